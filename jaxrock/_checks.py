@@ -1,0 +1,63 @@
+"""Argument checks: one message template, for values that are known and for values under jit."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Inexact
+
+
+def as_real(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+    """Return `value` as a floating-point array, or say what it is instead."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"Argument `{name}` must be a number or an array of numbers, but is {value!r}.") from error
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise ValueError(f"Argument `{name}` must be real, but is {value!r}.")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    # A Python float leaves a weak type behind, which would recompile every function it meets.
+    return jax.lax.convert_element_type(array, array.dtype)
+
+
+def checked(name: str, value: ArrayLike, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
+    """Return `value` as an array for which `holds` is true everywhere.
+
+    A known value that fails raises ValueError at once; one that is traced carries an
+    `equinox.error_if`, which raises when the compiled function meets it.
+    """
+    array = as_real(name, value)
+    message = f"Argument `{name}` must {allowed}"
+    if isinstance(array, jax.core.Tracer):
+        return eqx.error_if(array, ~jnp.all(holds(array)), message + ".")
+    known = np.asarray(array)
+    good = np.broadcast_to(np.asarray(holds(known)), known.shape)
+    if not good.all():
+        raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
+    return array
+
+
+def positive(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+    """Return `value` as an array of positive finite numbers."""
+    return checked(name, value, "be positive and finite", lambda x: (x > 0) & (x < np.inf))
+
+
+def finite(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+    """Return `value` as an array of finite numbers."""
+    return checked(name, value, "be finite", lambda x: (x > -np.inf) & (x < np.inf))
+
+
+def not_nan(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+    """Return `value` as an array of numbers, of which some may be infinite."""
+    return checked(name, value, "be a number", lambda x: x == x)
+
+
+def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
+    """Return `value` if it is one of the allowed words."""
+    if value not in allowed:
+        words = ", ".join(repr(word) for word in allowed)
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
+    return value

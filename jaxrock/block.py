@@ -1,0 +1,85 @@
+"""The rigid block: its geometry and mass, reduced to slenderness, frequency parameter and restitution."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import checked, positive
+
+GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
+
+
+class Block(eqx.Module):
+    """A free-standing symmetric rigid block.
+
+    **Arguments:**
+
+    - `alpha`: slenderness angle, tan(alpha) = half width / half height [rad], in (0, pi/2).
+    - `p`: frequency parameter, sqrt(m g R / I) [rad/s], positive; sqrt(3 g / 4 R) for a rectangle.
+    - `restitution`: angular velocity after an impact over that before it, in [0, 1]. None means
+      Housner's value 1 - 1.5 sin^2(alpha), which follows alpha under differentiation.
+
+    All may be arrays of one shape, for use under `jax.vmap`.
+
+    **Raises:** ValueError for a value outside its range; also when `restitution` is None and
+    Housner's value would be negative (alpha above 0.955 rad: width above 1.41 heights).
+
+    **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equations 2.3 and 2.4.
+    """
+
+    alpha: Inexact[Array, "..."]
+    p: Inexact[Array, "..."]
+    given_restitution: Inexact[Array, "..."] | None
+
+    def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None = None):
+        self.alpha = checked("alpha", alpha, "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
+        self.p = positive("p", p)
+        if restitution is None:
+            self.alpha = checked(
+                "alpha",
+                self.alpha,
+                "be at most 0.955 (asin sqrt(2/3)) when `restitution` is None, because Housner's value is negative above",
+                lambda x: x <= np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6),
+            )
+            self.given_restitution = None
+        else:
+            self.given_restitution = checked("restitution", restitution, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+
+    @classmethod
+    def from_dimensions(
+        cls,
+        width: ArrayLike,
+        height: ArrayLike,
+        restitution: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "Block":
+        """Build a homogeneous rectangular block from its full sizes.
+
+        **Arguments:**
+
+        - `width`: full width of the base in the plane of rocking [m], positive.
+        - `height`: full height [m], positive.
+        - `restitution`: as in `Block`.
+        - `gravity`: acceleration of gravity [m/s^2], positive.
+
+        **Returns:** a `Block` with tan(alpha) = width/height and p = sqrt(3 g / 4 R), R half the diagonal.
+
+        **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.2.
+        """
+        width, height = positive("width", width), positive("height", height)
+        half_diagonal = jnp.hypot(width, height) / 2
+        frequency = jnp.sqrt(3 * positive("gravity", gravity) / (4 * half_diagonal))
+        return cls(jnp.arctan2(width, height), frequency, restitution)
+
+    @property
+    def restitution(self) -> Inexact[Array, "..."]:
+        """Angular velocity after an impact over that before it (given, or Housner's)."""
+        if self.given_restitution is None:
+            return jnp.maximum(1 - 1.5 * jnp.sin(self.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
+        return self.given_restitution
+
+    @property
+    def half_diagonal(self) -> Inexact[Array, "..."]:
+        """Distance from pivot to centre of mass of the rectangle of this p under 9.81 m/s^2 [m]."""
+        return 3 * GRAVITY / (4 * self.p**2)

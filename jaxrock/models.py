@@ -1,0 +1,115 @@
+"""The equation of motion as a small table of numbers, one row per model.
+
+With the opening angle x = |rotation| (rad), side s = +1 or -1, dimensionless time p t and ground
+acceleration u (g), every model of a rigid symmetric block reads
+
+    x'' = -[restoring(x) + s u arm(x)],
+    restoring(x) = r0 + r1 x + rs sin x + rc cos x,      arm(x) = m0 + ms sin x + mc cos x.
+
+A coefficient that a model does not have is None, so that nothing is computed for it.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+from jaxrock.block import Block
+
+Scalar = Inexact[Array, ""]
+
+
+def _sum_of(*products: tuple[Scalar | None, Scalar | float]) -> Scalar | float:
+    """Add coefficient times function for the coefficients that exist."""
+    return sum((c * f for c, f in products if c is not None), start=0.0)
+
+
+class Table(eqx.Module):
+    """Coefficients of restoring moment and overturning arm, both over m g R (module docstring)."""
+
+    r0: Scalar | None = None
+    r1: Scalar | None = None
+    rs: Scalar | None = None
+    rc: Scalar | None = None
+    m0: Scalar | None = None
+    ms: Scalar | None = None
+    mc: Scalar | None = None
+
+    @property
+    def trigonometric(self) -> bool:
+        """Whether sin x or cos x appear at all."""
+        return any(c is not None for c in (self.rs, self.rc, self.ms, self.mc))
+
+    def restoring(self, x: Scalar) -> Scalar:
+        """Restoring moment over m g R at opening angle x [rad]."""
+        return _sum_of((self.r0, 1.0), (self.r1, x), (self.rs, jnp.sin(x)), (self.rc, jnp.cos(x)))
+
+    def arm(self, x: Scalar) -> Scalar:
+        """Overturning moment over m R u g at opening angle x [rad]."""
+        return _sum_of((self.m0, 1.0), (self.ms, jnp.sin(x)), (self.mc, jnp.cos(x)))
+
+    @property
+    def restoring_at_rest(self) -> Scalar:
+        """Restoring moment over m g R just after uplift: sin(alpha), or alpha in the linear model."""
+        return _sum_of((self.r0, 1.0), (self.rc, 1.0))
+
+    @property
+    def arm_at_rest(self) -> Scalar:
+        """Overturning arm over R just after uplift: cos(alpha), or 1 in the linear model."""
+        return _sum_of((self.m0, 1.0), (self.mc, 1.0))
+
+    @property
+    def threshold(self) -> Scalar:
+        """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
+        return self.restoring_at_rest / self.arm_at_rest
+
+    @property
+    def sinusoidal(self) -> bool:
+        """Whether the restoring moment is one sinusoid (else it is one straight line)."""
+        return self.rs is not None
+
+    @property
+    def stiffness(self) -> Scalar:
+        """k in restoring(x) = k sin(saddle - x), or k (saddle - x)."""
+        return jnp.hypot(self.rs, self.rc) if self.sinusoidal else -self.r1
+
+    @property
+    def saddle(self) -> Scalar:
+        """Opening angle of the unstable equilibrium: the block balances on its corner [rad]."""
+        return jnp.arctan2(self.rc, -self.rs) if self.sinusoidal else -self.r0 / self.r1
+
+    def manifold(self, x: Scalar) -> Scalar:
+        """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
+        gap = self.saddle - x
+        distance = 2 * jnp.sin(gap / 2) if self.sinusoidal else gap  # half-angle form: no cancellation near the saddle
+        return jnp.sqrt(self.stiffness) * distance
+
+
+class Housner(eqx.Module):
+    """The rigid rectangular block with its exact nonlinear equation (Housner 1963; D&D 2012, 2.1-2.2)."""
+
+    def table(self, block: Block) -> Table:
+        """sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x; its arm is cos(alpha - x)."""
+        sine, cosine = jnp.sin(block.alpha), jnp.cos(block.alpha)
+        return Table(rs=-cosine, rc=sine, ms=sine, mc=cosine)
+
+    @property
+    def falls_flat(self) -> bool:
+        """Whether a rotation of pi/2 means that the block lies on its side."""
+        return True
+
+
+class Linear(eqx.Module):
+    """The slender block linearised about its corner (D&D 2012, 3.1-3.2; Voyagaki et al. 2012, 2.3)."""
+
+    def table(self, block: Block) -> Table:
+        """Restoring moment alpha - x, arm 1."""
+        one = jnp.ones_like(block.alpha)
+        return Table(r0=block.alpha, r1=-one, m0=one)
+
+    @property
+    def falls_flat(self) -> bool:
+        """A linear block has no horizontal: only the point of no return counts."""
+        return False
+
+
+Model = Housner | Linear

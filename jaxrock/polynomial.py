@@ -1,0 +1,137 @@
+"""Polynomials on [0, 1] as lists of coefficients, and their first sign change, certified.
+
+A list entry is a scalar (or, under vmap, one per lane); the lists have fixed length, so that every
+operation unrolls into straight-line code that vectorises over lanes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact
+
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
+
+
+def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
+    """Coefficients in x/length from those in x."""
+    scaled, power = [coefficients[0]], length
+    for c in coefficients[1:]:
+        scaled.append(c * power)
+        power = power * length
+    return scaled
+
+
+def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
+    """Value and the first derivatives of a polynomial at x."""
+    values = [jnp.zeros_like(x)] * (derivatives + 1)
+    for c in reversed(coefficients):
+        for j in range(derivatives, 0, -1):
+            values[j] = values[j] * x + values[j - 1]
+        values[0] = values[0] * x + c
+    factorial = 1
+    for j in range(2, derivatives + 1):
+        factorial *= j
+        values[j] = factorial * values[j]
+    return values
+
+
+def derivative(coefficients: list[Scalar]) -> list[Scalar]:
+    """Coefficients of the derivative."""
+    return [k * c for k, c in enumerate(coefficients)][1:]
+
+
+def keeps_sign(coefficients: list[Scalar], sign: Scalar) -> Flag:
+    """Whether sign times the polynomial is certainly positive on (0, 1]; False when in doubt.
+
+    As long as the leading coefficients are not negative, x^m times their sum is a lower bound of
+    their part; every later negative coefficient takes away at most its size times x^m.
+    """
+    total, leading = jnp.zeros_like(sign), jnp.ones_like(sign, bool)
+    for k, c in enumerate(coefficients):
+        term = sign * c
+        if k < 4:
+            leading = leading & (term >= 0)
+            total = total + jnp.where(leading, term, jnp.minimum(term, 0.0))
+        else:
+            total = total + jnp.minimum(term, 0.0)
+    return total > 0
+
+
+def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int) -> Scalar:
+    """How negative the derivative of this order of sign times the polynomial can be on [0, 1] at most."""
+    total = jnp.zeros_like(sign)
+    for k, c in enumerate(coefficients):
+        weight = 1
+        for j in range(order):
+            weight *= k - j
+        if weight > 0:
+            total = total + weight * jnp.maximum(-sign * c, 0.0)
+    return total
+
+
+class Watch(NamedTuple):
+    """A quantity whose first sign change is wanted: sign (derivative of the polynomial - offset), positive at first."""
+
+    derivative: int
+    sign: Scalar
+    offset: Scalar | float
+    active: Flag | bool
+
+
+class Landing(NamedTuple):
+    """Where the march stopped, the polynomial's jet there, and which watched quantities reached zero."""
+
+    x: Scalar
+    jet: list[Scalar]
+    hits: list[Flag]
+
+
+def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
+    """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
+    root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
+    falling = slope <= 0
+    below = jnp.where(falling, root - slope, fall)
+    above = jnp.where(falling, 2 * value, slope + root)
+    # Nothing pulls it down: clear for ever, unless it is already at zero.
+    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.where(value > 0, jnp.inf, 0.0))
+
+
+def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar) -> Landing:
+    """March from `start` to the first point of [0, 1] where a watched quantity changes sign.
+
+    Each stride is the largest on which a parabola below every watched quantity stays positive, so no
+    zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
+    When the strides do not come to an end (a zero that is nearly double), the march stops where it
+    is, with no hit: everything before that point is certain.
+    """
+    highest = max(w.derivative for w in watches) + 1
+    falls = [fall_bound(coefficients, w.sign, w.derivative + 2) for w in watches]
+    eps = jnp.finfo(start.dtype).eps
+
+    def strides(x):
+        values = jet(coefficients, x, highest)
+        lengths = [
+            jnp.where(
+                w.active,
+                _clear_length(w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], fall),
+                jnp.inf,
+            )
+            for w, fall in zip(watches, falls)
+        ]
+        return values, lengths
+
+    def march(carry):
+        x, _, count = carry
+        _, lengths = strides(x)
+        stride = jnp.clip(jnp.min(jnp.stack(lengths)), 0.0, 1.0)
+        reached = jnp.minimum(x + stride, 1.0)
+        going = (stride > 2 * eps * reached) & (reached < 1) & (count < 80)
+        return reached, going, count + 1
+
+    x, _, _ = jax.lax.while_loop(
+        lambda carry: carry[1], march, (start, jnp.ones_like(start, bool), jnp.zeros_like(start, int))
+    )
+    values, lengths = strides(x)
+    return Landing(x, values, [length <= 32 * eps * x for length in lengths])

@@ -1,0 +1,346 @@
+"""What a block does under a motion: `simulate` gives its history, `outcome` only what came of it."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock._checks import as_real, checked
+from jaxrock.block import Block
+from jaxrock.free import FreeStage, free_stage
+from jaxrock.models import Housner, Model
+from jaxrock.motion import AbstractMotion
+from jaxrock.scene import Scene
+from jaxrock.series import Series, State, Stepper, initial_state
+from jaxrock.status import Status
+
+Scalar = Inexact[Array, "..."]
+_OUTCOME_STEPS = 100_000
+
+
+class Outcome(eqx.Module):
+    """What came of a scene: the motion, and the free stage after it to its end.
+
+    - `max_rotation`: largest |rotation| [rad]; infinite if the block overturned.
+    - `max_velocity`: largest |angular velocity| [rad/s]; infinite if the block overturned.
+    - `time_of_max`: when `max_rotation` was reached [s]; infinite if the block overturned.
+    - `impact_count`: impacts during the motion, and the one after it if that one decides the verdict. The
+      impacts without end of a block that comes to rest are counted while they matter.
+    - `overturned`: the verdict.
+    - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
+    - `status`: a `Status`. With any other than successful the numbers are not results.
+
+    The margin is the smallest squared distance (velocity / p sin alpha)^2 + (acceleration / p^2 sin alpha)^2 from
+    standing still in balance (Voyagaki et al. 2012, 3.11), over turning points and crossings of the unstable
+    equilibrium; negative, over those since the last outward crossing, if the block overturned. At a turning
+    point below the equilibrium it is at least 1 - E/E_crit by position, which it equals in a free linear stage.
+    A block that never uplifts has 2 - peak acceleration/threshold, 1 or more. (Linear model: alpha for sin alpha.)
+    """
+
+    max_rotation: Scalar
+    max_velocity: Scalar
+    time_of_max: Scalar
+    impact_count: Int[Array, "..."]
+    overturned: Bool[Array, "..."]
+    margin: Scalar
+    status: Status
+
+
+class Response(eqx.Module):
+    """The history of a scene; call it with times to evaluate it anywhere: `rotation, velocity = response(t)`.
+
+    - `time`, `rotation`, `velocity`: (samples,) equally spaced history [s], [rad], [rad/s].
+    - `impact_times`, `impact_velocities`: of every impact [s] and just before it [rad/s].
+    - `peak_times`, `peak_rotations`: of every turning point [s], [rad].
+    - `impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the duration.
+    - `overturned`, `margin`, `status`: as in `Outcome`; the verdict looks beyond a duration that covers the motion.
+
+    Under jit or vmap the arrays of impacts and peaks have fixed length: times are filled up with inf, values
+    with 0. Outside they hold the events alone.
+    """
+
+    time: Inexact[Array, "..."]
+    rotation: Inexact[Array, "..."]
+    velocity: Inexact[Array, "..."]
+    impact_count: Int[Array, "..."]
+    max_rotation: Scalar
+    max_velocity: Scalar
+    time_of_max: Scalar
+    overturned: Bool[Array, "..."]
+    margin: Scalar
+    status: Status
+    duration: Scalar
+    stepper: Stepper
+    nodes: State  # every step's start, one axis more; nodes past the last repeat it at time inf
+    node_times: Inexact[Array, "..."]
+    impacted: Bool[Array, "..."]
+
+    def __call__(self, time: ArrayLike) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
+        """Rotation and angular velocity.
+
+        **Arguments:**
+
+        - `time`: any shape, in [0, duration] [s].
+
+        **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the
+        steps themselves; at an impact the velocity after it. A block that has fallen lies still.
+
+        **Raises:** ValueError for a time outside the history.
+        """
+        last = np.nextafter(np.asarray(self.duration), np.inf) if not _traced(self.duration) else self.duration
+        time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= last * (1 + 1e-12)))
+        return _evaluate(self, time)
+
+    def _events(self, times, values, found):
+        """Events in order; trimmed to their number where that is known."""
+        order = jnp.argsort(jnp.where(found, times, jnp.inf), stable=True)
+        times, values = jnp.where(found, times, jnp.inf)[order], jnp.where(found, values, 0.0)[order]
+        if _traced(found):
+            return times, values
+        count = int(found.sum())
+        return times[:count], values[:count]
+
+    def _impacts(self):
+        def one(nodes, impacted, p):
+            return nodes.impact_time, nodes.impact_velocity * p, impacted
+
+        return self._gather(one)
+
+    def _peaks(self):
+        def one(nodes, impacted, p):
+            found = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0)
+            return self.node_times, nodes.side * nodes.opening, found & jnp.isfinite(self.node_times)
+
+        return self._gather(one)
+
+    def _gather(self, one):
+        if self.node_times.ndim > 1:
+            raise ValueError("This response holds many scenes: read its events inside jax.vmap.")
+        return self._events(*one(self.nodes, self.impacted, self.stepper.scene.p))
+
+    @property
+    def impact_times(self) -> Inexact[Array, " impacts"]:
+        """Times of the impacts [s]."""
+        return self._impacts()[0]
+
+    @property
+    def impact_velocities(self) -> Inexact[Array, " impacts"]:
+        """Angular velocities just before the impacts [rad/s]."""
+        return self._impacts()[1]
+
+    @property
+    def peak_times(self) -> Inexact[Array, " peaks"]:
+        """Times of the turning points [s]."""
+        return self._peaks()[0]
+
+    @property
+    def peak_rotations(self) -> Inexact[Array, " peaks"]:
+        """Rotations at the turning points [rad]."""
+        return self._peaks()[1]
+
+
+def _traced(value) -> bool:
+    return isinstance(value, jax.core.Tracer)
+
+
+def outcome(
+    block: Block,
+    motion: AbstractMotion,
+    model: Model = Housner(),
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    engine: Series | None = None,
+) -> Outcome:
+    """Tell what becomes of a block under a motion and in the free stage after it.
+
+    **Arguments:**
+
+    - `block`: a `Block` of scalars (use `jax.vmap` for many).
+    - `motion`: any motion; the ground rests after its end.
+    - `model`: `Housner()` (nonlinear) or `Linear()`.
+    - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
+    - `engine`: `Series(...)`; None takes its defaults.
+
+    **Returns:** an `Outcome`.
+
+    **Raises:** ValueError for arguments outside their ranges; arrays where scalars are wanted.
+    """
+    return _outcome(block, motion, model, _start(initial), engine or Series())
+
+
+def simulate(
+    block: Block,
+    motion: AbstractMotion,
+    model: Model = Housner(),
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    duration: ArrayLike | None = None,
+    engine: Series | None = None,
+    samples: int = 2001,
+) -> Response:
+    """Compute the history of a block under a motion.
+
+    **Arguments:**
+
+    - `block`, `motion`, `model`, `initial`, `engine`: as in `outcome`.
+    - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
+    - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had
+      by calling the result.
+
+    **Returns:** a `Response`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    if samples < 2:
+        raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
+    if duration is not None:
+        duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
+    response = _simulate(block, motion, model, _start(initial), duration, engine or Series())
+    time = jnp.linspace(jnp.zeros_like(response.duration), response.duration, samples)
+    rotation, velocity = _evaluate(response, time)
+    return eqx.tree_at(lambda r: (r.time, r.rotation, r.velocity), response, (time, rotation, velocity))
+
+
+_warned = False
+
+
+def _start(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
+    """Check the initial state, and warn once where numbers are single precision by default."""
+    global _warned
+    if not jax.config.jax_enable_x64 and not _warned:
+        _warned = True
+        warnings.warn(
+            "jaxrock runs in single precision here: expect 5 digits. For 13, put "
+            '`jax.config.update("jax_enable_x64", True)` before the first computation.',
+            stacklevel=3,
+        )
+    rotation, velocity = initial
+    rotation = checked(
+        "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)
+    )
+    return rotation, as_real("initial[1]", velocity)
+
+
+@jax.jit
+def _outcome(block, motion, model, initial, engine) -> Outcome:
+    scene = Scene.of(block, motion, model)
+    stepper = Stepper(
+        scene=scene,
+        stop=jnp.full_like(scene.p, jnp.inf),
+        order=engine.order_for(scene),
+        tolerance=engine.tolerance_for(scene),
+        history=False,
+    )
+    budget = engine.max_steps or _OUTCOME_STEPS
+    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+    state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state)
+    return _conclude(stepper, state)
+
+
+def _conclude(stepper: Stepper, state: State) -> Outcome:
+    """Add the free stage to a state at the end of the motion (or where the block was lost)."""
+    scene = stepper.scene
+    moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
+    stage: FreeStage = free_stage(scene.table, scene.restitution, state.opening, state.velocity, moving)
+    overturned = state.overturned | stage.overturned
+    closeness = jnp.minimum(state.closeness, stage.closeness)
+    # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
+    beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
+    higher = stage.peak > state.peak
+    status = Status.where(state.done, state.status, Status.step_budget_exhausted)
+
+    def unless_overturned(value):
+        return jnp.where(overturned, jnp.inf, value)
+
+    return Outcome(
+        max_rotation=unless_overturned(jnp.maximum(state.peak, stage.peak)),
+        max_velocity=unless_overturned(jnp.maximum(state.fastest, stage.fastest) * scene.p),
+        time_of_max=unless_overturned(
+            jnp.where(higher, stepper.time(state) + stage.peak_time / scene.p, state.peak_time)
+        ),
+        impact_count=state.impacts + stage.impacts,
+        overturned=overturned,
+        margin=jnp.where(overturned, -beyond, closeness),
+        status=status,
+    )
+
+
+@jax.jit
+def _simulate(block, motion, model, initial, duration, engine) -> Response:
+    scene = Scene.of(block, motion, model)
+    dtype = scene.p.dtype
+    stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration, dtype)
+    stepper = Stepper(
+        scene=scene,
+        stop=stop,
+        order=engine.order_for(scene),
+        tolerance=engine.tolerance_for(scene),
+        history=True,
+    )
+    budget = engine.max_steps or 4096 + 2 * scene.pieces
+    state = initial_state(scene, *(jnp.asarray(x, dtype) for x in initial))
+    nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
+
+    def store(nodes, state):
+        return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
+
+    def step(carry):
+        state, nodes = carry
+        state = stepper.advance(state)
+        return state, store(nodes, state)
+
+    state, nodes = jax.lax.while_loop(
+        lambda carry: ~carry[0].done & (carry[0].steps < budget), step, (state, store(nodes, state))
+    )
+    final = _conclude(stepper, state)
+    index = jnp.arange(budget + 1)
+    times = jax.vmap(stepper.time)(nodes)
+    times = jnp.where(index <= state.steps, times, jnp.inf)
+    impacted = jnp.diff(nodes.impacts, prepend=0) > 0
+    # The largest within the duration: the end may be on the way to a peak.
+    higher = state.opening > state.peak
+    lost = final.overturned
+    return Response(
+        time=times[:2],
+        rotation=times[:2],
+        velocity=times[:2],
+        impact_count=state.impacts,
+        max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
+        max_velocity=jnp.where(lost, jnp.inf, state.fastest * scene.p),
+        time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
+        overturned=lost,
+        margin=final.margin,
+        status=final.status,
+        duration=stop,
+        stepper=stepper,
+        nodes=nodes,
+        node_times=times,
+        impacted=impacted & (index <= state.steps),
+    )
+
+
+@jax.jit
+def _evaluate(response: Response, time):
+    """Expand the series again about the step that holds each time."""
+    stepper = response.stepper
+
+    def at(t):
+        index = jnp.clip(jnp.searchsorted(response.node_times, t, side="right") - 1, 0, response.node_times.size - 1)
+        node = jax.tree.map(lambda x: x[index], response.nodes)
+        forcing, unit = stepper.scene.forcing(node.piece, node.local, stepper.order)
+        x = jnp.minimum(t, response.duration) - response.node_times[index]
+        coefficients = stepper.expand(node, forcing, unit)
+        opening, speed = coefficients[-1], jnp.zeros_like(unit)
+        for c in reversed(coefficients[:-1]):
+            speed = speed * (x / unit) + opening
+            opening = opening * (x / unit) + c
+        still = (node.side == 0) | node.done
+        opening = jnp.where(node.done, node.opening, opening)
+        velocity = jnp.where(still, jnp.where(node.overturned | (node.side == 0), 0.0, node.velocity * stepper.scene.p), speed / unit)
+        return node.side * opening, jnp.where(node.side == 0, 0.0, node.side * velocity)
+
+    rotation, velocity = jax.vmap(at)(time.ravel())
+    return rotation.reshape(time.shape), velocity.reshape(time.shape)

@@ -1,0 +1,498 @@
+"""The series engine: Taylor steps of a rocking block from event to event, exact to rounding.
+
+A lane (one block under one motion) steps through its own time. Within a smooth piece of the motion the
+opening angle is expanded about the present state, the last coefficients give the step, and the step ends
+early at the first event: impact, turning point, saddle crossing, or a new largest velocity. A block at rest
+waits for the threshold. Under `jax.vmap` lanes advance together, each at its own time; a branch that no
+lane needs is not taken.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact, Int
+
+from jaxrock.models import Table
+from jaxrock.polynomial import Landing, Watch, derivative, fall_bound, first_event, jet, keeps_sign, rescaled
+from jaxrock.scene import Scene
+from jaxrock.status import Status
+
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
+
+
+class Series(eqx.Module):
+    """Settings of the series engine.
+
+    **Arguments:**
+
+    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16.
+    - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit.
+    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece (`simulate`, which stores them).
+
+    **Raises:** ValueError for a value outside its range.
+    """
+
+    order: int | None = eqx.field(static=True, default=None)
+    tolerance: float | None = eqx.field(static=True, default=None)
+    max_steps: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.order is not None and self.order < 4:
+            raise ValueError(f"Argument `order` must be at least 4, but is {self.order}.")
+        if self.tolerance is not None and not 0 < self.tolerance < 1:
+            raise ValueError(f"Argument `tolerance` must be in (0, 1), but is {self.tolerance}.")
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"Argument `max_steps` must be at least 1, but is {self.max_steps}.")
+
+    def order_for(self, scene: Scene) -> int:
+        """Order of the steps: short pieces of a record need few terms."""
+        return self.order or (8 if scene.pieces > 32 else 16)
+
+    def tolerance_for(self, scene: Scene) -> float:
+        """Local error over alpha."""
+        return self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2
+
+
+class State(eqx.Module):
+    """Where a lane is, and what it has seen so far. Velocities are per p t, angles in rad."""
+
+    piece: Int[Array, ""]
+    local: Scalar  # time since the start of the piece [s]
+    side: Scalar  # corner it stands on: +1, -1; 0 at rest
+    opening: Scalar  # side * rotation
+    velocity: Scalar  # of the opening
+    uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
+    beyond: Flag  # past the saddle
+    steady: Flag  # a velocity extremum: the acceleration is zero here, to rounding
+    peak: Scalar
+    peak_time: Scalar
+    fastest: Scalar
+    impacts: Int[Array, ""]
+    impact_time: Scalar  # of the last impact [s]
+    impact_velocity: Scalar  # of the rotation, just before it
+    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
+    closeness_beyond: Scalar  # the same since the saddle was last crossed outward
+    overturned: Flag
+    done: Flag
+    status: Status
+    steps: Int[Array, ""]
+
+
+def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
+    """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
+    velocity = velocity / scene.p
+    side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    opening, outward = jnp.abs(rotation), side * velocity
+    zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
+    count = jnp.zeros_like(opening, jnp.int32)
+    # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
+    unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
+    return State(
+        piece=count,
+        local=zero,
+        side=side,
+        opening=opening,
+        velocity=outward,
+        uplifting=no,
+        beyond=opening >= scene.table.saddle,
+        steady=no,
+        peak=opening,
+        peak_time=zero,
+        fastest=jnp.abs(outward),
+        impacts=count,
+        impact_time=zero,
+        impact_velocity=zero,
+        closeness=jnp.where(side == 0, unlifted, 1.0),
+        closeness_beyond=jnp.full_like(opening, jnp.inf),
+        overturned=no,
+        done=no,
+        status=Status.where(jnp.isfinite(rotation) & jnp.isfinite(velocity), Status.successful, Status.not_finite),
+        steps=count,
+    )
+
+
+def opening_series(table: Table, stretch: Scalar, side, opening, speed, uplifting, forcing: list, order: int) -> list:
+    """Taylor coefficients of the opening angle from x'' = -stretch^2 [restoring(x) + side u arm(x)].
+
+    `stretch` is p times the unit of time, `speed` the velocity per unit. The sine and cosine of the angle
+    follow their own recurrences (Jorba & Zou 2005).
+    """
+    x = [opening, speed]
+    slopes = [speed]  # (k + 1) x_{k+1}
+    sine, cosine, arms = [], [], []
+    if table.trigonometric:
+        sine, cosine = [jnp.sin(opening)], [jnp.cos(opening)]
+    scale = -(stretch**2)
+    for k in range(order - 1):
+        if table.trigonometric and k > 0:
+            sine.append(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) / k)
+            cosine.append(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) / k)
+
+        def combine(constant, line, of_sine, of_cosine, k):
+            terms = [] if constant is None or k > 0 else [constant]
+            terms += [] if line is None else [line * x[k]]
+            terms += [] if of_sine is None else [of_sine * sine[k]]
+            terms += [] if of_cosine is None else [of_cosine * cosine[k]]
+            return sum(terms) if terms else None
+
+        arms.append(combine(table.m0, None, table.ms, table.mc, k))
+        products = [
+            forcing[j] * arms[k - j] for j in range(min(k, len(forcing) - 1) + 1) if arms[k - j] is not None
+        ]
+        moment = sum(products) * side if products else 0.0
+        restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
+        moment = moment if restoring is None else moment + restoring
+        term = scale * moment / ((k + 1) * (k + 2))
+        if k == 0:
+            term = jnp.where(uplifting, 0.0, term)  # by continuity, exactly
+        x.append(term)
+        slopes.append((k + 2) * term)
+    return x
+
+
+def _when(needed: Flag, function: Callable, value):
+    """`function(value)` where needed; under vmap the function runs only if some lane needs it."""
+    return jax.lax.while_loop(
+        lambda carry: carry[0], lambda carry: (jnp.zeros_like(carry[0]), function(carry[1])), (needed, value)
+    )[1]
+
+
+def _step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
+    """Step at which the last two coefficients drop below `size`, at most `cap`."""
+    order = len(coefficients) - 1
+    last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
+    tiny = jnp.finfo(last.dtype).tiny
+    ratio = size / jnp.maximum(last, tiny)
+    if order & (order - 1) == 0:  # a power of two: repeated square roots vectorise
+        for _ in range(order.bit_length() - 1):
+            ratio = jnp.sqrt(ratio)
+    else:
+        ratio = ratio ** (1 / order)
+    return jnp.minimum(jnp.where(last > tiny, ratio, jnp.inf), cap)
+
+
+class Stepper(eqx.Module):
+    """One scene with the engine's settings, and how far to follow it."""
+
+    scene: Scene
+    stop: Scalar  # time at which to stop [s]; infinite: at the end of the motion
+    order: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+    history: bool = eqx.field(static=True)  # follow an overturning block down to the ground
+
+    def time(self, state: State) -> Scalar:
+        """Time of a state [s]."""
+        return self.scene.knots[state.piece] + state.local
+
+    def _room(self, state: State, unit: Scalar) -> Scalar:
+        """Time to the next knot or the stop, in units."""
+        to_knot = self.scene.lengths[state.piece] - state.local
+        return jnp.maximum(jnp.minimum(to_knot, self.stop - self.time(state)), 0.0) / unit
+
+    def _advance(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
+        """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
+        to_knot = self.scene.lengths[state.piece] - state.local
+        ends = full & (to_knot <= self.stop - self.time(state))
+        piece = state.piece + ends
+        over = jnp.where(jnp.isfinite(self.stop), full & ~ends, piece >= self.scene.pieces)
+        return piece, jnp.where(ends, 0.0, state.local + elapsed), over
+
+    def advance(self, state: State) -> State:
+        """One step of a lane: waiting at rest, or rocking."""
+        forcing, unit = self.scene.forcing(state.piece, state.local, self.order)
+        room = self._room(state, unit)
+        resting = state.side == 0
+        waited = self._wait(state, forcing, unit, room)
+        rocked = self._rock(state, forcing, unit, room, ~resting)
+        after = jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked)
+        good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
+        return eqx.tree_at(
+            lambda s: (s.steps, s.status, s.done),
+            after,
+            (state.steps + 1, Status.where(good, after.status, Status.not_finite), after.done | ~good),
+        )
+
+    def _wait(self, state: State, forcing, unit, room) -> State:
+        """At rest: go on to the knot, or to where the acceleration exceeds the threshold."""
+        scene, threshold = self.scene, self.scene.table.threshold
+        truncated = len(forcing) > self.order  # else a polynomial: exact
+        length = _step_length(forcing, self.tolerance * threshold, room) if truncated else room
+        never = scene.ceilings[state.piece] <= threshold
+        length = jnp.where(jnp.isfinite(length), length, 0.0)
+        scaled = rescaled(forcing, length)
+        slope = scaled[1] if len(scaled) > 1 else jnp.zeros_like(length)
+        gap = threshold - jnp.abs(scaled[0])
+        slack = 8 * jnp.finfo(gap.dtype).eps * threshold
+        touching = jnp.abs(gap) <= slack
+        lifts = (gap < -slack) | (touching & (jnp.sign(scaled[0]) * slope > 0))
+        full = length >= room
+        piece, local, over = self._advance(state, length * unit, full)
+        piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
+        waited = eqx.tree_at(lambda s: (s.piece, s.local, s.done), state, (piece, local, over | never))
+
+        def search(waited):
+            # A threshold that is only touched (or was just left) is not met again at once.
+            start = jnp.where(touching, 1e-8, 0.0).astype(gap.dtype)
+            again, _ = scene.forcing(state.piece, state.local, self.order)
+            again = rescaled(again, length)
+            again = again + [jnp.zeros_like(length)] * (2 - len(again))
+            one = jnp.ones_like(gap)
+            landing = first_event(
+                again, [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)], start
+            )
+            value, rate = landing.jet
+            met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
+            early = landing.x < 1
+            cut = eqx.tree_at(
+                lambda s: (s.piece, s.local, s.done),
+                waited,
+                (
+                    jnp.where(early, state.piece, waited.piece),
+                    jnp.where(early, state.local + landing.x * length * unit, waited.local),
+                    waited.done & ~early,
+                ),
+            )
+            return self._lift(cut, value, met, jnp.ones_like(met))
+
+        reachable = ~lifts & ~never & (state.side == 0)
+        reachable = reachable & (sum(jnp.abs(c) for c in scaled) >= threshold)
+        waited = _when(reachable, search, waited)
+        lifted = self._lift(state, scaled[0], lifts, touching)
+        return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
+
+    def _lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
+        """Leave rest where `lifts`: positive acceleration drives negative rotation."""
+        return eqx.tree_at(
+            lambda s: (s.side, s.uplifting, s.beyond, s.steady),
+            state,
+            (
+                jnp.where(lifts, -jnp.sign(acceleration), state.side),
+                jnp.where(lifts, continuous, state.uplifting),
+                jnp.where(lifts, False, state.beyond),
+                jnp.where(lifts, False, state.steady),
+            ),
+        )
+
+    def expand(self, state: State, forcing, unit) -> list[Scalar]:
+        """Taylor coefficients of the opening angle about a state, in time/unit."""
+        stretch = self.scene.p * unit
+        return opening_series(
+            self.scene.table,
+            stretch,
+            state.side,
+            state.opening,
+            state.velocity * stretch,
+            state.uplifting,
+            forcing,
+            self.order,
+        )
+
+    def _rock(self, state: State, forcing, unit, room, rocking: Flag) -> State:
+        """Rocking: a Taylor step, cut at the first event."""
+        scene = self.scene
+        table, saddle = scene.table, scene.table.saddle
+        coefficients = self.expand(state, forcing, unit)
+        length = _step_length(coefficients, self.tolerance * scene.alpha, jnp.minimum(room, 16.0))
+        full = length >= room * (1 - 1e-9)
+        length = jnp.where(full, room, length)
+        scaled = rescaled(coefficients, length)
+        per_step = length * unit * scene.p  # dimensionless time of the step
+        safe_step = jnp.where(per_step > 0, per_step, 1.0)
+        opening, speed = jet(scaled, jnp.ones_like(length), 1)
+
+        signs = self._signs(state, scaled)
+        turning = ~keeps_sign(derivative(scaled), signs[0])
+        crossing = (opening >= saddle) != state.beyond
+        top_speed = jnp.maximum(jnp.abs(scaled[1]), jnp.abs(speed)) + _bend(scaled)
+        faster = (top_speed > state.fastest * per_step) & ~keeps_sign(derivative(derivative(scaled)), signs[1])
+        eventful = (turning | crossing | faster | (opening <= 0)) & rocking
+        if self.history:
+            eventful = eventful | (rocking & (opening >= jnp.pi / 2))
+
+        # No forcing that is still to come can bring it back: restoring + ceiling arm < 0 from here on.
+        ceiling = scene.ceilings[state.piece]
+        escaped = (state.velocity >= 0) & state.beyond
+        escaped = escaped & (table.restoring(state.opening) + ceiling * table.arm(state.opening) <= 0)
+        flat = opening >= jnp.pi / 2 if scene.falls_flat else jnp.zeros_like(escaped)
+
+        piece, local, over = self._advance(state, length * unit, full)
+        moved = (per_step > 0) & rocking
+        passed = eqx.tree_at(
+            lambda s: (s.piece, s.local, s.opening, s.velocity, s.uplifting, s.steady, s.fastest, s.done),
+            state,
+            (
+                piece,
+                local,
+                opening,
+                jnp.where(moved, speed / safe_step, state.velocity),
+                state.uplifting & ~moved,
+                state.steady & ~moved,
+                jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(speed / safe_step)), state.fastest),
+                over,
+            ),
+        )
+
+        def land(passed):
+            again, _ = scene.forcing(state.piece, state.local, self.order)
+            scaled = rescaled(self.expand(state, again, unit), length)
+            return self._land(state, passed, scaled, rescaled(again, length), signs, faster, length, unit)
+
+        stepped = _when(eventful & moved, land, passed)
+        if self.history:
+            low = stepped.opening < jnp.pi / 2
+            overturned = state.overturned | escaped
+            overturned = overturned | ~low if scene.falls_flat else overturned
+            return eqx.tree_at(
+                lambda s: (s.overturned, s.done), stepped, (overturned, stepped.done | (overturned & ~low))
+            )
+        overturned = escaped | (flat & (stepped.opening >= jnp.pi / 2)) | stepped.overturned
+        return eqx.tree_at(lambda s: (s.overturned, s.done), stepped, (overturned, stepped.done | overturned))
+
+    def _signs(self, state: State, scaled) -> tuple[Scalar, Scalar]:
+        """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
+
+        def of(value, following):
+            return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+        velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, scaled[2]))
+        acceleration = jnp.where(
+            state.uplifting, 1.0, of(jnp.where(state.steady, 0.0, scaled[2]), scaled[3])
+        )
+        return velocity, acceleration
+
+    def _land(self, state, passed, scaled, forcing, signs, faster, length, unit) -> State:
+        """Find the first event of a step, move the lane there, and let it happen."""
+        scene, saddle = self.scene, self.scene.table.saddle
+        one = jnp.ones_like(length)
+        watches = [
+            Watch(0, one, 0.0, True),
+            Watch(1, signs[0], 0.0, True),
+            Watch(2, signs[1], 0.0, faster),
+            Watch(0, jnp.where(state.beyond, 1.0, -1.0), saddle, True),
+        ]
+        if self.history:
+            watches.append(Watch(0, -one, jnp.pi / 2, state.opening < jnp.pi / 2))
+        landing = first_event(scaled, watches, _clear_start(state, scaled, saddle))
+        per_step = length * unit * scene.p
+        opening, speed, bend = landing.jet[0], landing.jet[1] / per_step, landing.jet[2] / per_step**2
+        impact, turning, extremum, crossing = landing.hits[:4]
+        ground = landing.hits[4] if self.history else jnp.zeros_like(impact)
+        impact = impact & (speed <= 0)
+        early = landing.x < 1
+        elapsed = landing.x * length * unit
+        landed = eqx.tree_at(
+            lambda s: (s.piece, s.local, s.opening, s.velocity, s.beyond, s.steady, s.fastest, s.done),
+            passed,
+            (
+                jnp.where(early, state.piece, passed.piece),
+                jnp.where(early, state.local + elapsed, passed.local),
+                jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
+                jnp.where(turning, 0.0, speed),
+                state.beyond ^ crossing,
+                extremum,
+                jnp.maximum(state.fastest, jnp.abs(speed)),
+                passed.done & ~early,
+            ),
+        )
+        landed = self._note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
+        return self._impact(landed, impact, speed, forcing, landing, length, unit)
+
+    def _note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
+        """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
+        table = self.scene.table
+        at_rest = table.restoring_at_rest
+        stillness = (speed / at_rest) ** 2 + (bend / at_rest) ** 2
+        base, height = table.manifold(jnp.zeros_like(opening)), table.manifold(jnp.minimum(opening, table.saddle))
+        turn = turning & (outward | state.beyond)
+        at_turn = jnp.where(state.beyond, stillness, jnp.maximum((height / base) ** 2, stillness))
+        closeness = jnp.where(turn, jnp.minimum(state.closeness, at_turn), state.closeness)
+        closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
+        beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
+        beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
+        higher = turning & outward & (opening > state.peak)
+        return eqx.tree_at(
+            lambda s: (s.peak, s.peak_time, s.closeness, s.closeness_beyond),
+            state,
+            (
+                jnp.where(higher, opening, state.peak),
+                jnp.where(higher, self.time(state), state.peak_time),
+                closeness,
+                beyond,
+            ),
+        )
+
+    def _impact(self, state: State, impact: Flag, speed, forcing, landing: Landing, length, unit) -> State:
+        """Change side with the restitution; come to rest where the impacts to come no longer matter.
+
+        After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come
+        last 2 v (1/a + e/a')/(1 - e^2). They may be replaced by rest if they are certain to end before
+        the threshold is reached, and lower than the tolerance.
+        """
+        scene, e = self.scene, self.scene.restitution
+        rebound = e * jnp.abs(speed)
+        side = -state.side
+        acceleration = jet(forcing, landing.x, 0)[0]
+        table = scene.table
+        push = side * acceleration * table.arm_at_rest
+        here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
+        weakest = jnp.minimum(here, there)
+        safe = jnp.where(weakest > 0, weakest, 1.0)
+        decay = jnp.where(e < 1, 1 - e * e, 1.0)
+        remaining = 2 * rebound * (1 / jnp.where(weakest > 0, here, 1.0) + e / jnp.where(weakest > 0, there, 1.0)) / decay
+        per_unit = jnp.where(length > 0, length, 1.0)
+        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / per_unit
+        window = 2 * remaining / (scene.p * unit)  # hops at half the deceleration, in units
+        steady = steepest * window * table.arm_at_rest <= weakest / 2
+        within = window <= (1 - landing.x) * length
+        low = rebound**2 <= 2 * safe * 100 * self.tolerance * scene.alpha
+        dies = (weakest > 0) & (e < 1) & steady & within & low
+        rests = impact & (dies | (rebound == 0))
+        wait = jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
+        return eqx.tree_at(
+            lambda s: (
+                s.impacts,
+                s.impact_time,
+                s.impact_velocity,
+                s.side,
+                s.opening,
+                s.velocity,
+                s.local,
+                s.beyond,
+                s.uplifting,
+                s.steady,
+            ),
+            state,
+            (
+                state.impacts + impact,
+                jnp.where(impact, self.time(state), state.impact_time),
+                jnp.where(impact, state.side * speed, state.impact_velocity),
+                jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),
+                jnp.where(impact, 0.0, state.opening),
+                jnp.where(rests, 0.0, jnp.where(impact, rebound, state.velocity)),
+                state.local + wait,
+                state.beyond & ~impact,
+                state.uplifting & ~impact,
+                state.steady & ~impact,
+            ),
+        )
+
+
+def _bend(scaled: list[Scalar]) -> Scalar:
+    """How far the velocity can exceed its end values within the step (an eighth of its largest second derivative)."""
+    one = jnp.ones_like(scaled[0])
+    return jnp.maximum(fall_bound(scaled, one, 3), fall_bound(scaled, -one, 3)) / 8
+
+
+def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
+    """From where to look for events: a block that leaves rest has them all at its start."""
+    one = jnp.ones_like(saddle)
+    lead = jnp.where(state.uplifting, 3 * scaled[3], scaled[2])
+    order = jnp.where(state.uplifting, fall_bound([0.0 * one] * 4 + scaled[4:], one, 2), fall_bound([0.0 * one] * 3 + scaled[3:], one, 2))
+    tiny = jnp.finfo(saddle.dtype).tiny
+    clear = jnp.clip(lead / jnp.maximum(order, tiny), 0.0, 0.5)
+    below_saddle = jnp.sqrt(saddle / (4 * sum(jnp.abs(c) for c in scaled) + tiny))
+    leaving = (state.opening == 0) & (state.velocity == 0)
+    return jnp.where(leaving, jnp.minimum(clear, below_saddle), 0.0)
