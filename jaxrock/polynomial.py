@@ -42,33 +42,37 @@ def derivative(coefficients: list[Scalar]) -> list[Scalar]:
     return [k * c for k, c in enumerate(coefficients)][1:]
 
 
-def keeps_sign(coefficients: list[Scalar], sign: Scalar) -> Flag:
-    """Whether sign times the polynomial is certainly positive on (0, 1]; False when in doubt.
+def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
+    """Value of a polynomial at x."""
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total
+
+
+def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scalar:
+    """Positive only if sign times the polynomial is certainly positive on (0, length].
 
     As long as the leading coefficients are not negative, x^m times their sum is a lower bound of
     their part; every later negative coefficient takes away at most its size times x^m.
     """
-    total, leading = jnp.zeros_like(sign), jnp.ones_like(sign, bool)
+    leading, kept = jnp.ones_like(sign, bool), []
     for k, c in enumerate(coefficients):
         term = sign * c
-        if k < 4:
-            leading = leading & (term >= 0)
-            total = total + jnp.where(leading, term, jnp.minimum(term, 0.0))
-        else:
-            total = total + jnp.minimum(term, 0.0)
-    return total > 0
+        leading = leading & (term >= 0) if k < 4 else jnp.zeros_like(leading)
+        kept.append(jnp.where(leading, term, jnp.minimum(term, 0.0)) if k < 4 else jnp.minimum(term, 0.0))
+    return horner(kept, length)
 
 
-def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int) -> Scalar:
-    """How negative the derivative of this order of sign times the polynomial can be on [0, 1] at most."""
-    total = jnp.zeros_like(sign)
-    for k, c in enumerate(coefficients):
+def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
+    """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
+    falls = []
+    for k, c in enumerate(coefficients[order:], start=order):
         weight = 1
         for j in range(order):
             weight *= k - j
-        if weight > 0:
-            total = total + weight * jnp.maximum(-sign * c, 0.0)
-    return total
+        falls.append(weight * jnp.maximum(-sign * c, 0.0))
+    return horner(falls, length) if falls else jnp.zeros_like(sign)
 
 
 class Watch(NamedTuple):
@@ -94,17 +98,19 @@ def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
     falling = slope <= 0
     below = jnp.where(falling, root - slope, fall)
     above = jnp.where(falling, 2 * value, slope + root)
-    # Nothing pulls it down: clear for ever, unless it is already at zero.
-    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.where(value > 0, jnp.inf, 0.0))
+    # Nothing pulls it down: clear for ever, unless it is at zero and does not rise.
+    endless = jnp.where((value > 0) | ~falling, jnp.inf, 0.0)
+    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), endless)
 
 
-def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar) -> Landing:
+def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
     """March from `start` to the first point of [0, 1] where a watched quantity changes sign.
 
     Each stride is the largest on which a parabola below every watched quantity stays positive, so no
     zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
     When the strides do not come to an end (a zero that is nearly double), the march stops where it
-    is, with no hit: everything before that point is certain.
+    is, with no hit: everything before that point is certain. Where not `needed` it does not start (lanes
+    march together under vmap, as long as the slowest).
     """
     highest = max(w.derivative for w in watches) + 1
     falls = [fall_bound(coefficients, w.sign, w.derivative + 2) for w in watches]
@@ -131,7 +137,7 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar)
         return reached, going, count + 1
 
     x, _, _ = jax.lax.while_loop(
-        lambda carry: carry[1], march, (start, jnp.ones_like(start, bool), jnp.zeros_like(start, int))
+        lambda carry: carry[1], march, (start, needed, jnp.zeros_like(start, jnp.int32))
     )
     values, lengths = strides(x)
     return Landing(x, values, [length <= 32 * eps * x for length in lengths])

@@ -159,7 +159,9 @@ class ExponentialPulse(AbstractMotion):
         value_down = 2 * foot * _growth_ratio(2 * down * foot) / _growth_ratio(down)
         value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
         # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
-        value_up = jnp.where((piece % 3 == 0) & (layer < 0.5), 0.0, value_up)
+        flat = layer < 0.5
+        value_up = jnp.where((piece % 3 == 0) & flat, 0.0, value_up)
+        value_down = jnp.where((piece % 3 > 0) & flat, 1.0, value_down)
         direction = jnp.where(piece < 2, 1.0, -1.0)
         step = direction * unit / self.duration
         terms = [self.amplitude * jnp.where(spiked, value_up, value_down)]
@@ -263,7 +265,7 @@ class RickerPulse(AbstractMotion):
     """A Ricker wavelet, the second or third derivative of a Gaussian.
 
     symmetric: u = amplitude (1 - 2 y^2) e^(-y^2), y = pi (t - center)/period;
-    antisymmetric: u proportional to (3 y - y^3) e^(-y^2/2), y = 2 pi (t - center)/(sqrt(3) period), scaled to `amplitude`.
+    antisymmetric: u proportional to (y^3 - 3 y) e^(-y^2/2), y = 2 pi (t - center)/(sqrt(3) period), scaled to `amplitude`.
 
     **Arguments:**
 

@@ -14,7 +14,7 @@ from jaxrock.free import FreeStage, free_stage
 from jaxrock.models import Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.scene import Scene
-from jaxrock.series import Series, State, Stepper, initial_state
+from jaxrock.series import Series, State, Stepper, initial_state, surpasses
 from jaxrock.status import Status
 
 Scalar = Inexact[Array, "..."]
@@ -249,7 +249,7 @@ def _conclude(stepper: Stepper, state: State) -> Outcome:
     closeness = jnp.minimum(state.closeness, stage.closeness)
     # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
     beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
-    higher = stage.peak > state.peak
+    higher = surpasses(stage.peak, state.peak)
     status = Status.where(state.done, state.status, Status.step_budget_exhausted)
 
     def unless_overturned(value):
@@ -301,7 +301,7 @@ def _simulate(block, motion, model, initial, duration, engine) -> Response:
     times = jnp.where(index <= state.steps, times, jnp.inf)
     impacted = jnp.diff(nodes.impacts, prepend=0) > 0
     # The largest within the duration: the end may be on the way to a peak.
-    higher = state.opening > state.peak
+    higher = surpasses(state.opening, state.peak)
     lost = final.overturned
     return Response(
         time=times[:2],
@@ -330,7 +330,7 @@ def _evaluate(response: Response, time):
     def at(t):
         index = jnp.clip(jnp.searchsorted(response.node_times, t, side="right") - 1, 0, response.node_times.size - 1)
         node = jax.tree.map(lambda x: x[index], response.nodes)
-        forcing, unit = stepper.scene.forcing(node.piece, node.local, stepper.order)
+        forcing, unit = stepper.forcing(node)
         x = jnp.minimum(t, response.duration) - response.node_times[index]
         coefficients = stepper.expand(node, forcing, unit)
         opening, speed = coefficients[-1], jnp.zeros_like(unit)

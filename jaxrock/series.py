@@ -114,22 +114,24 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     )
 
 
-def opening_series(table: Table, stretch: Scalar, side, opening, speed, uplifting, forcing: list, order: int) -> list:
+def opening_series(
+    table: Table, stretch: Scalar, side, opening, speed, uplifting, forcing: list, order: int, keep: Callable
+) -> list:
     """Taylor coefficients of the opening angle from x'' = -stretch^2 [restoring(x) + side u arm(x)].
 
-    `stretch` is p times the unit of time, `speed` the velocity per unit. The sine and cosine of the angle
-    follow their own recurrences (Jorba & Zou 2005).
+    `stretch` is p times the unit of time, `speed` the velocity per unit; `keep` marks what many terms use.
+    The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
     """
     x = [opening, speed]
     slopes = [speed]  # (k + 1) x_{k+1}
     sine, cosine, arms = [], [], []
     if table.trigonometric:
-        sine, cosine = [jnp.sin(opening)], [jnp.cos(opening)]
+        sine, cosine = [keep(jnp.sin(opening))], [keep(jnp.cos(opening))]
     scale = -(stretch**2)
     for k in range(order - 1):
         if table.trigonometric and k > 0:
-            sine.append(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) / k)
-            cosine.append(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) / k)
+            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k)))
+            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k)))
 
         def combine(constant, line, of_sine, of_cosine, k):
             terms = [] if constant is None or k > 0 else [constant]
@@ -145,7 +147,7 @@ def opening_series(table: Table, stretch: Scalar, side, opening, speed, upliftin
         moment = sum(products) * side if products else 0.0
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
         moment = moment if restoring is None else moment + restoring
-        term = scale * moment / ((k + 1) * (k + 2))
+        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))))
         if k == 0:
             term = jnp.where(uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)
@@ -153,11 +155,34 @@ def opening_series(table: Table, stretch: Scalar, side, opening, speed, upliftin
     return x
 
 
+def keeper(one: Scalar) -> Callable:
+    """A function that marks a value as worth keeping: it divides by a one that the compiler cannot see.
+
+    On CPUs, XLA computes a cheap value again in every loop that uses it; a series would be computed dozens
+    of times a step. A division is never repeated.
+    """
+    if jax.default_backend() != "cpu":
+        return lambda value: value
+    return lambda value: value / one
+
+
 def _when(needed: Flag, function: Callable, value):
-    """`function(value)` where needed; under vmap the function runs only if some lane needs it."""
-    return jax.lax.while_loop(
-        lambda carry: carry[0], lambda carry: (jnp.zeros_like(carry[0]), function(carry[1])), (needed, value)
-    )[1]
+    """`function(value, needed, keep)` where needed; under vmap the function runs only if some lane needs it.
+
+    What the function makes from values outside must pass through `keep` first: otherwise XLA moves it
+    out of the branch, and every step pays for it.
+    """
+
+    def body(carry):
+        first, value = carry
+        return jnp.zeros_like(first), function(value, first, keeper(jnp.where(first, 1.0, 2.0).astype(jnp.result_type(float))))
+
+    return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
+
+
+def surpasses(value: Scalar, best: Scalar) -> Flag:
+    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first one counts."""
+    return value > best * (1 + 16 * jnp.finfo(best.dtype).eps)
 
 
 def _step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
@@ -187,6 +212,15 @@ class Stepper(eqx.Module):
         """Time of a state [s]."""
         return self.scene.knots[state.piece] + state.local
 
+    def _keep(self, state: State) -> Callable:
+        return keeper(jnp.where(state.steps < 0, 2.0, jnp.ones_like(state.local)))
+
+    def forcing(self, state: State) -> tuple[list[Scalar], Scalar]:
+        """Taylor coefficients of the ground acceleration [g] about a state, in time/unit, and the unit [s]."""
+        terms, unit = self.scene.forcing(state.piece, state.local, self.order)
+        keep = self._keep(state)
+        return [keep(u) for u in terms], keep(unit)
+
     def _room(self, state: State, unit: Scalar) -> Scalar:
         """Time to the next knot or the stop, in units."""
         to_knot = self.scene.lengths[state.piece] - state.local
@@ -202,7 +236,7 @@ class Stepper(eqx.Module):
 
     def advance(self, state: State) -> State:
         """One step of a lane: waiting at rest, or rocking."""
-        forcing, unit = self.scene.forcing(state.piece, state.local, self.order)
+        forcing, unit = self.forcing(state)
         room = self._room(state, unit)
         resting = state.side == 0
         waited = self._wait(state, forcing, unit, room)
@@ -233,16 +267,13 @@ class Stepper(eqx.Module):
         piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
         waited = eqx.tree_at(lambda s: (s.piece, s.local, s.done), state, (piece, local, over | never))
 
-        def search(waited):
+        def search(waited, needed, keep):
+            series = rescaled(forcing, keep(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
             # A threshold that is only touched (or was just left) is not met again at once.
             start = jnp.where(touching, 1e-8, 0.0).astype(gap.dtype)
-            again, _ = scene.forcing(state.piece, state.local, self.order)
-            again = rescaled(again, length)
-            again = again + [jnp.zeros_like(length)] * (2 - len(again))
             one = jnp.ones_like(gap)
-            landing = first_event(
-                again, [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)], start
-            )
+            watches = [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)]
+            landing = first_event([keep(c) for c in series], watches, start, needed)
             value, rate = landing.jet
             met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
             early = landing.x < 1
@@ -288,6 +319,7 @@ class Stepper(eqx.Module):
             state.uplifting,
             forcing,
             self.order,
+            self._keep(state),
         )
 
     def _rock(self, state: State, forcing, unit, room, rocking: Flag) -> State:
@@ -295,19 +327,23 @@ class Stepper(eqx.Module):
         scene = self.scene
         table, saddle = scene.table, scene.table.saddle
         coefficients = self.expand(state, forcing, unit)
-        length = _step_length(coefficients, self.tolerance * scene.alpha, jnp.minimum(room, 16.0))
+        # Relative to the motion itself while it is small: tiny rotations keep their digits too.
+        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[:4]))))
+        length = _step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
         length = jnp.where(full, room, length)
-        scaled = rescaled(coefficients, length)
-        per_step = length * unit * scene.p  # dimensionless time of the step
-        safe_step = jnp.where(per_step > 0, per_step, 1.0)
-        opening, speed = jet(scaled, jnp.ones_like(length), 1)
+        keep = self._keep(state)
+        length = keep(length)
+        stretch = unit * scene.p
+        opening, speed = (keep(value) for value in jet(coefficients, length, 1))
+        velocity = speed / stretch
 
-        signs = self._signs(state, scaled)
-        turning = ~keeps_sign(derivative(scaled), signs[0])
+        signs = self._signs(state, coefficients)
+        turning = keep(keeps_sign(derivative(coefficients), signs[0], length)) <= 0
         crossing = (opening >= saddle) != state.beyond
-        top_speed = jnp.maximum(jnp.abs(scaled[1]), jnp.abs(speed)) + _bend(scaled)
-        faster = (top_speed > state.fastest * per_step) & ~keeps_sign(derivative(derivative(scaled)), signs[1])
+        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length))
+        steady = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length)) > 0
+        faster = (top_speed > state.fastest * stretch) & ~steady
         eventful = (turning | crossing | faster | (opening <= 0)) & rocking
         if self.history:
             eventful = eventful | (rocking & (opening >= jnp.pi / 2))
@@ -319,7 +355,7 @@ class Stepper(eqx.Module):
         flat = opening >= jnp.pi / 2 if scene.falls_flat else jnp.zeros_like(escaped)
 
         piece, local, over = self._advance(state, length * unit, full)
-        moved = (per_step > 0) & rocking
+        moved = (length > 0) & rocking
         passed = eqx.tree_at(
             lambda s: (s.piece, s.local, s.opening, s.velocity, s.uplifting, s.steady, s.fastest, s.done),
             state,
@@ -327,18 +363,18 @@ class Stepper(eqx.Module):
                 piece,
                 local,
                 opening,
-                jnp.where(moved, speed / safe_step, state.velocity),
+                jnp.where(moved, velocity, state.velocity),
                 state.uplifting & ~moved,
                 state.steady & ~moved,
-                jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(speed / safe_step)), state.fastest),
+                jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
                 over,
             ),
         )
 
-        def land(passed):
-            again, _ = scene.forcing(state.piece, state.local, self.order)
-            scaled = rescaled(self.expand(state, again, unit), length)
-            return self._land(state, passed, scaled, rescaled(again, length), signs, faster, length, unit)
+        def land(passed, needed, keep):
+            scaled = [keep(c) for c in rescaled(coefficients, keep(length))]
+            series = rescaled(forcing, keep(length))
+            return self._land(state, passed, scaled, series, signs, faster, length, unit, needed)
 
         stepped = _when(eventful & moved, land, passed)
         if self.history:
@@ -363,19 +399,19 @@ class Stepper(eqx.Module):
         )
         return velocity, acceleration
 
-    def _land(self, state, passed, scaled, forcing, signs, faster, length, unit) -> State:
+    def _land(self, state, passed, scaled, forcing, signs, faster, length, unit, needed) -> State:
         """Find the first event of a step, move the lane there, and let it happen."""
         scene, saddle = self.scene, self.scene.table.saddle
         one = jnp.ones_like(length)
         watches = [
             Watch(0, one, 0.0, True),
-            Watch(1, signs[0], 0.0, True),
+            Watch(1, signs[0], 0.0, self._matters(state, scaled)),
             Watch(2, signs[1], 0.0, faster),
             Watch(0, jnp.where(state.beyond, 1.0, -1.0), saddle, True),
         ]
         if self.history:
             watches.append(Watch(0, -one, jnp.pi / 2, state.opening < jnp.pi / 2))
-        landing = first_event(scaled, watches, _clear_start(state, scaled, saddle))
+        landing = first_event(scaled, watches, _clear_start(state, scaled, saddle), needed)
         per_step = length * unit * scene.p
         opening, speed, bend = landing.jet[0], landing.jet[1] / per_step, landing.jet[2] / per_step**2
         impact, turning, extremum, crossing = landing.hits[:4]
@@ -400,6 +436,19 @@ class Stepper(eqx.Module):
         landed = self._note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
         return self._impact(landed, impact, speed, forcing, landing, length, unit)
 
+    def _matters(self, state: State, scaled) -> Flag:
+        """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
+        always = jnp.ones_like(state.beyond)
+        if self.history:
+            return always
+        # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
+        fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
+        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
+        top = jnp.where(fall > 0, state.opening + rise, jnp.inf)
+        share = self.scene.table.manifold(jnp.minimum(top, self.scene.table.saddle))
+        share = (share / self.scene.table.manifold(jnp.zeros_like(top))) ** 2
+        return state.beyond | (top >= state.peak) | (share < state.closeness)
+
     def _note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
         """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
         table = self.scene.table
@@ -412,7 +461,7 @@ class Stepper(eqx.Module):
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
         beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
         beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
-        higher = turning & outward & (opening > state.peak)
+        higher = turning & outward & surpasses(opening, state.peak)
         return eqx.tree_at(
             lambda s: (s.peak, s.peak_time, s.closeness, s.closeness_beyond),
             state,
@@ -428,8 +477,9 @@ class Stepper(eqx.Module):
         """Change side with the restitution; come to rest where the impacts to come no longer matter.
 
         After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come
-        last 2 v (1/a + e/a')/(1 - e^2). They may be replaced by rest if they are certain to end before
-        the threshold is reached, and lower than the tolerance.
+        last 2 v (1/a + e/a')/(1 - e^2). They are replaced by rest if they are certain to end before the
+        threshold is reached: what follows does not depend on them. Each is slower by e, so those above the
+        tolerance can be counted.
         """
         scene, e = self.scene, self.scene.restitution
         rebound = e * jnp.abs(speed)
@@ -447,9 +497,13 @@ class Stepper(eqx.Module):
         window = 2 * remaining / (scene.p * unit)  # hops at half the deceleration, in units
         steady = steepest * window * table.arm_at_rest <= weakest / 2
         within = window <= (1 - landing.x) * length
-        low = rebound**2 <= 2 * safe * 100 * self.tolerance * scene.alpha
-        dies = (weakest > 0) & (e < 1) & steady & within & low
+        # Speed of a hop as high as the tolerance; a history shows the hops down to there.
+        low = jnp.sqrt(2 * safe * 100 * self.tolerance * scene.alpha)
+        dies = (weakest > 0) & (e < 1) & steady & within
+        dies = dies & (rebound <= low) if self.history else dies
         rests = impact & (dies | (rebound == 0))
+        more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
+        more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
         wait = jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
         return eqx.tree_at(
             lambda s: (
@@ -466,7 +520,7 @@ class Stepper(eqx.Module):
             ),
             state,
             (
-                state.impacts + impact,
+                state.impacts + impact + more,
                 jnp.where(impact, self.time(state), state.impact_time),
                 jnp.where(impact, state.side * speed, state.impact_velocity),
                 jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),
@@ -480,10 +534,11 @@ class Stepper(eqx.Module):
         )
 
 
-def _bend(scaled: list[Scalar]) -> Scalar:
-    """How far the velocity can exceed its end values within the step (an eighth of its largest second derivative)."""
-    one = jnp.ones_like(scaled[0])
-    return jnp.maximum(fall_bound(scaled, one, 3), fall_bound(scaled, -one, 3)) / 8
+def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:
+    """How far the velocity can exceed its end values within a step (an eighth of its largest second derivative)."""
+    one = jnp.ones_like(length)
+    third = jnp.maximum(fall_bound(coefficients, one, 3, length), fall_bound(coefficients, -one, 3, length))
+    return third * length**2 / 8
 
 
 def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
