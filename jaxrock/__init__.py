@@ -1,4 +1,12 @@
-"""Rocking and overturning of free-standing blocks, on JAX."""
+"""Rocking and overturning of free-standing blocks, on JAX.
+
+Conventions: angles in rad, time in s, accelerations in g; positive ground acceleration drives negative
+rotation; `alpha` is the slenderness angle, `p` the frequency parameter [rad/s], `restitution` the angular
+velocity after an impact over that before it.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
 
 from jaxrock.block import Block as Block
 from jaxrock.models import Housner as Housner, Linear as Linear
@@ -13,8 +21,26 @@ from jaxrock.pulses import (
     SinePulse as SinePulse,
     TriangularPulse as TriangularPulse,
 )
+from jaxrock.records import example_record as example_record, read_record as read_record
 from jaxrock.response import Outcome as Outcome, Response as Response, outcome as outcome, simulate as simulate
 from jaxrock.series import Series as Series
+from jaxrock.spectra import (
+    OverturningMap as OverturningMap,
+    Spectrum as Spectrum,
+    overturning_map as overturning_map,
+    rocking_spectrum as rocking_spectrum,
+    self_similar_spectrum as self_similar_spectrum,
+)
 from jaxrock.status import Status as Status
 
+if TYPE_CHECKING:
+    from jaxrock import plot as plot
+
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str):
+    # Figures are drawn by few programs that compute: `jaxrock.plot` is imported when it is first used.
+    if name == "plot":
+        return importlib.import_module("jaxrock.plot")
+    raise AttributeError(f"module 'jaxrock' has no attribute {name!r}")

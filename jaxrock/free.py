@@ -7,11 +7,11 @@ in the linear model), its peaks and verdicts follow from the energy.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.models import Table
 
-Scalar = Inexact[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
 
 
 class FreeStage(eqx.Module):

@@ -11,11 +11,11 @@ A coefficient that a model does not have is None, so that nothing is computed fo
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock.block import Block
 
-Scalar = Inexact[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
 
 
 def _sum_of(*products: tuple[Scalar | None, Scalar | float]) -> Scalar | float:

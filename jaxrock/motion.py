@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._checks import checked, finite, positive
 
-Scalar = Inexact[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
 
 
 class AbstractMotion(eqx.Module):
@@ -22,7 +22,7 @@ class AbstractMotion(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def knots(self) -> Inexact[Array, " pieces+1"]:
+    def knots(self) -> Inexact[Array, " knots"]:
         """Times that bound the smooth pieces, from 0 to the end of the motion [s], never decreasing."""
 
     @property
@@ -115,7 +115,7 @@ class Record(AbstractMotion):
         self.name = name
 
     @property
-    def knots(self) -> Inexact[Array, " pieces+1"]:
+    def knots(self) -> Inexact[Array, " knots"]:
         # A single sample is a piece of no length: the ground never moves.
         if self.samples.shape[-1] == 1:
             return jnp.zeros(2, self.samples.dtype)

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
 
 
 def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:

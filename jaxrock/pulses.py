@@ -4,7 +4,7 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import checked, finite, not_nan, one_of, positive
 from jaxrock.motion import AbstractMotion
@@ -130,7 +130,7 @@ class ExponentialPulse(AbstractMotion):
         zero = jnp.zeros_like(inner)
         return self.duration * jnp.stack([zero, inner, zero + 0.5, 1 - inner, zero + 1])
 
-    def _curved(self, piece) -> Real:
+    def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
         """Whether a piece is a layer; one thinner than rounding is left out."""
         in_layer = jnp.where(self.shape > 0, piece % 3 > 0, piece % 3 == 0)
         return in_layer & (jnp.abs(self.shape) < 1e24)

@@ -17,7 +17,7 @@ from jaxrock.scene import Scene
 from jaxrock.series import Series, State, Stepper, initial_state, surpasses
 from jaxrock.status import Status
 
-Scalar = Inexact[Array, "..."]
+Scalar = Inexact[ArrayLike, "..."]
 _OUTCOME_STEPS = 100_000
 
 
@@ -337,10 +337,11 @@ def _evaluate(response: Response, time):
         for c in reversed(coefficients[:-1]):
             speed = speed * (x / unit) + opening
             opening = opening * (x / unit) + c
-        still = (node.side == 0) | node.done
-        opening = jnp.where(node.done, node.opening, opening)
-        velocity = jnp.where(still, jnp.where(node.overturned | (node.side == 0), 0.0, node.velocity * stepper.scene.p), speed / unit)
-        return node.side * opening, jnp.where(node.side == 0, 0.0, node.side * velocity)
+        # The last node is the end of the history: the block lies, rests, or is caught in motion there.
+        lies = node.done & (node.opening >= jnp.pi / 2)
+        velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed / unit)
+        velocity = jnp.where(lies, 0.0, velocity)
+        return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity
 
     rotation, velocity = jax.vmap(at)(time.ravel())
     return rotation.reshape(time.shape), velocity.reshape(time.shape)

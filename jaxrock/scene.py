@@ -3,13 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock.block import Block
 from jaxrock.models import Model, Table
 from jaxrock.motion import AbstractMotion
 
-Scalar = Inexact[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
 
 _FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
 
@@ -31,12 +31,12 @@ class Scene(eqx.Module):
     alpha: Scalar
     restitution: Scalar
     motion: AbstractMotion
-    knots: Inexact[Array, " pieces+1"]
-    lengths: Inexact[Array, " pieces+1"]
-    scales: Inexact[Array, " pieces+1"]
-    ceilings: Inexact[Array, " pieces+1"]  # bound of |acceleration| from each piece to the end [g]
-    quiet_near: Inexact[Array, " pieces+1"]  # bound over the next pieces [g]
-    quiet_far: Inexact[Array, " pieces+1"]
+    knots: Inexact[Array, " knots"]
+    lengths: Inexact[Array, " knots"]
+    scales: Inexact[Array, " knots"]
+    ceilings: Inexact[Array, " knots"]  # bound of |acceleration| from each piece to the end [g]
+    quiet_near: Inexact[Array, " knots"]  # bound over the next pieces [g]
+    quiet_far: Inexact[Array, " knots"]
     falls_flat: bool = eqx.field(static=True)
 
     @classmethod

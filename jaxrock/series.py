@@ -12,15 +12,15 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.models import Table
 from jaxrock.polynomial import Landing, Watch, derivative, fall_bound, first_event, jet, keeps_sign, rescaled
 from jaxrock.scene import Scene
 from jaxrock.status import Status
 
-Scalar = Inexact[Array, ""]
-Flag = Bool[Array, ""]
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
 
 
 class Series(eqx.Module):
@@ -181,8 +181,8 @@ def _when(needed: Flag, function: Callable, value):
 
 
 def surpasses(value: Scalar, best: Scalar) -> Flag:
-    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first one counts."""
-    return value > best * (1 + 16 * jnp.finfo(best.dtype).eps)
+    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
+    return value > best * (1 + 4096 * jnp.finfo(best.dtype).eps)
 
 
 def _step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
@@ -461,13 +461,14 @@ class Stepper(eqx.Module):
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
         beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
         beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
-        higher = turning & outward & surpasses(opening, state.peak)
+        higher = turning & outward
+        first = higher & surpasses(opening, state.peak)
         return eqx.tree_at(
             lambda s: (s.peak, s.peak_time, s.closeness, s.closeness_beyond),
             state,
             (
-                jnp.where(higher, opening, state.peak),
-                jnp.where(higher, self.time(state), state.peak_time),
+                jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
+                jnp.where(first, self.time(state), state.peak_time),
                 closeness,
                 beyond,
             ),

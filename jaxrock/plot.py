@@ -1,0 +1,163 @@
+"""Figures: functions that take results, draw them into matplotlib axes and return the axes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrock.response import Response
+from jaxrock.spectra import OverturningMap, Spectrum
+
+_BLUE, _RED, _GREY, _SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
+
+
+def history(response: Response, axes=None):
+    """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
+
+    **Arguments:**
+
+    - `response`: result of `simulate`.
+    - `axes`: three matplotlib axes; None makes a figure.
+
+    **Returns:** the three axes.
+    """
+    import matplotlib.pyplot as plt
+
+    if axes is None:
+        _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    scene = response.stepper.scene
+    time, alpha = np.asarray(response.time), float(scene.alpha)
+    acceleration = np.asarray(scene.motion.acceleration(response.time))
+    impacts = np.asarray(response.impact_times)
+    speeds = np.asarray(response.impact_velocities) / (float(scene.p) * alpha)
+    curves = (np.asarray(response.rotation) / alpha, np.asarray(response.velocity) / (float(scene.p) * alpha))
+    for axis, curve in zip(axes, (*curves, acceleration)):
+        axis.plot(time, curve, color=_BLUE if axis is not axes[2] else "black", linewidth=0.9)
+        axis.axhline(0, color=_GREY, linewidth=0.5)
+    axes[0].plot(impacts, np.zeros_like(impacts), "|", color=_RED, markersize=7, label="impact")
+    axes[1].plot(impacts, speeds, ".", color=_RED, markersize=3)
+    threshold = float(scene.table.threshold)
+    for sign in (-1, 1):
+        axes[2].axhline(sign * threshold, color=_SAND, linewidth=0.9, label="uplift threshold" if sign > 0 else None)
+    axes[0].set_ylabel(r"rotation $\theta/\alpha$")
+    axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
+    axes[2].set_ylabel("ground\nacceleration [g]")
+    axes[2].set_xlabel("time [s]")
+    for axis in (axes[0], axes[2]):
+        axis.legend(loc="upper right", fontsize=8, frameon=False)
+    return axes
+
+
+def phase(response: Response, axis=None):
+    """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
+
+    **Arguments:**
+
+    - `response`: result of `simulate`.
+    - `axis`: matplotlib axis; None makes a figure.
+
+    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns.
+    """
+    import matplotlib.pyplot as plt
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
+    scene = response.stepper.scene
+    alpha, p = float(scene.alpha), float(scene.p)
+    rotation, velocity = np.asarray(response.rotation) / alpha, np.asarray(response.velocity) / (p * alpha)
+    # The line breaks at impacts: the velocity jumps there.
+    crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
+    axis.plot(
+        np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=_BLUE, linewidth=0.8
+    )
+    opening = np.linspace(0, 2, 101)
+    manifold = np.asarray(jax.vmap(scene.table.manifold)(jnp.asarray(opening * alpha))) / alpha
+    for side in (1, -1):
+        label = "stable manifold" if side > 0 else None
+        axis.plot(side * opening, side * manifold, color=_RED, linewidth=1, label=label)
+        axis.plot(side * opening, -side * manifold, color=_RED, linewidth=0.7, linestyle=":")
+        axis.plot([side], [0], "o", color=_RED, markersize=4)
+    axis.axvline(0, color=_GREY, linewidth=0.5)
+    reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
+    axis.set_xlim(-reach, reach)
+    axis.set_ylim(-max(1.2, 1.1 * np.max(np.abs(velocity[np.abs(rotation) < reach]), initial=0)), None)
+    axis.set_ylim(axis.get_ylim()[0], -axis.get_ylim()[0])
+    axis.set_xlabel(r"rotation $\theta/\alpha$")
+    axis.set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
+    axis.legend(loc="upper right", fontsize=8, frameon=False)
+    return axis
+
+
+def spectrum(result: Spectrum, axes=None):
+    """Draw a rocking spectrum: peak rotation and peak velocity; overturned blocks at the top edge.
+
+    **Arguments:**
+
+    - `result`: from `rocking_spectrum` or `self_similar_spectrum`.
+    - `axes`: two matplotlib axes; None makes a figure.
+
+    **Returns:** the two axes.
+    """
+    import matplotlib.pyplot as plt
+
+    if axes is None:
+        _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), layout="constrained")
+    abscissa = np.asarray(result.abscissa)
+    rows = np.atleast_2d(np.asarray(result.overturned))
+    for axis, values in zip(axes, (result.max_rotation, result.max_velocity)):
+        values = np.atleast_2d(np.where(np.isfinite(values), values, np.nan))
+        colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(values))) if len(values) > 1 else [_BLUE]
+        for i, (curve, color) in enumerate(zip(values, colors)):
+            label = None if result.intensity is None else f"{float(result.intensity[i]):g}"
+            axis.plot(abscissa, curve, color=color, linewidth=1, label=label)
+        axis.set_ylim(bottom=0)
+        lost = rows.any(axis=0)
+        if lost.any():
+            where = lost if len(values) == 1 else rows.all(axis=0)
+            axis.fill_between(
+                abscissa, 0, 1, where=where, transform=axis.get_xaxis_transform(), color=_RED, alpha=0.15,
+                linewidth=0, label="overturned" if len(values) == 1 else "all overturned", step="mid",
+            )  # fmt: skip
+    axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
+    axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
+    self_similar = result.intensity is not None
+    axes[1].set_xlabel(r"frequency ratio $\omega/p$" if self_similar else r"$2\pi/p$ [s]")
+    if self_similar or axes[0].get_legend_handles_labels()[0]:
+        axes[0].legend(
+            title="intensity" if self_similar else None, fontsize=8, title_fontsize=8, frameon=False, loc="upper right"
+        )
+    return axes
+
+
+def overturning(result: OverturningMap, axis=None):
+    """Draw an overturning map: safe, overturned without impact, overturned after impacts.
+
+    **Arguments:**
+
+    - `result`: from `overturning_map`.
+    - `axis`: matplotlib axis; None makes a figure.
+
+    **Returns:** the axis.
+    """
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(7, 5), layout="constrained")
+    names = ("not computed", "safe", "overturned without impact", "overturned after impacts")
+    colors = ("black", "#f3efe6", _BLUE, _RED)
+    axis.pcolormesh(
+        np.asarray(result.frequency_ratio),
+        np.asarray(result.intensity),
+        np.asarray(result.state),
+        cmap=ListedColormap(colors),
+        norm=BoundaryNorm((-1.5, -0.5, 0.5, 1.5, 2.5), 4),
+        shading="nearest",
+        rasterized=True,
+    )
+    shown = sorted(set(np.unique(np.asarray(result.state)).tolist()) | {0, 1, 2})
+    handles = [Patch(facecolor=colors[i + 1], edgecolor=_GREY, label=names[i + 1]) for i in shown]
+    axis.legend(handles=handles, loc="upper left", fontsize=8)
+    axis.set_xlabel(r"frequency ratio $\omega/p$")
+    axis.set_ylabel("intensity (peak acceleration / uplift threshold)")
+    return axis

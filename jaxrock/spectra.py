@@ -1,0 +1,254 @@
+"""Whole surfaces: rocking spectra and overturning maps, many scenes in chunks of one compiled shape."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxrock._checks import as_real, positive
+from jaxrock._progress import Progress
+from jaxrock.block import Block
+from jaxrock.models import Housner, Model
+from jaxrock.motion import AbstractMotion
+from jaxrock.pulses import SinePulse
+from jaxrock.response import Outcome, outcome
+from jaxrock.series import Series
+from jaxrock.status import Status
+
+_LANES = 32  # neighbours that step together
+_BLOCK = 4096  # scenes of one compiled call
+
+# Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
+_CPU_OPTIONS = {
+    "xla_cpu_prefer_vector_width": 512,
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+    "xla_cpu_fast_math_honor_division": True,
+    "xla_cpu_fast_math_honor_functions": True,
+}
+
+
+class Spectrum(eqx.Module):
+    """A rocking spectrum; every result has the shape (..., len(abscissa)).
+
+    - `abscissa`: 2 pi/p [s], or the frequency ratio omega/p [-] of a self-similar spectrum.
+    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
+    - `max_velocity`: peak |angular velocity| over p alpha [-]; infinite where the block overturned.
+    - `impact_count`, `overturned`, `margin`, `status`: as in `Outcome`.
+    - `intensity`: peak acceleration over the uplift threshold [-], one per row (self-similar spectrum), or None.
+    """
+
+    abscissa: Float[Array, " n"]
+    max_rotation: Float[Array, "*rows n"]
+    max_velocity: Float[Array, "*rows n"]
+    impact_count: Int[Array, "*rows n"]
+    overturned: Bool[Array, "*rows n"]
+    margin: Float[Array, "*rows n"]
+    status: Status
+    intensity: Float[Array, " rows"] | None = None
+
+
+class OverturningMap(eqx.Module):
+    """An overturning map; every result has the shape (len(intensity), len(frequency_ratio)).
+
+    - `frequency_ratio`: omega/p [-]; `intensity`: peak acceleration over the uplift threshold [-].
+    - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
+    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
+    - `impact_count`, `margin`, `status`: as in `Outcome`.
+    """
+
+    frequency_ratio: Float[Array, " columns"]
+    intensity: Float[Array, " rows"]
+    state: Int[Array, "rows columns"]
+    max_rotation: Float[Array, "rows columns"]
+    impact_count: Int[Array, "rows columns"]
+    margin: Float[Array, "rows columns"]
+    status: Status
+
+
+def rocking_spectrum(
+    alpha: ArrayLike,
+    motion: AbstractMotion,
+    period: ArrayLike,
+    restitution: ArrayLike | None = None,
+    model: Model = Housner(),
+    *,
+    engine: Series | None = None,
+    progress: bool | None = None,
+) -> Spectrum:
+    """Peak response of blocks of one slenderness and every size under one motion.
+
+    **Arguments:**
+
+    - `alpha`: slenderness angle [rad], in (0, pi/2).
+    - `motion`: any motion.
+    - `period`: (n,) values of 2 pi/p [s], positive.
+    - `restitution`, `model`, `engine`: as in `Block` and `outcome`.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** a `Spectrum` over the periods.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
+    """
+    period = _axis("period", period)
+    Block(alpha, 1.0, restitution)  # raises here, where values are known
+
+    def one(period, scene):
+        alpha, motion, restitution = scene
+        return outcome(Block(alpha, 2 * jnp.pi / period, restitution), motion, model, engine=engine)
+
+    scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
+    found = _in_chunks(one, (period,), scene, "spectrum", progress)
+    scale = (scene[0], 2 * jnp.pi / period * scene[0])
+    return _spectrum(period, found, scale)
+
+
+def self_similar_spectrum(
+    frequency_ratio: ArrayLike,
+    intensity: ArrayLike,
+    *,
+    alpha: ArrayLike = 0.2,
+    restitution: ArrayLike | None = None,
+    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    model: Model = Housner(),
+    engine: Series | None = None,
+    progress: bool | None = None,
+) -> Spectrum:
+    """Peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
+
+    **Arguments:**
+
+    - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
+    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
+    - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
+    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that).
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+
+    **Returns:** a `Spectrum` with results of shape (rows, n).
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), section 4.
+    """
+    found, ratio, intensity = _over_pulses(
+        frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
+    )
+    alpha = as_real("alpha", alpha)
+    return eqx.tree_at(
+        lambda s: s.intensity, _spectrum(ratio, found, (alpha, alpha)), intensity, is_leaf=lambda x: x is None
+    )
+
+
+def overturning_map(
+    frequency_ratio: ArrayLike,
+    intensity: ArrayLike,
+    *,
+    alpha: ArrayLike = 0.2,
+    restitution: ArrayLike | None = None,
+    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    model: Model = Housner(),
+    engine: Series | None = None,
+    progress: bool | None = None,
+) -> OverturningMap:
+    """Who overturns under a pulse, over its frequency and intensity.
+
+    **Arguments:** as in `self_similar_spectrum`.
+
+    **Returns:** an `OverturningMap`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
+    """
+    found, ratio, intensity = _over_pulses(
+        frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
+    )
+    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
+    return OverturningMap(
+        frequency_ratio=ratio,
+        intensity=intensity,
+        state=jnp.where(found.status == Status.successful, state, -1),
+        max_rotation=found.max_rotation / as_real("alpha", alpha),
+        impact_count=found.impact_count,
+        margin=found.margin,
+        status=found.status,
+    )
+
+
+def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
+    """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
+    ratio, intensity = _axis("frequency_ratio", frequency_ratio), _axis("intensity", intensity)
+    Block(alpha, 1.0, restitution)
+
+    def one(intensity, ratio, scene):
+        alpha, restitution = scene
+        block = Block(alpha, jnp.ones_like(alpha), restitution)
+        motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
+        return outcome(block, motion, model, engine=engine)
+
+    scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
+    # Neighbours in intensity share a chunk: they move alike.
+    columns, rows = (x.ravel() for x in jnp.meshgrid(ratio, intensity, indexing="ij"))
+    found = _in_chunks(one, (rows, columns), scene, label, progress)
+    shape = (ratio.size, intensity.size)
+    return jax.tree.map(lambda x: x.reshape(shape).T, found), ratio, intensity
+
+
+def _axis(name: str, values: ArrayLike) -> Float[Array, " n"]:
+    array = jnp.atleast_1d(positive(name, values))
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")
+    return array
+
+
+def _spectrum(abscissa, found: Outcome, scale) -> Spectrum:
+    return Spectrum(
+        abscissa=abscissa,
+        max_rotation=found.max_rotation / scale[0],
+        max_velocity=found.max_velocity / scale[1],
+        impact_count=found.impact_count,
+        overturned=found.overturned,
+        margin=found.margin,
+        status=found.status,
+    )
+
+
+def _in_chunks(function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None):
+    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape."""
+    size = axes[0].size
+    block = min(_BLOCK, -(-size // _LANES) * _LANES)
+
+    def run(axes, scene):
+        chunks = [axis.reshape(-1, _LANES) for axis in axes]
+        found = jax.lax.map(lambda chunk: jax.vmap(lambda *point: function(*point, scene))(*chunk), chunks)
+        return jax.tree.map(lambda x: x.reshape(-1), found)
+
+    blocks = -(-size // block)
+    padded = [jnp.concatenate([axis, jnp.full(blocks * block - size, axis[-1])]) for axis in axes]
+    parts, compiled = [], None
+    bar = Progress(size, label, progress)
+    for i in range(blocks):
+        part = [axis[i * block : (i + 1) * block] for axis in padded]
+        if compiled is None:
+            compiled = _compile(run, part, scene)
+        # Results wait in host memory, whatever the size of the surface.
+        parts.append(jax.tree.map(np.asarray, compiled(part, scene)))
+        bar.update(min((i + 1) * block, size))
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
+
+
+def _compile(function: Callable, *arguments):
+    """Compile for speed; fall back on the defaults where this jaxlib does not know the options."""
+    lowered = jax.jit(function).lower(*arguments)
+    if jax.default_backend() == "cpu":
+        try:
+            return lowered.compile(_CPU_OPTIONS)
+        except Exception:  # an unknown option is reported by an internal error type
+            pass
+    return lowered.compile()
