@@ -1,6 +1,6 @@
 """Argument checks: one message template, for values that are known and for values under jit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
+Values = ArrayLike | Sequence[float]
 
-def as_real(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+
+def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as a floating-point array, or say what it is instead."""
     try:
         array = jnp.asarray(value)
@@ -23,7 +25,7 @@ def as_real(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
     return jax.lax.convert_element_type(array, array.dtype)
 
 
-def checked(name: str, value: ArrayLike, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
+def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
     """Return `value` as an array for which `holds` is true everywhere.
 
     A known value that fails raises ValueError at once; one that is traced carries an
@@ -40,17 +42,17 @@ def checked(name: str, value: ArrayLike, allowed: str, holds: Callable) -> Inexa
     return array
 
 
-def positive(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+def positive(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as an array of positive finite numbers."""
     return checked(name, value, "be positive and finite", lambda x: (x > 0) & (x < np.inf))
 
 
-def finite(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+def finite(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as an array of finite numbers."""
     return checked(name, value, "be finite", lambda x: (x > -np.inf) & (x < np.inf))
 
 
-def not_nan(name: str, value: ArrayLike) -> Inexact[Array, "..."]:
+def not_nan(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as an array of numbers, of which some may be infinite."""
     return checked(name, value, "be a number", lambda x: x == x)
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import checked, finite, positive
+from jaxrock._checks import Values, checked, finite, positive
 
 Scalar = Inexact[ArrayLike, ""]
 
@@ -48,7 +48,7 @@ class AbstractMotion(eqx.Module):
         """Time at which the ground comes to rest [s]."""
         return self.knots[-1]
 
-    def acceleration(self, time: ArrayLike) -> Inexact[Array, "..."]:
+    def acceleration(self, time: Values) -> Inexact[Array, "..."]:
         """Ground acceleration.
 
         **Arguments:**
@@ -106,7 +106,7 @@ class Record(AbstractMotion):
     dt: Inexact[Array, "..."]
     name: str = eqx.field(static=True)
 
-    def __init__(self, acceleration: ArrayLike, dt: ArrayLike, name: str = ""):
+    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
         samples = finite("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")

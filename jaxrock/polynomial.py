@@ -64,15 +64,20 @@ def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scal
     return horner(kept, length)
 
 
-def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
-    """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
+def _falls(coefficients: list[Scalar], sign: Scalar, order: int) -> list[Scalar]:
+    """Coefficients of a bound of how negative this derivative of sign times the polynomial can be from 0 on."""
     falls = []
     for k, c in enumerate(coefficients[order:], start=order):
         weight = 1
         for j in range(order):
             weight *= k - j
         falls.append(weight * jnp.maximum(-sign * c, 0.0))
-    return horner(falls, length) if falls else jnp.zeros_like(sign)
+    return falls or [jnp.zeros_like(sign)]
+
+
+def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
+    """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
+    return horner(_falls(coefficients, sign, order), length)
 
 
 class Watch(NamedTuple):
@@ -113,31 +118,29 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     march together under vmap, as long as the slowest).
     """
     highest = max(w.derivative for w in watches) + 1
-    falls = [fall_bound(coefficients, w.sign, w.derivative + 2) for w in watches]
+    falls = [_falls(coefficients, w.sign, w.derivative + 2) for w in watches]
     eps = jnp.finfo(start.dtype).eps
 
-    def strides(x):
-        values = jet(coefficients, x, highest)
+    def clear(x, radius):
+        """The polynomial's jet at x, and for every quantity the length after x on which it has no zero."""
+        values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
-            jnp.where(
-                w.active,
-                _clear_length(w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], fall),
-                jnp.inf,
-            )
+            _clear_length(w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end))
             for w, fall in zip(watches, falls)
         ]
-        return values, lengths
+        return values, [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
 
     def march(carry):
-        x, _, count = carry
-        _, lengths = strides(x)
-        stride = jnp.clip(jnp.min(jnp.stack(lengths)), 0.0, 1.0)
+        x, radius, _, count = carry
+        _, lengths = clear(x, radius)
+        stride = jnp.clip(jnp.min(jnp.stack(lengths)), 0.0, radius)
         reached = jnp.minimum(x + stride, 1.0)
-        going = (stride > 2 * eps * reached) & (reached < 1) & (count < 80)
-        return reached, going, count + 1
+        going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
+        # The lower parabola only has to hold as far as the next stride may go: near is tight.
+        return reached, jnp.minimum(4 * stride, 1.0), going, count + 1
 
-    x, _, _ = jax.lax.while_loop(
-        lambda carry: carry[1], march, (start, needed, jnp.zeros_like(start, jnp.int32))
+    x, radius, _, _ = jax.lax.while_loop(
+        lambda carry: carry[2], march, (start, jnp.ones_like(start), needed, jnp.zeros_like(start, jnp.int32))
     )
-    values, lengths = strides(x)
+    values, lengths = clear(x, radius)
     return Landing(x, values, [length <= 32 * eps * x for length in lengths])

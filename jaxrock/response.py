@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import as_real, checked
+from jaxrock._checks import Values, as_real, checked
 from jaxrock.block import Block
 from jaxrock.free import FreeStage, free_stage
 from jaxrock.models import Housner, Model
@@ -78,7 +78,7 @@ class Response(eqx.Module):
     node_times: Inexact[Array, "..."]
     impacted: Bool[Array, "..."]
 
-    def __call__(self, time: ArrayLike) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
+    def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Rotation and angular velocity.
 
         **Arguments:**

@@ -166,7 +166,7 @@ def keeper(one: Scalar) -> Callable:
     return lambda value: value / one
 
 
-def _when(needed: Flag, function: Callable, value):
+def _when(needed: Flag, function: Callable, value: State) -> State:
     """`function(value, needed, keep)` where needed; under vmap the function runs only if some lane needs it.
 
     What the function makes from values outside must pass through `keep` first: otherwise XLA moves it
@@ -175,7 +175,8 @@ def _when(needed: Flag, function: Callable, value):
 
     def body(carry):
         first, value = carry
-        return jnp.zeros_like(first), function(value, first, keeper(jnp.where(first, 1.0, 2.0).astype(jnp.result_type(float))))
+        one = jnp.where(first, 1.0, 2.0).astype(value.opening.dtype)
+        return jnp.zeros_like(first), function(value, first, keeper(one))
 
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
 
@@ -328,7 +329,7 @@ class Stepper(eqx.Module):
         table, saddle = scene.table, scene.table.saddle
         coefficients = self.expand(state, forcing, unit)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
-        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[:4]))))
+        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: self.order // 2]))))
         length = _step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
         length = jnp.where(full, room, length)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._checks import as_real, positive
+from jaxrock._checks import Values, as_real, positive
 from jaxrock._progress import Progress
 from jaxrock.block import Block
 from jaxrock.models import Housner, Model
@@ -73,7 +73,7 @@ class OverturningMap(eqx.Module):
 def rocking_spectrum(
     alpha: ArrayLike,
     motion: AbstractMotion,
-    period: ArrayLike,
+    period: Values,
     restitution: ArrayLike | None = None,
     model: Model = Housner(),
     *,
@@ -110,8 +110,8 @@ def rocking_spectrum(
 
 
 def self_similar_spectrum(
-    frequency_ratio: ArrayLike,
-    intensity: ArrayLike,
+    frequency_ratio: Values,
+    intensity: Values,
     *,
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
@@ -146,8 +146,8 @@ def self_similar_spectrum(
 
 
 def overturning_map(
-    frequency_ratio: ArrayLike,
-    intensity: ArrayLike,
+    frequency_ratio: Values,
+    intensity: Values,
     *,
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
@@ -200,7 +200,7 @@ def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, e
     return jax.tree.map(lambda x: x.reshape(shape).T, found), ratio, intensity
 
 
-def _axis(name: str, values: ArrayLike) -> Float[Array, " n"]:
+def _axis(name: str, values: Values) -> Float[Array, " n"]:
     array = jnp.atleast_1d(positive(name, values))
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")

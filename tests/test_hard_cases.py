@@ -20,21 +20,19 @@ def test_free_rocking_in_closed_form(start):
     response = rk.simulate(
         rk.Block(alpha, p, e), STILL, rk.Linear(), initial=(start * alpha, 0.0), duration=60.0
     )
-    energy = 1 - (1 - start) ** 2  # over that of the saddle
-    if start > 0.9:
-        energy = 1 - (1 - start) ** 2
-    times, speeds = [np.arccosh(1 / np.sqrt(1 - energy)) / p], [p * alpha * np.sqrt(energy)]
+    energy = start * (2 - start)  # over that of the saddle
+    times, speeds = [np.arccosh(1 / (1 - start)) / p if start > 0.5 else np.arctanh(np.sqrt(energy)) / p], [p * alpha * np.sqrt(energy)]
     while len(times) < 30:
         energy *= e**2
-        times.append(times[-1] + 2 * np.arccosh(1 / np.sqrt(1 - energy)) / p if energy > 1e-6 else
-                     times[-1] + 2 * np.arcsinh(np.sqrt(energy / (1 - energy))) / p)  # fmt: skip
+        times.append(times[-1] + 2 * np.arctanh(np.sqrt(energy)) / p)
         speeds.append(p * alpha * np.sqrt(energy))
     sign = np.array([-1, 1] * 15)
     found = min(30, len(response.impact_times))
     assert found == 30 or start < 1e-4  # hops lower than the tolerance are rest
     assert found > 3
-    shift = np.array(times)[:found]
-    np.testing.assert_allclose(response.impact_times[:found], shift, rtol=1e-11)
+    # Near the brink the first time is as uncertain as the distance to it.
+    tolerance = 1e-11 + 1e-15 / (1 - start)
+    np.testing.assert_allclose(response.impact_times[:found], np.array(times)[:found], rtol=tolerance)
     np.testing.assert_allclose(response.impact_velocities[:found], (sign * speeds)[:found], rtol=1e-10)
 
 
@@ -139,11 +137,9 @@ def test_two_crossings_inside_one_step():
     """A dip through the ground that is much shorter than a step is two impacts, not none."""
     block = rk.Block(0.2, 1.0, 1.0)
     # Down at speed v, and pushed up hard by a constant force: back at the ground after 2 v/a.
-    push = -3.0
-    lift = -(np.sin(0.2) + push * np.cos(0.2))
-    height = 1e-3
-    speed = np.sqrt(2 * height * lift) * (1 + 1e-5)
-    response = rk.simulate(block, rk.RectangularPulse(push, 1.0), initial=(height, -speed), duration=0.3)
+    push, height = -3.0, 1e-3
+    speed = np.sqrt(2 * (-push - 0.2) * height + height**2) * (1 + 1e-5)
+    response = rk.simulate(block, rk.RectangularPulse(push, 1.0), rk.Linear(), initial=(height, -speed), duration=0.3)
     assert int(response.impact_count) >= 2
     gap = np.diff(response.impact_times)[0]
     assert 0 < gap < 1e-3

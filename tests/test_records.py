@@ -1,0 +1,613 @@
+"""Readers of accelerograms: every variant of the formats, and every way in which a file can be wrong."""
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxrock.records import STANDARD_GRAVITY, example_record, read_record
+
+SAMPLES = np.array([0.01, -0.2556093, 0.3, -0.04, 0.05, 1.06e-3, -7e-5])  # g
+
+SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "records"
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a file, by default motion.txt, and return its path."""
+
+    def write(content, name="motion.txt"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+def rows(values, form, per_line, end="\n"):
+    """Values printed in lines of `per_line`, the last one short."""
+    printed = [form % value for value in values]
+    return "".join("".join(printed[start : start + per_line]) + end for start in range(0, len(printed), per_line))
+
+
+# ---------------------------------------------------------------------------------------------- AT2
+
+TITLES = "PEER STRONG MOTION DATABASE RECORD\nLOMA PRIETA 10/18/89, WAHO, 090\n"
+UNIT = "ACCELERATION TIME SERIES IN UNITS OF G\n"
+COUNTS = "NPTS=     7, DT= .00500 SEC\n"
+BODY = rows(SAMPLES, "%15.7E", 5)
+AT2 = TITLES + UNIT + COUNTS + BODY
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(AT2, id="old PEER"),
+        pytest.param(AT2.replace(" SEC", " SEC,         "), id="trailing blanks"),
+        pytest.param(AT2.replace(" SEC", " SEC, LOW CUT 0.1 HZ, 2 PASSES"), id="trailing text"),
+        pytest.param(AT2.replace("7, DT", "7  DT"), id="no comma"),
+        pytest.param(AT2.replace("DT=", "dt="), id="lower case dt"),
+        pytest.param(AT2.replace(COUNTS, "npts=7,dt=.005sec\n"), id="no blanks"),
+        pytest.param(AT2.replace(COUNTS, "7    0.0050    NPTS, DT\n"), id="numbers first"),
+        pytest.param(AT2.replace(COUNTS, "  7  5.0E-3  NPTS DT\n"), id="numbers first, no comma"),
+        pytest.param(UNIT.join(["LOMA PRIETA 10/18/89, WAHO, 090\n", COUNTS + BODY]), id="3 header lines"),
+        pytest.param("A NOTE\n\n" + AT2, id="6 header lines"),
+        pytest.param(TITLES + UNIT + COUNTS + "FILTERED\n\n" + BODY, id="text after the counts"),
+        pytest.param(AT2.replace("\n", "\r\n"), id="CRLF"),
+        pytest.param(AT2.replace("\n", "\r"), id="CR"),
+        pytest.param(AT2 + "\x1a\x1a", id="DOS end of file"),
+        pytest.param(AT2.rstrip(), id="no end of line"),
+        pytest.param(AT2 + "\n  \n", id="blank lines at the end"),
+        pytest.param(b"\xef\xbb\xbf" + AT2.encode(), id="byte order mark"),
+        pytest.param(AT2.encode().replace(b"WAHO", b"WAH\xd3"), id="latin-1"),
+        pytest.param(TITLES + UNIT + COUNTS + rows(SAMPLES, "%12.7f", 8), id="8 a line"),
+        pytest.param(TITLES + UNIT + COUNTS + "\n".join(map(str, SAMPLES)), id="1 a line"),
+        pytest.param(AT2.replace("E-", "D-"), id="Fortran exponents"),
+        pytest.param(TITLES + UNIT + COUNTS + BODY.replace(" -", "-"), id="some touch"),
+        pytest.param(
+            TITLES + UNIT + COUNTS + "   .1E-01-.2556093E+00 .3-.04+.05\n.106E-02-.7E-04\n", id="all kinds of touching"
+        ),
+        pytest.param(AT2.replace("OF G", "OF G. FILTER POINTS: HP=0.2 Hz LP=15.0 Hz"), id="filter after the unit"),
+        pytest.param(AT2.replace("OF G", "OF (g)"), id="unit in brackets"),
+    ],
+)
+def test_at2(file, content):
+    record = read_record(file(content))
+    np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-6)
+    assert record.dt == 0.005
+
+
+@pytest.mark.parametrize(
+    "unit, per_g",
+    [
+        ("G", 1.0),
+        ("g", 1.0),
+        ("CM/SEC/SEC", 980.665),
+        ("cm/s2", 980.665),
+        ("CM/S**2", 980.665),
+        ("cm/sec^2.", 980.665),
+        ("Gal", 980.665),
+        ("M/S2", 9.80665),
+        ("m/sec/sec", 9.80665),
+    ],
+)
+def test_at2_in_other_units(file, unit, per_g):
+    content = AT2.replace("OF G", f"OF {unit}").replace(BODY, rows(SAMPLES * per_g, "%16.8E", 5))
+    np.testing.assert_allclose(read_record(file(content)).samples, SAMPLES, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "content, error",
+    [
+        pytest.param(
+            AT2.replace("  7,", "  8,"), r"File `motion.txt`: header announces 8 samples, but 7 follow\.", id="fewer"
+        ),
+        pytest.param(AT2.replace("  7,", "  6,"), "header announces 6 samples, but 7 follow", id="more"),
+        pytest.param(TITLES + UNIT + COUNTS, "header announces 7 samples, but 0 follow", id="none"),
+        pytest.param(TITLES + UNIT + "NPTS= 0, DT= .01 SEC\n", "announces 0 samples", id="zero announced"),
+        pytest.param(AT2.replace("OF G", "OF CM/S"), r"line 3 states the unit 'CM/S'", id="velocity"),
+        pytest.param(AT2.replace("OF G", "OF G/10"), r"line 3 states the unit 'G/10'", id="unknown unit"),
+        pytest.param(AT2.replace("IN UNITS OF G", ""), "`unit` must be given for file `motion.txt`", id="no unit"),
+        pytest.param(AT2.replace(".00500", "0.000"), "time step of 0 s, which is not positive", id="zero dt"),
+        pytest.param(AT2.replace(".00500", "-.005"), "time step of -0.005 s", id="negative dt"),
+        pytest.param(
+            AT2 + "1.0 garbled\n", "line 7 should hold samples, but is '1.0 garbled'", id="garbled after the last"
+        ),
+        pytest.param(AT2.replace("\n  1.06", "\nx 1.06"), "line 6 should hold samples, but is 'x 1.06", id="garbled"),
+        pytest.param(
+            AT2.replace("  1.0600000E-03", "            NaN"), "line 6 should hold samples, but is 'NaN", id="NaN"
+        ),
+        pytest.param(
+            AT2.replace("  1.0000000E-02", "            nan"), "line 5 should hold samples, but is 'nan", id="nan first"
+        ),
+        pytest.param(
+            AT2.replace("1.0600000E-03", "*************"), "line 6 should hold samples", id="overflow in print"
+        ),
+        pytest.param(
+            AT2.replace("1.0600000E-03", "1.060000E+999"), "line 6 holds a number that is not finite", id="infinite"
+        ),
+        pytest.param(
+            AT2.replace("  1.0600000E-03", "  1.234562.34567"), "line 6 should hold samples", id="touching, no sign"
+        ),
+    ],
+)
+def test_at2_errors(file, content, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content))
+
+
+def test_at2_without_counts_is_recognised_by_its_suffix(file):
+    with pytest.raises(ValueError, match="File `motion.AT2`: no header line states NPTS and DT"):
+        read_record(file(AT2.replace(COUNTS, ""), "motion.AT2"))
+
+
+def test_at2_without_unit_takes_the_argument(file):
+    path = file(AT2.replace("IN UNITS OF G", ""))
+    np.testing.assert_allclose(read_record(path, unit="m/s2").samples, SAMPLES / STANDARD_GRAVITY, rtol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------- V2
+
+SHAKE = np.array([-1.72, 0.5, 305.02, -12.345, 0.001, 9.999, -99.5, 3.0, 4.25, -5.5])  # cm/s2
+PER_G = 100 * STANDARD_GRAVITY
+
+
+def channel(number=1, values=SHAKE, announce=" (UNITS: CM/SEC/SEC)", form="%10.3f", step=".010", count=None):
+    """One channel of a V2 file: three headers, three blocks, and the line that ends it."""
+    count = len(values) if count is None else count
+    text = [
+        "CORRECTED ACCELEROGRAM   01336-C0165-79290.04       CHAN  2: 360 DEG     FROM   ",
+        "UNCORRECTED ACCELEROGRAM DATA              PROCESSED:           USGS            ",
+        "IMPERIAL VALLEY, CA  EARTHQUAKE                                                 ",
+        "15 OCT 1979 - 2317 UTC",
+        "01336-C0165-79290.04",
+        "STATION NO.  1336   32.773N, 115.448W     CRA-1  S/N 0165 (13 CHNS OF 26 AT STA)",
+        "EL CENTRO - HWY 8/MELOLAND OVERPASS                                             ",
+        f"CHAN  {number}:   0 DEG     LOCATION: FREEFIELD",
+        f"  {count} POINTS OF INSTRUMENT- AND BASELINE-CORRECTED ACCEL, VELOC AND DISPL DATA ",
+        "AT EQUALLY-SPACED INTERVALS OF    .010  SEC.",
+        "PEAK ACCELERATION =   305.020    CM/SEC/SEC  AT     .020   SEC.",
+    ]
+    headers = "\n".join(text) + "\n" + rows([0] * 100, "%5d", 16) + rows(np.zeros(100), "%10.3f", 8)
+    blocks = "".join(
+        f"{len(values):5d} POINTS OF {what} DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: {unit})\n"
+        + rows(0.1 * values, "%10.3f", 8)
+        for what, unit in (("VELOC", "CM/SEC"), ("DISPL", "CM"))
+    )
+    announced = f"{count:5d} POINTS OF ACCEL DATA EQUALLY SPACED AT  {step} SEC. {announce}\n"
+    end = f"/&  ----------  END OF DATA FOR CHANNEL  {number}  ----------\n"
+    return headers + announced + rows(values, form, 8) + blocks + end
+
+
+V2 = channel()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(V2, id="CSMIP"),
+        pytest.param(V2.replace("\n", "\r\n") + "\x1a" * 40, id="CRLF and DOS end of file"),
+        pytest.param(channel(announce=", in cm/sec2. (8f10.3)").lower(), id="later CSMIP"),
+        pytest.param(channel(announce=", in cm/sec2. (8f11.6)", form="%11.6f"), id="width stated"),
+        pytest.param(
+            V2.replace("OF ACCEL DATA", "OF ACC DATA").replace("(UNITS: CM/SEC/SEC)", "IN UNITS CM/SEC/SEC"), id="USC"
+        ),
+        pytest.param(channel(announce="(UNITS: G)", values=SHAKE / PER_G, form="%10.7f"), id="in g"),
+        pytest.param(V2[: V2.index("   10 POINTS OF VELOC")], id="acceleration only"),
+        pytest.param(V2[V2.index("   10 POINTS OF ACCEL") :], id="no header"),
+    ],
+)
+def test_v2(file, content):
+    record = read_record(file(content))
+    np.testing.assert_allclose(record.samples, SHAKE / PER_G, rtol=0, atol=1e-7)
+    assert record.dt == 0.01
+
+
+def test_v2_values_that_touch_are_split_by_width(file):
+    values = np.array([-12345.678, -23456.789, 123456.789, 1.5])
+    record = read_record(file(channel(values=values)))
+    np.testing.assert_allclose(record.samples, values / PER_G)
+
+
+@pytest.mark.parametrize("column, factor", [(None, 1), (0, 1), (1, -2), (np.int64(2), 3)])
+def test_v2_channels(file, column, factor):
+    content = channel(1) + channel(2, -2 * SHAKE) + channel(3, 3 * SHAKE)
+    record = read_record(file(content), column=column)
+    np.testing.assert_allclose(record.samples, factor * SHAKE / PER_G)
+    assert (
+        record.name == f"IMPERIAL VALLEY, CA EARTHQUAKE, EL CENTRO - HWY 8/MELOLAND OVERPASS, CHAN {abs(factor)}: 0 DEG"
+    )
+
+
+def test_v2_channels_of_acceleration_only(file):
+    first = V2[: V2.index("   10 POINTS OF VELOC")]
+    for column in (0, 1):
+        assert read_record(file(first + first), column=column).samples.shape == (10,)
+
+
+@pytest.mark.parametrize(
+    "content, error",
+    [
+        pytest.param(channel(count=11), r"File `motion.txt`: header announces 11 samples, but 10 follow\.", id="fewer"),
+        pytest.param(channel(count=9), "header announces 9 samples, but 10 follow", id="more"),
+        pytest.param(channel(announce="(UNITS: CM/SEC)"), "line 32 states the unit 'CM/SEC'", id="unknown unit"),
+        pytest.param(channel(announce=""), "Argument `unit` must be given for file `motion.txt`", id="no unit"),
+        pytest.param(channel(step=".000"), "time step of 0 s, which is not positive", id="zero dt"),
+        pytest.param(V2.replace("   305.020", "   305.O20"), "line 33 should hold samples, but is", id="garbled"),
+        pytest.param(V2.replace("    -5.500", "       NaN"), "line 34 should hold samples, but is", id="NaN"),
+        pytest.param(V2.replace("   305.020", "          "), "line 33 should hold samples, but is", id="missing value"),
+        pytest.param(
+            V2.replace("    -1.720", "       -1.720"), "line 33 should hold samples, but is", id="shifted columns"
+        ),
+    ],
+)
+def test_v2_errors(file, content, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content))
+
+
+def test_v2_without_block_is_recognised_by_its_suffix(file):
+    with pytest.raises(ValueError, match="File `motion.v2`: no line announces 'POINTS OF ACCEL DATA'"):
+        read_record(file(V2.replace("POINTS OF ACCEL DATA", ""), "motion.v2"))
+
+
+# ------------------------------------------------------------------------------------------ columns
+
+TIMES = 0.02 * np.arange(7)
+
+
+def two_columns(separator, header="", form="%.2f"):
+    return header + "".join(f"{form % t}{separator}{a}\n" for t, a in zip(TIMES, SAMPLES))
+
+
+ONE_COLUMN = rows(SAMPLES, "%.9g", 1)
+PAIRS = two_columns(",")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(ONE_COLUMN, id="plain"),
+        pytest.param("Station 5\nacceleration [g]\n\n" + ONE_COLUMN, id="header"),
+        pytest.param("# 7 samples\n" + ONE_COLUMN.replace("\n", "  # sample\n"), id="comments"),
+        pytest.param(ONE_COLUMN.replace("\n", ",\n"), id="trailing commas"),
+        pytest.param(ONE_COLUMN.replace("\n", "\r\n"), id="CRLF"),
+        pytest.param(ONE_COLUMN.replace("e-", "D-"), id="Fortran exponents"),
+    ],
+)
+def test_one_column(file, content):
+    record = read_record(file(content), dt=0.02, unit="g")
+    np.testing.assert_allclose(record.samples, SAMPLES)
+    assert record.dt == 0.02
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(PAIRS, id="comma"),
+        pytest.param(two_columns(", "), id="comma and blank"),
+        pytest.param(two_columns(";"), id="semicolon"),
+        pytest.param(two_columns("\t"), id="tab"),
+        pytest.param(two_columns("   "), id="blanks"),
+        pytest.param(two_columns(",", "time,acceleration\ns,g\n"), id="header"),
+        pytest.param(two_columns(",", "# NPTS= 7, DT= .02 SEC\n"), id="comment like AT2"),
+        pytest.param(two_columns(",", "\ufeff"), id="byte order mark"),
+        pytest.param(two_columns(" ", "# made by hand\n% t a\n"), id="comments"),
+        pytest.param(two_columns(",", form="%.1E").replace("-0", "-"), id="times with exponents"),
+    ],
+)
+def test_two_columns(file, content):
+    record = read_record(file(content), unit="g")
+    np.testing.assert_allclose(record.samples, SAMPLES)
+    assert record.dt == 0.02
+
+
+@pytest.mark.parametrize("unit, per_g", [("g", 1.0), ("m/s2", 9.80665), ("cm/s2", 980.665)])
+def test_unit_of_text(file, unit, per_g):
+    np.testing.assert_allclose(read_record(file(PAIRS), unit=unit).samples, SAMPLES / per_g)
+
+
+@pytest.mark.parametrize(
+    "step, form, start",
+    [
+        pytest.param(0.01, "%.2f", 0.0, id="as few digits as the step has"),
+        pytest.param(0.01, "%.2f", 3.0, id="start not at 0"),
+        pytest.param(0.01, "%r", 0.0, id="all digits"),
+        pytest.param(1 / 256, "%.3f", 0.0, id="1-256 s in milliseconds"),
+        pytest.param(1 / 256, "%.6g", 0.0, id="1-256 s in 6 digits"),
+        pytest.param(0.0025, "%.6g", 100.0, id="6 digits beyond 100 s"),
+        pytest.param(0.005, "%.8E", 0.0, id="exponents"),
+        pytest.param(0.004, "%g", -1.0, id="from negative times"),
+        pytest.param(0.02, "%.2f", 1e5, id="times of day"),
+        pytest.param(0.001, "%r", 100.0, id="milliseconds beyond 100 s"),
+    ],
+)
+@pytest.mark.parametrize("single", [False, True], ids=["double", "single precision"])
+def test_times_rounded_in_print(file, step, form, start, single):
+    times = start + step * np.arange(2000)
+    times = times.astype(np.float32).astype(float) if single and start < 1e5 else times
+    content = "".join(f"{form % float(t)} 0.1\n" for t in times)
+    assert read_record(file(content), unit="g").dt == pytest.approx(step, rel=3e-4)
+    assert read_record(file(content), unit="g", dt=step).dt == step
+
+
+def test_step_from_times_is_the_printed_one(file):
+    content = "".join(f"{0.01 * k:.2f} 0\n" for k in range(30))
+    assert 0.29 / 29 != 0.01
+    assert read_record(file(content), unit="g").dt == 0.01
+
+
+@pytest.mark.parametrize(
+    "column, dt",
+    [
+        pytest.param(2, None, id="times in column 0"),
+        pytest.param(2, 0.02, id="times that agree"),
+        pytest.param(0, 0.3, id="column 0 itself"),
+    ],
+)
+def test_many_columns(file, column, dt):
+    table = np.stack([TIMES, 2 * SAMPLES, 3 * SAMPLES], 1)
+    record = read_record(
+        file("".join(f"{a!r},{b!r},{c!r}\n" for a, b, c in table.tolist())), unit="g", dt=dt, column=column
+    )
+    np.testing.assert_allclose(record.samples, table[:, column])
+    assert record.dt == (dt or 0.02)
+
+
+def test_many_columns_without_times(file):
+    content = "".join(f"{a} {2 * a} {3 * a}\n" for a in SAMPLES)
+    np.testing.assert_allclose(read_record(file(content), unit="g", dt=0.01, column=1).samples, 2 * SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "content, arguments, error",
+    [
+        pytest.param(ONE_COLUMN, {"unit": "g"}, "Argument `dt` must be given for text file `motion.txt`", id="no dt"),
+        pytest.param(
+            ONE_COLUMN,
+            {"dt": 0.01, "unit": None},
+            "Argument `unit` must be 'g', 'm/s2' or 'cm/s2' for text",
+            id="no unit",
+        ),
+        pytest.param(PAIRS, {"unit": None}, "Argument `unit` must be", id="no unit, 2 columns"),
+        pytest.param(PAIRS, {"dt": 0.01}, "file `motion.txt`, which has 0.02 s, but is 0.01", id="other dt"),
+        pytest.param(PAIRS, {"dt": 0.01, "column": 1}, "which has 0.02 s, but is 0.01", id="other dt, with column"),
+        pytest.param(PAIRS, {"column": 0}, "Argument `dt` must be given", id="column of times"),
+        pytest.param(PAIRS, {"column": 2}, r"`column` must be 0 to 1, .*`motion.txt`, but is 2\.", id="no such column"),
+        pytest.param("0 1 2\n1 2 3\n", {}, "Argument `column` must be 0 to 2, .* but is None", id="3 columns"),
+        pytest.param(
+            "t a b\n0 1 2\n1 2 3\n", {"column": -1}, "`column` must be an integer, 0 or more, but is -1", id="-1"
+        ),
+        pytest.param(
+            PAIRS.replace("0.02,", "0.020,x"), {}, "line 2 should hold numbers only, but is '0.020,x", id="text"
+        ),
+        pytest.param(
+            PAIRS + "the end\n", {}, "line 8 should hold numbers only, but is 'the end'", id="text at the end"
+        ),
+        pytest.param(PAIRS.replace("0.00,0", "0.00,O"), {}, "line 1 holds more than numbers", id="broken first line"),
+        pytest.param(PAIRS.replace("0.3", "nan"), {}, "line 3 holds a number that is not finite: '0.04,nan'", id="nan"),
+        pytest.param("t a\n" + PAIRS.replace("0.3", "-inf"), {}, "line 4 holds a number that is not finite", id="inf"),
+        pytest.param("nan\n0.1\n", {"dt": 0.01}, "line 1 holds a number that is not finite", id="nan first"),
+        pytest.param(PAIRS.replace("0.3", "1e999"), {}, "line 3 holds a number that is not finite", id="1e999"),
+        pytest.param(PAIRS.replace(",0.3", ""), {}, "line 3 has 1 column, but line 1 has 2", id="missing field"),
+        pytest.param(
+            PAIRS.replace("0.3", "0.3,1"), {}, "line 3 has 3 columns, but line 1 has 2", id="additional field"
+        ),
+        pytest.param(PAIRS.replace("0.3", ""), {}, "line 3 has 1 column, but line 1 has 2", id="empty field"),
+        pytest.param("0,00;0,1\n0,01;0,2\n", {}, "line 1 holds more than numbers", id="decimal commas"),
+        pytest.param("0.00 1_0\n0.01 1_1\n", {}, "line 1 holds more than numbers", id="underscores"),
+        pytest.param("time,acceleration\n", {}, "no line holds columns of numbers", id="header only"),
+        pytest.param("0.0,0.1\n", {}, "has one row only, so its times give no time step", id="one row"),
+        pytest.param("0,1\n0,2\n", {}, "the times in column 0 do not increase", id="constant times"),
+        pytest.param("1700000000 1\n1700000000.01 2\n1700000000.03 3\n", {}, "not equally spaced", id="epoch times"),
+        pytest.param("0.00 1\n0.00 2\n0.01 3\n0.01 4\n0.02 5\n", {}, "not equally spaced", id="times too coarse"),
+        pytest.param("1,1\n0,2\n", {}, "the times in column 0 do not increase", id="times that fall"),
+        pytest.param(
+            PAIRS.replace("0.06,-0.04\n", ""),
+            {},
+            "times in column 0 are not equally spaced: 0.04 s before line 4, but 0.02 s elsewhere",
+            id="missing row",
+        ),
+        pytest.param(
+            PAIRS.replace("0.06,-0.04\n", ""), {"dt": 0.02, "column": 1}, "not equally spaced", id="the same, dt given"
+        ),
+        pytest.param(
+            two_columns(",", form="%.4f").replace("0.0600,", "0.0602,"), {}, "not equally spaced", id="uneven by 1 %"
+        ),
+    ],
+)
+def test_column_errors(file, content, arguments, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content), **{"unit": "g"} | arguments)
+
+
+@pytest.mark.parametrize("jitter, fine", [(5e-4, True), (2e-3, False)])
+def test_even_spacing_is_demanded_to_a_thousandth(file, jitter, fine):
+    times = TIMES + 0.02 * jitter * np.array([0, 0, 1, 0, 0, 0, 0])
+    path = file("".join(f"{t:.9f} {a}\n" for t, a in zip(times, SAMPLES)))
+    if fine:
+        assert read_record(path, unit="g").dt == pytest.approx(0.02)
+    else:
+        with pytest.raises(ValueError, match="not equally spaced"):
+            read_record(path, unit="g")
+
+
+# ---------------------------------------------------------------------------- any file, any argument
+
+
+@pytest.mark.parametrize("content", [AT2, V2], ids=["at2", "v2"])
+@pytest.mark.parametrize(
+    "arguments, error",
+    [
+        ({"dt": 0.02}, r"Argument `dt` must agree with file `motion.txt`, which has 0.0\d+ s, but is 0.02\."),
+        (
+            {"unit": "m/s2"},
+            r"Argument `unit` must agree with file `motion.txt`, which is in '(g|cm/s2)', but is 'm/s2'\.",
+        ),
+        ({"column": 1}, "Argument `column` must be (None|0 to 0), .* file `motion.txt`.*, but is 1"),
+        ({"unit": "ft"}, r"^Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft'\.$"),
+        ({"format": "smc"}, r"^Argument `format` must be one of 'at2', 'v2', 'csv', but is 'smc'\.$"),
+        ({"dt": 0.0}, r"Argument `dt` must be positive and finite, but is 0\.0"),
+        ({"dt": float("nan")}, "Argument `dt` must be positive and finite, but is nan"),
+        ({"dt": np.array([0.01, 0.01])}, r"Argument `dt` must be one number, but has shape \(2,\)"),
+        ({"column": True}, "Argument `column` must be an integer, 0 or more, but is True"),
+    ],
+)
+def test_argument_errors(file, content, arguments, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content), **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments, error",
+    [
+        ({"column": 1.0}, "Argument `column` must be an integer, 0 or more, but is 1.0"),
+        ({"column": "1"}, "Argument `column` must be an integer, 0 or more, but is '1'"),
+    ],
+)
+def test_arguments_of_a_wrong_type(file, arguments, error):
+    # Without the type checker of the tests, which users do not have and which would speak first.
+    with pytest.raises(ValueError, match=error):
+        inspect.unwrap(read_record)(file(V2), **arguments)
+
+
+@pytest.mark.parametrize(
+    "content, arguments",
+    [
+        pytest.param(AT2, {"dt": 0.005, "unit": "g", "format": "at2"}, id="at2"),
+        pytest.param(V2, {"dt": 0.01, "unit": "cm/s2", "format": "v2", "column": 0}, id="v2"),
+        pytest.param(PAIRS, {"dt": 0.02, "unit": "g", "format": "csv", "column": 1}, id="csv"),
+    ],
+)
+def test_arguments_that_agree_are_accepted(file, content, arguments):
+    path = file(content)
+    np.testing.assert_array_equal(
+        read_record(path, **arguments).samples, read_record(path, unit=arguments["unit"]).samples
+    )
+
+
+@pytest.mark.parametrize(
+    "content, format, error",
+    [
+        (PAIRS, "at2", "no header line states NPTS and DT"),
+        (AT2, "v2", "no line announces 'POINTS OF ACCEL DATA'"),
+        (AT2, "csv", "line 6 has 2 columns, but line 5 has 5"),
+    ],
+)
+def test_a_wrong_format_raises(file, content, format, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content), format=format, unit="g", dt=0.01)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.AT2", "a.v2", "a"])
+@pytest.mark.parametrize("content, size", [(AT2, 7), (V2, 10)], ids=["at2", "v2"])
+def test_content_comes_before_suffix(file, content, size, name):
+    assert read_record(file(content, name)).samples.shape == (size,)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.dat", "a"])
+def test_columns_need_no_suffix(file, name):
+    assert read_record(file(PAIRS, name), unit="g").samples.shape == (7,)
+
+
+@pytest.mark.parametrize(
+    "content, error",
+    [
+        pytest.param(b"", "File `motion.txt`: is empty", id="empty"),
+        pytest.param(b" \r\n\n \x1a", "File `motion.txt`: is empty", id="blank"),
+        pytest.param(bytes(range(256)), "File `motion.txt`: is not plain text", id="binary"),
+        pytest.param(b"PK\x03\x04" + b"0.1\n" * 9, "File `motion.txt`: is not plain text", id="zip"),
+        pytest.param(PAIRS.encode("utf-16"), "File `motion.txt`: is not plain text", id="UTF-16"),
+        pytest.param(
+            b"<html>\n<p>Not found</p>\n", "File `motion.txt`: no line holds columns of numbers", id="web page"
+        ),
+    ],
+)
+def test_unreadable_content(file, content, error):
+    with pytest.raises(ValueError, match=error):
+        read_record(file(content), unit="g")
+
+
+def test_files_that_cannot_be_opened(tmp_path):
+    with pytest.raises(FileNotFoundError, match="missing.at2"):
+        read_record(tmp_path / "missing.at2")
+    with pytest.raises(OSError, match=tmp_path.name):
+        read_record(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content, name",
+    [
+        pytest.param(AT2, "LOMA PRIETA 10/18/89, WAHO, 090", id="at2"),
+        pytest.param(
+            AT2.replace("WAHO, 090", "WAHO,  090    "), "LOMA PRIETA 10/18/89, WAHO, 090", id="at2 with blanks"
+        ),
+        pytest.param("TITLE\n" + UNIT + COUNTS + BODY, "motion", id="at2 without title"),
+        pytest.param(V2, "IMPERIAL VALLEY, CA EARTHQUAKE, EL CENTRO - HWY 8/MELOLAND OVERPASS, CHAN 1: 0 DEG", id="v2"),
+        pytest.param(V2[V2.index("   10 POINTS OF ACCEL") :], "motion", id="v2 without header"),
+        pytest.param(PAIRS, "motion", id="csv"),
+    ],
+)
+def test_name(file, content, name):
+    assert read_record(file(content), unit="g" if content is PAIRS else None).name == name
+
+
+def test_path_may_be_a_string(file):
+    assert read_record(str(file(AT2))).samples.shape == (7,)
+
+
+# ------------------------------------------------------------------------------------- real records
+
+
+def test_example_record():
+    record = example_record()
+    size = np.abs(record.samples)
+    assert record.samples.shape == (5690,)
+    assert record.dt == 0.01
+    assert size.max() == pytest.approx(305.020 / 980.665, rel=1e-12)
+    assert size.argmax() * record.dt == pytest.approx(4.06)
+    assert record.samples[0] == pytest.approx(-1.72 / 980.665, rel=1e-12)
+    assert record.name == "IMPERIAL VALLEY, CA EARTHQUAKE, EL CENTRO - HWY 8/MELOLAND OVERPASS, CHAN 2: 360 DEG"
+
+
+@pytest.mark.parametrize(
+    "path, arguments, size, dt, peak",
+    [
+        ("at2-variants/IELC180.AT2", {}, 4000, 0.01, 0.3128806),
+        ("at2-variants/NIS090.AT2", {}, 4096, 0.01, 0.502749),
+        ("at2-variants/RSN6_IMPVALL.I_I-ELC180-hor1.AT2", {}, 5372, 0.01, 0.2807955),
+        ("at2-variants/RSN77_SFERN_PUL164-hor1.AT2", {}, 4172, 0.01, 1.219037),
+        ("paper_records/LOMAP_AND270_oldPEER.AT2", {}, 7921, 0.005, 0.24386),
+        ("paper_records/RSN729_SUPER.B_B-IVW360.AT2", {}, 11999, 0.005, 0.207563),
+        ("paper_records/RSN811_LOMAP_WAH090_unscaled.AT2", {}, 5001, 0.005, 0.65405904),
+        ("formats/RSN763_LOMAP_GIL067.AT2", {}, 7999, 0.005, 0.3585328),
+        ("formats/ce36456p_CE36456.V2", {}, 3251, 0.02, 267.957 / 980.665),
+        ("formats/ce36456p_CE36456.V2", {"column": 2}, 3250, 0.02, 256.231 / 980.665),
+        ("formats/017m30bt.s0a", {}, 1887, 0.02, 242.3945 / 980.665),
+        ("meloland-1979/CHAN14.V2", {}, 5696, 0.01, 225.090 / 980.665),
+        ("meloland-1979/CHAN24.V2", {}, 5694, 0.01, 292.690 / 980.665),
+        (
+            "formats/HI.ARS1..HNE.D.20190728.160908.C.ACC.ASC",
+            {"dt": 0.005, "unit": "cm/s2"},
+            19128,
+            0.005,
+            0.300022 / 980.665,
+        ),
+    ],
+)
+def test_real_records(path, arguments, size, dt, peak):
+    if not (SHARED / path).exists():
+        pytest.skip("the real records lie beside the repository, which has no licence to hold them")
+    record = read_record(SHARED / path, **arguments)
+    assert record.samples.shape == (size,)
+    assert record.dt == dt
+    assert np.abs(record.samples).max() == pytest.approx(peak, rel=3e-6)
+
+
+@pytest.mark.parametrize("path", ["formats/0111a.smc", "formats/us1000hyfh_akbmrp_AKBMR--n.1000hyfh.BNZ.--.acc.V2c"])
+def test_real_records_in_other_formats_raise(path):
+    if not (SHARED / path).exists():
+        pytest.skip("the real records lie beside the repository, which has no licence to hold them")
+    with pytest.raises(ValueError, match=Path(path).name):
+        read_record(SHARED / path, dt=0.02, unit="cm/s2")
