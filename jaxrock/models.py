@@ -9,6 +9,8 @@ acceleration u (g), every model of a rigid symmetric block reads
 A coefficient that a model does not have is None, so that nothing is computed for it.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
@@ -21,6 +23,14 @@ Scalar = Inexact[ArrayLike, ""]
 def _sum_of(*products: tuple[Scalar | None, Scalar | float]) -> Scalar | float:
     """Add coefficient times function for the coefficients that exist."""
     return sum((c * f for c, f in products if c is not None), start=0.0)
+
+
+class Angle(NamedTuple):
+    """An angle [rad] with its sine and cosine, which are computed once."""
+
+    value: Scalar
+    sine: Scalar
+    cosine: Scalar
 
 
 class Table(eqx.Module):
@@ -39,13 +49,13 @@ class Table(eqx.Module):
         """Whether sin x or cos x appear at all."""
         return any(c is not None for c in (self.rs, self.rc, self.ms, self.mc))
 
-    def restoring(self, x: Scalar) -> Scalar:
-        """Restoring moment over m g R at opening angle x [rad]."""
-        return _sum_of((self.r0, 1.0), (self.r1, x), (self.rs, jnp.sin(x)), (self.rc, jnp.cos(x)))
+    def restoring(self, angle: Angle) -> Scalar:
+        """Restoring moment over m g R at an opening angle."""
+        return _sum_of((self.r0, 1.0), (self.r1, angle.value), (self.rs, angle.sine), (self.rc, angle.cosine))
 
-    def arm(self, x: Scalar) -> Scalar:
-        """Overturning moment over m R u g at opening angle x [rad]."""
-        return _sum_of((self.m0, 1.0), (self.ms, jnp.sin(x)), (self.mc, jnp.cos(x)))
+    def arm(self, angle: Angle) -> Scalar:
+        """Overturning moment over m R u g at an opening angle."""
+        return _sum_of((self.m0, 1.0), (self.ms, angle.sine), (self.mc, angle.cosine))
 
     @property
     def restoring_at_rest(self) -> Scalar:

@@ -4,11 +4,14 @@ A list entry is a scalar (or, under vmap, one per lane); the lists have fixed le
 operation unrolls into straight-line code that vectorises over lanes.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import ArrayLike, Bool, Inexact
+
+from jaxrock._keep import keep
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
@@ -100,11 +103,12 @@ class Landing(NamedTuple):
 def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
     """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
     root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
-    falling = slope <= 0
-    below = jnp.where(falling, root - slope, fall)
-    above = jnp.where(falling, 2 * value, slope + root)
+    rising = slope > 0
+    # The zero of the parabola without cancellation: of its two forms the one that adds.
+    sum_ = keep(jnp.where(rising, slope + root, slope - root), fall)
+    above, below = jnp.where(rising, sum_, 2 * value), jnp.where(rising, fall, -sum_)
     # Nothing pulls it down: clear for ever, unless it is at zero and does not rise.
-    endless = jnp.where((value > 0) | ~falling, jnp.inf, 0.0)
+    endless = jnp.where((value > 0) | rising, jnp.inf, 0.0)
     return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), endless)
 
 
@@ -133,7 +137,7 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     def march(carry):
         x, radius, _, count = carry
         _, lengths = clear(x, radius)
-        stride = jnp.clip(jnp.min(jnp.stack(lengths)), 0.0, radius)
+        stride = keep(jnp.clip(functools.reduce(jnp.minimum, lengths), 0.0, radius), x)
         reached = jnp.minimum(x + stride, 1.0)
         going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
         # The lower parabola only has to hold as far as the next stride may go: near is tight.

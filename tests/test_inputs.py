@@ -1,0 +1,453 @@
+"""Bad input raises at once and says what is wrong; so it does under jit. What is allowed is allowed."""
+
+import functools
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+
+NAN, INF, HALF_PI = np.nan, np.inf, np.pi / 2
+BLOCK = rk.Block(0.2, 1.0)
+SINE = rk.SinePulse(0.5, 1.0)
+TWO = np.array([0.2, 0.3])
+
+SLENDERNESS = "be in (0, pi/2)"
+POSITIVE = "be positive and finite"
+FINITE = "be finite"
+SHARE = "be in [0, 1]"
+HOUSNER = "be at most 0.955 (asin sqrt(2/3)) when `restitution` is None, because Housner's value is negative above"
+LIST = "be a list of at least one value"
+SCENE = "hold one scene"
+ONE_SAMPLE = "hold at least one sample"
+HISTORY = "be in the history [0, duration]"
+ROTATION = "be a rotation in (-pi/2, pi/2)"
+
+
+# Where an engine must run, the one that compiles fastest.
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
+
+
+@functools.cache
+def history():
+    """A history of 4 s."""
+    return rk.simulate(BLOCK, SINE, duration=4.0, samples=5, **QUICK)
+
+
+@functools.cache
+def histories():
+    """Two histories, of which neither is asked for under vmap."""
+    return jax.vmap(lambda a: rk.simulate(BLOCK, rk.SinePulse(a, 1.0), duration=4.0, samples=5, **QUICK))(TWO)
+
+
+# What is called, and the argument, what is allowed and the value in the message.
+BAD = {
+    # Block
+    "alpha 0": (lambda: rk.Block(0.0, 1.0), "alpha", SLENDERNESS, "0.0"),
+    "alpha negative": (lambda: rk.Block(-0.1, 1.0), "alpha", SLENDERNESS, "-0.1"),
+    "alpha pi/2": (lambda: rk.Block(HALF_PI, 1.0, 0.5), "alpha", SLENDERNESS, "1.5707963267948966"),
+    "alpha NaN": (lambda: rk.Block(NAN, 1.0), "alpha", SLENDERNESS, "nan"),
+    "alpha inf": (lambda: rk.Block(INF, 1.0), "alpha", SLENDERNESS, "inf"),
+    "one alpha of many": (lambda: rk.Block(np.array([0.1, 2.5, 0.2]), 1.0), "alpha", SLENDERNESS, "2.5"),
+    "stocky block": (lambda: rk.Block(1.0, 1.0), "alpha", HOUSNER, "1.0"),
+    "stocky sizes": (lambda: rk.Block.from_dimensions(1.5, 1.0), "alpha", HOUSNER, "0.98279372324732"),
+    "p 0": (lambda: rk.Block(0.2, 0.0), "p", POSITIVE, "0.0"),
+    "p negative": (lambda: rk.Block(0.2, -2.0), "p", POSITIVE, "-2.0"),
+    "p integer": (lambda: rk.Block(0.2, -2), "p", POSITIVE, "-2.0"),
+    "p NaN": (lambda: rk.Block(0.2, NAN), "p", POSITIVE, "nan"),
+    "p inf": (lambda: rk.Block(0.2, INF), "p", POSITIVE, "inf"),
+    "restitution above 1": (lambda: rk.Block(0.2, 1.0, 1.001), "restitution", SHARE, "1.001"),
+    "restitution negative": (lambda: rk.Block(0.2, 1.0, -0.1), "restitution", SHARE, "-0.1"),
+    "restitution NaN": (lambda: rk.Block(0.2, 1.0, NAN), "restitution", SHARE, "nan"),
+    "width 0": (lambda: rk.Block.from_dimensions(0.0, 3.0), "width", POSITIVE, "0.0"),
+    "width negative": (lambda: rk.Block.from_dimensions(-0.6, 3.0), "width", POSITIVE, "-0.6"),
+    "width NaN": (lambda: rk.Block.from_dimensions(NAN, 3.0), "width", POSITIVE, "nan"),
+    "width inf": (lambda: rk.Block.from_dimensions(INF, 3.0), "width", POSITIVE, "inf"),
+    "height 0": (lambda: rk.Block.from_dimensions(0.6, 0.0), "height", POSITIVE, "0.0"),
+    "height negative": (lambda: rk.Block.from_dimensions(0.6, -3.0), "height", POSITIVE, "-3.0"),
+    "gravity 0": (lambda: rk.Block.from_dimensions(0.6, 3.0, gravity=0.0), "gravity", POSITIVE, "0.0"),
+    "sizes, restitution 2": (lambda: rk.Block.from_dimensions(0.6, 3.0, 2.0), "restitution", SHARE, "2.0"),
+    # Pulses
+    "sine, period 0": (lambda: rk.SinePulse(0.5, 0.0), "period", POSITIVE, "0.0"),
+    "sine, period negative": (lambda: rk.SinePulse(0.5, -1.0), "period", POSITIVE, "-1.0"),
+    "sine, amplitude NaN": (lambda: rk.SinePulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "sine, amplitude inf": (lambda: rk.SinePulse(-INF, 1.0), "amplitude", FINITE, "-inf"),
+    "cosine, period 0": (lambda: rk.CosinePulse(0.5, 0.0), "period", POSITIVE, "0.0"),
+    "cosine, amplitude NaN": (lambda: rk.CosinePulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "half sine, duration negative": (lambda: rk.HalfSinePulse(0.5, -1.0), "duration", POSITIVE, "-1.0"),
+    "half sine, amplitude inf": (lambda: rk.HalfSinePulse(INF, 1.0), "amplitude", FINITE, "inf"),
+    "rectangle, duration NaN": (lambda: rk.RectangularPulse(0.5, NAN), "duration", POSITIVE, "nan"),
+    "rectangle, amplitude NaN": (lambda: rk.RectangularPulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "triangle, duration inf": (lambda: rk.TriangularPulse(0.5, INF), "duration", POSITIVE, "inf"),
+    "triangle, amplitude NaN": (lambda: rk.TriangularPulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "exponential, shape NaN": (lambda: rk.ExponentialPulse(0.5, 1.0, NAN), "shape", "be a number", "nan"),
+    "exponential, duration 0": (lambda: rk.ExponentialPulse(0.5, 0.0, 1.0), "duration", POSITIVE, "0.0"),
+    "exponential, amplitude NaN": (lambda: rk.ExponentialPulse(NAN, 1.0, 1.0), "amplitude", FINITE, "nan"),
+    "ricker, kind": (
+        lambda: rk.RickerPulse(0.5, 1.0, "mexican"),
+        "kind",
+        "be one of 'symmetric', 'antisymmetric'",
+        "'mexican'",
+    ),
+    "ricker, period 0": (lambda: rk.RickerPulse(0.5, 0.0), "period", POSITIVE, "0.0"),
+    "ricker, amplitude NaN": (lambda: rk.RickerPulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "ricker, center 0": (lambda: rk.RickerPulse(0.5, 1.0, center=0.0), "center", POSITIVE, "0.0"),
+    "ricker, center negative": (lambda: rk.RickerPulse(0.5, 1.0, center=-1.0), "center", POSITIVE, "-1.0"),
+    "near-fault, period negative": (
+        lambda: rk.MavroeidisPapageorgiouPulse(0.5, -1.0),
+        "period",
+        POSITIVE,
+        "-1.0",
+    ),
+    "near-fault, oscillations 1": (
+        lambda: rk.MavroeidisPapageorgiouPulse(0.5, 1.0, 1.0),
+        "oscillations",
+        "be above 1 and finite",
+        "1.0",
+    ),
+    "near-fault, oscillations inf": (
+        lambda: rk.MavroeidisPapageorgiouPulse(0.5, 1.0, INF),
+        "oscillations",
+        "be above 1 and finite",
+        "inf",
+    ),
+    "near-fault, amplitude NaN": (lambda: rk.MavroeidisPapageorgiouPulse(NAN, 1.0), "amplitude", FINITE, "nan"),
+    "near-fault, phase inf": (lambda: rk.MavroeidisPapageorgiouPulse(0.5, 1.0, 2.0, INF), "phase", FINITE, "inf"),
+    # Records, and motions made of motions
+    "record, dt 0": (lambda: rk.Record([0.0, 0.1], 0.0), "dt", POSITIVE, "0.0"),
+    "record, dt negative": (lambda: rk.Record([0.0, 0.1], -0.01), "dt", POSITIVE, "-0.01"),
+    "record, dt NaN": (lambda: rk.Record([0.0, 0.1], NAN), "dt", POSITIVE, "nan"),
+    "record, NaN": (lambda: rk.Record([0.0, NAN], 0.01), "acceleration", FINITE, "nan"),
+    "record, inf": (lambda: rk.Record([0.0, -INF], 0.01), "acceleration", FINITE, "-inf"),
+    "record, empty": (lambda: rk.Record([], 0.01), "acceleration", ONE_SAMPLE, "shape (0,)"),
+    "record, two of no samples": (
+        lambda: rk.Record(np.zeros((2, 0)), 0.01),
+        "acceleration",
+        ONE_SAMPLE,
+        "shape (2, 0)",
+    ),
+    "record, scalar": (lambda: rk.Record(0.3, 0.01), "acceleration", ONE_SAMPLE, "shape ()"),
+    "record, complex": (
+        lambda: rk.Record(np.array([1j]), 0.01),
+        "acceleration",
+        "be real",
+        "array([0.+1.j])",
+    ),
+    "delay negative": (lambda: SINE.shifted(-0.1), "delay", "be 0 or more and finite", "-0.1"),
+    "delay NaN": (lambda: SINE.shifted(NAN), "delay", "be 0 or more and finite", "nan"),
+    "delay inf": (lambda: SINE.shifted(INF), "delay", "be 0 or more and finite", "inf"),
+    "factor NaN": (lambda: NAN * SINE, "factor", FINITE, "nan"),
+    "factor inf": (lambda: SINE * INF, "factor", FINITE, "inf"),
+    # outcome and simulate
+    "rotation pi/2": (
+        lambda: rk.outcome(BLOCK, SINE, initial=(HALF_PI, 0.0)),
+        "initial[0]",
+        ROTATION,
+        "1.5707963267948966",
+    ),
+    "rotation -2": (lambda: rk.outcome(BLOCK, SINE, initial=(-2.0, 0.0)), "initial[0]", ROTATION, "-2.0"),
+    "rotation NaN": (lambda: rk.simulate(BLOCK, SINE, initial=(NAN, 0.0)), "initial[0]", ROTATION, "nan"),
+    "duration 0": (lambda: rk.simulate(BLOCK, SINE, duration=0.0), "duration", POSITIVE, "0.0"),
+    "duration negative": (lambda: rk.simulate(BLOCK, SINE, duration=-1.0), "duration", POSITIVE, "-1.0"),
+    "duration NaN": (lambda: rk.simulate(BLOCK, SINE, duration=NAN), "duration", POSITIVE, "nan"),
+    "duration inf": (lambda: rk.simulate(BLOCK, SINE, duration=INF), "duration", POSITIVE, "inf"),
+    "samples 1": (lambda: rk.simulate(BLOCK, SINE, samples=1), "samples", "be at least 2", "1"),
+    "samples 0": (lambda: rk.simulate(BLOCK, SINE, samples=0), "samples", "be at least 2", "0"),
+    # Engine
+    "order 3": (lambda: rk.Series(order=3), "order", "be at least 4", "3"),
+    "order 0": (lambda: rk.Series(order=0), "order", "be at least 4", "0"),
+    "tolerance 0": (lambda: rk.Series(tolerance=0.0), "tolerance", "be in (0, 1)", "0.0"),
+    "tolerance 1": (lambda: rk.Series(tolerance=1.0), "tolerance", "be in (0, 1)", "1.0"),
+    "tolerance negative": (lambda: rk.Series(tolerance=-1e-9), "tolerance", "be in (0, 1)", "-1e-09"),
+    "tolerance NaN": (lambda: rk.Series(tolerance=NAN), "tolerance", "be in (0, 1)", "nan"),
+    "max_steps 0": (lambda: rk.Series(max_steps=0), "max_steps", "be at least 1", "0"),
+    "max_steps negative": (lambda: rk.Series(max_steps=-5), "max_steps", "be at least 1", "-5"),
+    # Spectra and maps
+    "spectrum, no period": (lambda: rk.rocking_spectrum(0.2, SINE, []), "period", LIST, "shape (0,)"),
+    "spectrum, table of periods": (
+        lambda: rk.rocking_spectrum(0.2, SINE, np.ones((2, 3))),
+        "period",
+        LIST,
+        "shape (2, 3)",
+    ),
+    "spectrum, period 0": (lambda: rk.rocking_spectrum(0.2, SINE, [1.0, 0.0]), "period", POSITIVE, "0.0"),
+    "spectrum, period negative": (lambda: rk.rocking_spectrum(0.2, SINE, [-1.0]), "period", POSITIVE, "-1.0"),
+    "spectrum, period NaN": (lambda: rk.rocking_spectrum(0.2, SINE, [NAN]), "period", POSITIVE, "nan"),
+    "spectrum, alpha 2": (lambda: rk.rocking_spectrum(2.0, SINE, [1.0]), "alpha", SLENDERNESS, "2.0"),
+    "spectrum, restitution 2": (
+        lambda: rk.rocking_spectrum(0.2, SINE, [1.0], 2.0),
+        "restitution",
+        SHARE,
+        "2.0",
+    ),
+    "self-similar, no ratio": (
+        lambda: rk.self_similar_spectrum([], [2.0]),
+        "frequency_ratio",
+        LIST,
+        "shape (0,)",
+    ),
+    "self-similar, ratio 0": (
+        lambda: rk.self_similar_spectrum([0.0, 1.0], [2.0]),
+        "frequency_ratio",
+        POSITIVE,
+        "0.0",
+    ),
+    "self-similar, intensity 0": (lambda: rk.self_similar_spectrum([1.0], [0.0]), "intensity", POSITIVE, "0.0"),
+    "map, no ratio": (lambda: rk.overturning_map([], [2.0]), "frequency_ratio", LIST, "shape (0,)"),
+    "map, no intensity": (lambda: rk.overturning_map([1.0], []), "intensity", LIST, "shape (0,)"),
+    "map, ratio negative": (lambda: rk.overturning_map([-1.0], [2.0]), "frequency_ratio", POSITIVE, "-1.0"),
+    "map, intensity negative": (lambda: rk.overturning_map([1.0], [2.0, -3.0]), "intensity", POSITIVE, "-3.0"),
+    "map, intensity inf": (lambda: rk.overturning_map([1.0], [INF]), "intensity", POSITIVE, "inf"),
+    "map, alpha 0": (lambda: rk.overturning_map([1.0], [2.0], alpha=0.0), "alpha", SLENDERNESS, "0.0"),
+    "map, restitution negative": (
+        lambda: rk.overturning_map([1.0], [2.0], restitution=-0.1),
+        "restitution",
+        SHARE,
+        "-0.1",
+    ),
+    "map, alpha 1.2 and no restitution": (
+        lambda: rk.overturning_map([1.0], [2.0], alpha=1.2),
+        "alpha",
+        HOUSNER,
+        "1.2",
+    ),
+    # Many scenes where one is wanted
+    "many alphas": (lambda: rk.outcome(rk.Block(TWO, 1.0), SINE), "block", SCENE, "`alpha` has shape (2,)"),
+    "many p": (lambda: rk.outcome(rk.Block(0.2, TWO), SINE), "block", SCENE, "`p` has shape (2,)"),
+    "many restitutions": (
+        lambda: rk.outcome(rk.Block(0.2, 1.0, TWO), SINE),
+        "block",
+        SCENE,
+        "`given_restitution` has shape (2,)",
+    ),
+    "many alphas, history": (
+        lambda: rk.simulate(rk.Block(TWO, 1.0), SINE),
+        "block",
+        SCENE,
+        "`alpha` has shape (2,)",
+    ),
+    "many amplitudes": (
+        lambda: rk.outcome(BLOCK, rk.SinePulse(TWO, 1.0)),
+        "motion",
+        SCENE,
+        "`amplitude` has shape (2,)",
+    ),
+    "many records": (
+        lambda: rk.outcome(BLOCK, rk.Record(np.zeros((2, 3)), 0.01)),
+        "motion",
+        SCENE,
+        "`samples` has shape (2, 3)",
+    ),
+    "many steps": (
+        lambda: rk.outcome(BLOCK, rk.Record(np.zeros(3), TWO)),
+        "motion",
+        SCENE,
+        "`dt` has shape (2,)",
+    ),
+    "many delays": (lambda: rk.outcome(BLOCK, (2 * SINE).shifted(TWO)), "motion", SCENE, "`delay` has shape (2,)"),
+    "many amplitudes in a sum": (
+        lambda: rk.outcome(BLOCK, SINE + rk.SinePulse(TWO, 1.0)),
+        "motion",
+        SCENE,
+        "`second.amplitude` has shape (2,)",
+    ),
+    "spectrum of many alphas": (
+        lambda: rk.rocking_spectrum(TWO, SINE, [1.0]),
+        "block",
+        SCENE,
+        "`alpha` has shape (2,)",
+    ),
+    "map of many restitutions": (
+        lambda: rk.overturning_map([1.0], [2.0], restitution=TWO),
+        "block",
+        SCENE,
+        "`given_restitution` has shape (2,)",
+    ),
+    # Histories
+    "time negative": (lambda: history()(-0.1), "time", HISTORY, "-0.1"),
+    "time too late": (lambda: history()(4.001), "time", HISTORY, "4.001"),
+    "one time of many": (lambda: history()(np.array([[1.0, 5.0], [2.0, 3.0]])), "time", HISTORY, "5.0"),
+    "time NaN": (lambda: history()(NAN), "time", HISTORY, "nan"),
+    "time inf": (lambda: history()(INF), "time", HISTORY, "inf"),
+}
+
+
+@pytest.mark.parametrize("call, argument, allowed, value", BAD.values(), ids=BAD)
+def test_bad_input(call, argument, allowed, value):
+    text = rf"^Argument `{re.escape(argument)}` must {re.escape(allowed)}.*, but .*{re.escape(value)}"
+    with pytest.raises(ValueError, match=text) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_the_error_names_arrays_by_their_first_bad_value():
+    with pytest.raises(ValueError, match=r"`p` must be positive and finite, but is -3\.0\.$"):
+        rk.Block(0.2, np.array([1.0, -3.0, NAN, 0.0]))
+
+
+@pytest.mark.parametrize("name", ["impact_times", "impact_velocities", "peak_times", "peak_rotations"])
+def test_events_of_many_histories(name):
+    """The number of events differs between scenes: one table would need to be filled up."""
+    with pytest.raises(ValueError, match=r"holds many scenes: read its events inside jax\.vmap\.$"):
+        getattr(histories(), name)
+
+
+def test_a_call_of_many_histories():
+    """As with events: the times are those of one scene."""
+    with pytest.raises(ValueError, match=r"holds many scenes.*jax\.vmap"):
+        histories()(1.0)
+
+
+# Checks under jit: argument and what is allowed; the compiled function cannot print the value.
+TRACED = {
+    "alpha": (lambda x: rk.Block(x, 1.0).alpha, -0.1, 0.2, "alpha", SLENDERNESS),
+    "alpha of a stocky block": (lambda x: rk.Block(x, 1.0).alpha, 1.2, 0.2, "alpha", HOUSNER),
+    "p": (lambda x: rk.Block(0.2, x).p, 0.0, 1.0, "p", POSITIVE),
+    "restitution": (lambda x: rk.Block(0.2, 1.0, x).restitution, 1.5, 1.0, "restitution", SHARE),
+    "width": (lambda x: rk.Block.from_dimensions(x, 3.0).alpha, -0.6, 0.6, "width", POSITIVE),
+    "period": (lambda x: rk.SinePulse(0.5, x).end, 0.0, 1.0, "period", POSITIVE),
+    "amplitude": (lambda x: rk.SinePulse(x, 1.0).bounds, NAN, 1.0, "amplitude", FINITE),
+    "shape": (lambda x: rk.ExponentialPulse(0.5, 1.0, x).knots, NAN, INF, "shape", "be a number"),
+    "samples": (lambda x: rk.Record(jnp.stack([x, x]), 0.01).samples, INF, 1.0, "acceleration", FINITE),
+    "delay": (lambda x: SINE.shifted(x).end, -1.0, 0.0, "delay", "be 0 or more and finite"),
+    "restitution of an outcome": (
+        lambda x: rk.outcome(rk.Block(0.2, 1.0, x), SINE, **QUICK).margin,
+        -0.5,
+        0.5,
+        "restitution",
+        SHARE,
+    ),
+    "duration": (lambda x: rk.simulate(BLOCK, SINE, duration=x, **QUICK).rotation, -1.0, 2.0, "duration", POSITIVE),
+}
+
+
+@pytest.mark.parametrize("function, bad, good, argument, allowed", TRACED.values(), ids=TRACED)
+def test_bad_input_under_jit(function, bad, good, argument, allowed):
+    compiled = jax.jit(function)
+    assert not np.isnan(compiled(good)).any()
+    with pytest.raises(Exception, match=f"Argument `{argument}` must {re.escape(allowed)}"):
+        compiled(bad).block_until_ready()
+
+
+@pytest.mark.parametrize("time", [-0.1, 4.1, NAN])
+def test_times_outside_the_history_under_jit(time):
+    evaluate = jax.jit(lambda response, time: response(time)[0])
+    response = history()
+    assert evaluate(response, 4.0) == response.rotation[-1]
+    with pytest.raises(Exception, match="Argument `time` must be in the history"):
+        evaluate(response, time).block_until_ready()
+
+
+def test_bad_input_under_vmap():
+    """One bad lane is enough."""
+    with pytest.raises(Exception, match=r"Argument `alpha` must be in \(0, pi/2\)"):
+        jax.vmap(lambda alpha: rk.Block(alpha, 1.0).alpha)(jnp.array([0.2, 2.0])).block_until_ready()
+
+
+@pytest.mark.parametrize("velocity", [NAN, INF, -INF])
+def test_initial_velocity_that_is_not_finite(velocity):
+    """Refused, or reported; never taken for a number."""
+    try:
+        result = rk.outcome(BLOCK, SINE, initial=(0.0, velocity), **QUICK)
+    except ValueError as error:
+        assert "Argument `initial[1]` must be finite, but is" in str(error)
+    else:
+        assert result.status == rk.Status.not_finite
+
+
+# ----------------------------------------------------------------------------------- what is allowed
+
+
+@pytest.mark.parametrize("shape", [-INF, INF, -1e300, 1e300, 0])
+def test_any_shape_is_allowed(shape):
+    pulse = rk.ExponentialPulse(0.5, 2.0, shape)
+    found = jax.jit(lambda pulse: pulse.acceleration(np.linspace(-1, 3, 41)))(pulse)
+    assert np.isfinite(found).all()
+    assert np.isfinite(pulse.knots).all()
+    assert np.asarray(found).max() == (0.5 if shape <= 0 else 0)
+
+
+@pytest.mark.parametrize("restitution", [0, 0.0, 1, 1.0])
+def test_ends_of_ranges_are_allowed(restitution):
+    assert rk.Block(1.5, 1e-3, restitution).restitution == restitution
+    assert (0.0 * SINE).shifted(0.0).end == 1.0
+    assert rk.Record([0.3], 1e-9).end == 0.0
+    assert rk.RickerPulse(-0.5, 1.0, center=1e-3).end == 2e-3
+
+
+def test_ends_of_the_history_are_allowed():
+    response = history()
+    rotation, velocity = response([0.0, 4.0])
+    np.testing.assert_array_equal(rotation, response.rotation[jnp.array([0, -1])])
+    np.testing.assert_array_equal(velocity, response.velocity[jnp.array([0, -1])])
+
+
+def test_numbers_may_be_integers():
+    assert rk.Block(1, 2, 0).p.dtype == jnp.float64
+    assert rk.Record(np.array([0, 1, 0]), 1).knots.dtype == jnp.float64
+    assert rk.SinePulse(1, 2).acceleration(np.array([0, 1])).dtype == jnp.float64
+
+
+def test_housner_restitution():
+    alpha = np.array([1e-6, 0.1, 0.5, 0.9, np.arcsin(np.sqrt(2 / 3))])
+    np.testing.assert_allclose(rk.Block(alpha, 1.0).restitution, 1 - 1.5 * np.sin(alpha) ** 2, rtol=1e-15, atol=1e-15)
+    assert np.all(rk.Block(alpha, 1.0).restitution >= 0)
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.2, 0.9])
+def test_housner_restitution_follows_alpha(alpha):
+    slope = jax.grad(lambda x: rk.Block(x, 1.0).restitution)(alpha)
+    np.testing.assert_allclose(slope, -1.5 * np.sin(2 * alpha), rtol=1e-14)
+    assert jax.grad(lambda x: rk.Block(x, 1.0, 0.9).restitution)(alpha) == 0
+
+
+def test_block_from_dimensions():
+    block = rk.Block.from_dimensions(0.6, 3.0)
+    half_diagonal = np.hypot(0.6, 3.0) / 2
+    np.testing.assert_allclose(np.tan(block.alpha), 0.2, rtol=1e-15)
+    np.testing.assert_allclose(block.p, np.sqrt(3 * 9.81 / (4 * half_diagonal)), rtol=1e-15)
+    np.testing.assert_allclose(block.half_diagonal, half_diagonal, rtol=1e-15)
+    moon = rk.Block.from_dimensions(0.6, 3.0, gravity=1.62)
+    np.testing.assert_allclose(moon.p / block.p, np.sqrt(1.62 / 9.81), rtol=1e-15)
+    assert moon.alpha == block.alpha
+
+
+# ---------------------------------------------------------------------------------- single precision
+
+SINGLE = """
+import warnings
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    import jaxrock as rk
+    block, quick = rk.Block(0.2, 2.0), {"model": rk.Linear(), "engine": rk.Series(order=4)}
+    before = len(caught)
+    results = [rk.outcome(block, rk.SinePulse(amplitude, 1.1), **quick) for amplitude in (0.5, 0.6)]
+for warning in caught:
+    print(warning.category.__name__, warning.filename, warning.message)
+print(before, len(caught), results[0].max_rotation.dtype)
+"""
+
+
+def test_single_precision_warns_once():
+    done = subprocess.run(
+        [sys.executable, "-c", SINGLE],
+        cwd=Path(rk.__file__).parents[1],
+        env=os.environ | {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    *warned, counts = done.stdout.splitlines()
+    assert counts == "0 1 float32"
+    assert len(warned) == 1
+    # It points at the user's line, and says what to do.
+    assert warned[0].startswith("UserWarning <string> jaxrock runs in single precision")
+    assert 'jax.config.update("jax_enable_x64", True)' in warned[0]

@@ -1,0 +1,191 @@
+"""The shape of the package: imports go downward, files and functions stay short, importing has no side effects."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxrock
+
+PACKAGE = Path(jaxrock.__file__).parent
+TREES = {path.stem: ast.parse(path.read_text()) for path in sorted(PACKAGE.glob("*.py"))}
+MODULES = [name for name in TREES if name != "__init__"]
+
+# At the bottom: `status`, and helpers (one underscore). They import nothing, and all others may import them.
+BOTTOM = {"status"} | {name for name in MODULES if re.match("_[^_]", name)}
+
+# Every other module, and the modules just below it: it may import those, and what lies below them.
+BELOW = dict.fromkeys(BOTTOM, set()) | {
+    "polynomial": set(),
+    "block": set(),
+    "models": {"block"},
+    "motion": {"models"},
+    "pulses": {"motion"},
+    "records": {"pulses"},
+    "free": {"models"},
+    "scene": {"models", "motion"},
+    "series": {"polynomial", "scene"},
+    "response": {"series", "free"},
+    "spectra": {"response", "pulses"},
+    "plot": {"spectra"},
+    "__init__": {"plot", "records"},
+    "__main__": {"__init__"},
+}
+
+MOST_LINES_OF_A_MODULE = 450
+MOST_LINES_OF_A_FUNCTION = 70
+
+
+def imported(tree: ast.Module) -> set[str]:
+    """Modules of the package that a file imports, wherever in it; the package itself is `__init__`."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"relative import in line {node.lineno}"
+            # `from jaxrock import x`: a module x, or something that the package exports.
+            names = [f"{node.module}.{a.name}" if a.name in TREES else node.module for a in node.names]
+            names = names if node.module == "jaxrock" else [node.module]
+        else:
+            continue
+        parts = [name.split(".") for name in names]
+        found |= {"__init__" if len(part) == 1 else part[1] for part in parts if part[0] == "jaxrock"}
+    return found
+
+
+IMPORTS = {name: imported(tree) for name, tree in TREES.items()}
+
+
+def reached(graph: dict[str, set[str]], start: str) -> set[str]:
+    """All modules that `start` leads to, in any number of steps."""
+    found, waiting = set(), [*graph[start]]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += graph[name]
+    return found
+
+
+def code_lines(function: ast.FunctionDef, lines: list[str]) -> int:
+    """Lines of a function from `def` to its end, without its docstring, comments and blank lines."""
+    numbers = set(range(function.lineno, function.end_lineno + 1))
+    if ast.get_docstring(function) is not None:
+        numbers -= set(range(function.body[0].lineno, function.body[0].end_lineno + 1))
+    return sum(bool(lines[n - 1].strip()) and not lines[n - 1].lstrip().startswith("#") for n in numbers)
+
+
+def functions():
+    for name, tree in TREES.items():
+        lines = (PACKAGE / f"{name}.py").read_text().splitlines()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                yield f"{name}.{node.name}", code_lines(node, lines)
+
+
+def fresh(code: str) -> str:
+    """What a fresh interpreter prints, with nothing set for JAX."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=PACKAGE.parent,
+        env=environment | {"JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_the_table_names_every_module():
+    assert not {name for name in BELOW if name in reached(BELOW, name)}
+    assert set(TREES) == set(BELOW), "a module was added or removed: give it its place in BELOW"
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_imports_go_downward(name):
+    assert name in BELOW, "this module has no place in BELOW yet"
+    upward = IMPORTS[name] - reached(BELOW, name) - (set() if name in BOTTOM else BOTTOM)
+    assert not upward, f"{name} imports {sorted(upward)}, which do not lie below it"
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_no_cycles(name):
+    assert name not in reached(IMPORTS, name)
+
+
+@pytest.mark.parametrize("name", ["free", "polynomial", "models", "motion"])
+def test_the_physics_imports_no_engine(name):
+    assert not reached(IMPORTS, name) & {"series", "response"}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_modules_are_short(name):
+    lines = len((PACKAGE / f"{name}.py").read_text().splitlines())
+    assert lines <= MOST_LINES_OF_A_MODULE
+
+
+def test_functions_are_short():
+    found = dict(functions())
+    assert len(found) > 100
+    assert not {name: lines for name, lines in found.items() if lines > MOST_LINES_OF_A_FUNCTION}
+
+
+def test_restitution_is_not_called_eta():
+    """`eta` is the restitution in some papers, its square in others."""
+    found = {
+        f"{path.name}:{number}"
+        for path in PACKAGE.rglob("*.py")
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if re.search(r"\beta\b", line)
+    }
+    assert not found
+
+
+def exports() -> dict[str, tuple[str, str]]:
+    """Public names of the package: the module that each comes from, and its name there."""
+    return {
+        alias.asname or alias.name: (node.module.split(".")[-1], alias.name)
+        for node in TREES["__init__"].body
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("jaxrock.")
+        for alias in node.names
+    }
+
+
+@pytest.mark.parametrize("name", exports())
+def test_what_is_public_has_a_docstring(name):
+    # In the source: at run time a dataclass without a docstring has one made of its arguments.
+    assert getattr(jaxrock, name) is not None
+    module, origin = exports()[name]
+    definitions = [
+        node for node in TREES[module].body if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == origin
+    ]
+    assert len(definitions) == 1, f"{name} is not defined in {module}, from which it is imported"
+    assert ast.get_docstring(definitions[0])
+
+
+def test_the_public_names_are_found():
+    assert {"Block", "Record", "outcome", "simulate", "overturning_map", "Status"} <= set(exports())
+
+
+def test_import_draws_nothing_and_configures_nothing():
+    settings = "{k: v for k, v in jax.config.values.items()}"
+    code = f"import sys, jax; before = {settings}; import jaxrock; after = {settings}\n"
+    code += "print(before == after, jax.config.jax_enable_x64, 'matplotlib.pyplot' in sys.modules)"
+    assert fresh(code) == "True False False"
+
+
+def test_figures_come_when_they_are_asked_for():
+    code = "import sys, jaxrock; before = 'jaxrock.plot' in sys.modules; jaxrock.plot.history; "
+    assert fresh(code + "print(before, 'jaxrock.plot' in sys.modules)") == "False True"
+
+
+def test_unknown_names_raise():
+    with pytest.raises(AttributeError, match="module 'jaxrock' has no attribute 'rock'"):
+        jaxrock.rock  # noqa: B018
