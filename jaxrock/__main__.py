@@ -46,14 +46,18 @@ def _parser() -> argparse.ArgumentParser:
     run = command("run", "simulate one block under a record")
     run.add_argument("--width", type=float, default=0.6, help="full width [m] (default 0.6)")
     run.add_argument("--height", type=float, default=3.0, help="full height [m] (default 3)")
-    run.add_argument("--duration", type=float, help="how long to follow the block [s] (default: a little past the record)")
+    run.add_argument(
+        "--duration", type=float, help="how long to follow the block [s] (default: a little past the record)"
+    )
     spectrum = command("spectrum", "rocking spectrum of a record: peak response against block size")
     spectrum.add_argument("--slenderness", type=float, default=5.0, help="height/width of the blocks (default 5)")
     spectrum.add_argument("--shortest", type=float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
     spectrum.add_argument("--longest", type=float, default=8.0, help="longest 2 pi/p [s] (default 8)")
     spectrum.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
     for sub in (run, spectrum):
-        sub.add_argument("record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)")
+        sub.add_argument(
+            "record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)"
+        )
         sub.add_argument("--dt", type=float, help="time between samples [s], for files that do not say")
         sub.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
         sub.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
@@ -76,9 +80,7 @@ def _motion(arguments):
                 raise ValueError(f"Option --{option} describes a file, but no RECORD is given.")
         record = rk.example_record()
     else:
-        record = rk.read_record(
-            arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column
-        )
+        record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
     samples = record.samples * arguments.scale
     return rk.Record(samples, record.dt, record.name)
 
@@ -115,7 +117,6 @@ def _run(arguments) -> int:
     lost = bool(result.overturned)
     peak = float(np.max(np.abs(record.samples)))
     rows = [
-        ("record", record.name or "unnamed", ""),
         ("peak ground acceleration", f"{peak:.4f}", "g"),
         ("block, width x height", f"{arguments.width:g} x {arguments.height:g}", "m"),
         ("slenderness alpha", f"{alpha:.4f}", "rad"),
@@ -126,12 +127,15 @@ def _run(arguments) -> int:
         ("peak rotation", "overturned" if lost else f"{float(result.max_rotation):.6f}", "" if lost else "rad"),
         ("peak rotation / alpha", "overturned" if lost else f"{float(result.max_rotation) / alpha:.6f}", ""),
         ("at time", "-" if lost else f"{float(result.time_of_max):.4f}", "" if lost else "s"),
-        ("peak angular velocity", "overturned" if lost else f"{float(result.max_velocity):.6f}", "" if lost else "rad/s"),
+        (
+            "peak angular velocity",
+            "overturned" if lost else f"{float(result.max_velocity):.6f}",
+            "" if lost else "rad/s",
+        ),
         ("margin (0: boundary)", f"{float(result.margin):+.4f}", ""),
         ("verdict", "OVERTURNS" if lost else "stands", ""),
-        ("status", rk.Status[result.status], ""),
     ]
-    print(_table(rows))
+    print(f"{record.name or 'unnamed record'}\n{_table(rows)}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     _write_csv(arguments.out / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
                response.rotation, response.velocity)  # fmt: skip
@@ -142,7 +146,8 @@ def _run(arguments) -> int:
     _save(rk.plot.phase(response).figure, arguments.out / "phase.png")
     good = (result.status == rk.Status.successful) & (response.status == rk.Status.successful)
     if not good:
-        print(f"jaxrock: the history is not complete: {rk.Status[response.status]}", file=sys.stderr)
+        worse = response.status if response.status != rk.Status.successful else result.status
+        print(f"jaxrock: these are not results: {rk.Status[worse]}", file=sys.stderr)
     return 0 if good else 1
 
 
@@ -164,14 +169,17 @@ def _spectrum(arguments) -> int:
     result = rk.rocking_spectrum(alpha, record, period, arguments.restitution, _model(arguments))
     lost = np.asarray(result.overturned)
     rows = [
-        ("record", record.name or "unnamed", ""),
         ("slenderness, height/width", f"{arguments.slenderness:g}", ""),
         ("block sizes", f"{period.size}", ""),
         ("of these overturn", f"{int(lost.sum())}", ""),
-        ("longest 2 pi/p that overturns", f"{period[lost].max():.3f}" if lost.any() else "none", "s" if lost.any() else ""),
+        (
+            "longest 2 pi/p that overturns",
+            f"{period[lost].max():.3f}" if lost.any() else "none",
+            "s" if lost.any() else "",
+        ),
         ("not computed", f"{int(np.sum(~np.asarray(result.status == rk.Status.successful)))}", ""),
     ]
-    print(_table(rows))
+    print(f"{record.name or 'unnamed record'}\n{_table(rows)}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
     _write_csv(arguments.out / "spectrum.csv", header, period, result.max_rotation, result.max_velocity,

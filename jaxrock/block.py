@@ -39,7 +39,7 @@ class Block(eqx.Module):
             self.alpha = checked(
                 "alpha",
                 self.alpha,
-                "be at most 0.955 (asin sqrt(2/3)) when `restitution` is None, because Housner's value is negative above",
+                "be at most 0.955 when `restitution` is None, because Housner's value is negative above",
                 lambda x: x <= np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6),
             )
             self.given_restitution = None

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import ArrayLike, Inexact
 
 from jaxrock.block import Block
 

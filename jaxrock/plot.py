@@ -10,6 +10,15 @@ from jaxrock.spectra import OverturningMap, Spectrum
 _BLUE, _RED, _GREY, _SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
 
 
+def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
+    scene = response.stepper.scene
+    time = np.linspace(0, float(response.duration), 20001)
+    rotation, velocity = response(time)
+    alpha, p = float(scene.alpha), float(scene.p)
+    return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
+
+
 def history(response: Response, axes=None):
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
@@ -25,12 +34,11 @@ def history(response: Response, axes=None):
     if axes is None:
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
     scene = response.stepper.scene
-    time, alpha = np.asarray(response.time), float(scene.alpha)
-    acceleration = np.asarray(scene.motion.acceleration(response.time))
+    time, rotation, velocity = _dense(response)
+    acceleration = np.asarray(scene.motion.acceleration(time))
     impacts = np.asarray(response.impact_times)
-    speeds = np.asarray(response.impact_velocities) / (float(scene.p) * alpha)
-    curves = (np.asarray(response.rotation) / alpha, np.asarray(response.velocity) / (float(scene.p) * alpha))
-    for axis, curve in zip(axes, (*curves, acceleration)):
+    speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
+    for axis, curve in zip(axes, (rotation, velocity, acceleration)):
         axis.plot(time, curve, color=_BLUE if axis is not axes[2] else "black", linewidth=0.9)
         axis.axhline(0, color=_GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=_RED, markersize=7, label="impact")
@@ -62,13 +70,11 @@ def phase(response: Response, axis=None):
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
     scene = response.stepper.scene
-    alpha, p = float(scene.alpha), float(scene.p)
-    rotation, velocity = np.asarray(response.rotation) / alpha, np.asarray(response.velocity) / (p * alpha)
+    alpha = float(scene.alpha)
+    _, rotation, velocity = _dense(response)
     # The line breaks at impacts: the velocity jumps there.
     crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
-    axis.plot(
-        np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=_BLUE, linewidth=0.8
-    )
+    axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=_BLUE, linewidth=0.8)
     opening = np.linspace(0, 2, 101)
     manifold = np.asarray(jax.vmap(scene.table.manifold)(jnp.asarray(opening * alpha))) / alpha
     for side in (1, -1):

@@ -129,7 +129,9 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
         """The polynomial's jet at x, and for every quantity the length after x on which it has no zero."""
         values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
-            _clear_length(w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end))
+            _clear_length(
+                w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end)
+            )
             for w, fall in zip(watches, falls)
         ]
         return values, [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._keep import keep
 from jaxrock._checks import checked, finite, not_nan, one_of, positive
+from jaxrock._keep import keep
 from jaxrock.motion import AbstractMotion
 
 Real = Inexact[Array, "..."]
@@ -59,7 +59,7 @@ class RectangularPulse(AbstractMotion):
 
 
 class TriangularPulse(AbstractMotion):
-    """Up in a straight line to `amplitude` [g] at mid `duration` [s], down in another: shape 0 of `ExponentialPulse`."""
+    """Straight up to `amplitude` [g] at mid `duration` [s] and straight down: shape 0 of `ExponentialPulse`."""
 
     amplitude: Real
     duration: Real
@@ -270,7 +270,8 @@ class RickerPulse(AbstractMotion):
     """A Ricker wavelet, the second or third derivative of a Gaussian.
 
     symmetric: u = amplitude (1 - 2 y^2) e^(-y^2), y = pi (t - center)/period;
-    antisymmetric: u proportional to (y^3 - 3 y) e^(-y^2/2), y = 2 pi (t - center)/(sqrt(3) period), scaled to `amplitude`.
+    antisymmetric: u proportional to (y^3 - 3 y) e^(-y^2/2), y = 2 pi (t - center)/(sqrt(3) period),
+    scaled to a peak of `amplitude`.
 
     **Arguments:**
 
@@ -360,12 +361,12 @@ class MavroeidisPapageorgiouPulse(AbstractMotion):
     oscillations: Real
     phase: Real
 
-    def __init__(
-        self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0
-    ):
+    def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
         self.amplitude = finite("amplitude", amplitude)
         self.period = positive("period", period)
-        self.oscillations = checked("oscillations", oscillations, "be above 1 and finite", lambda x: (x > 1) & (x < jnp.inf))
+        self.oscillations = checked(
+            "oscillations", oscillations, "be above 1 and finite", lambda x: (x > 1) & (x < jnp.inf)
+        )
         self.phase = finite("phase", phase)
 
     @property

@@ -31,7 +31,8 @@ class Series(eqx.Module):
 
     - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16.
     - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit.
-    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece (`simulate`, which stores them).
+    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
+      (`simulate`, which stores every step).
 
     **Raises:** ValueError for a value outside its range.
     """
@@ -140,9 +141,7 @@ def opening_series(
             return sum(terms) if terms else None
 
         arms.append(combine(table.m0, None, table.ms, table.mc, k))
-        products = [
-            forcing[j] * arms[k - j] for j in range(min(k, len(forcing) - 1) + 1) if arms[k - j] is not None
-        ]
+        products = [forcing[j] * arms[k - j] for j in range(min(k, len(forcing) - 1) + 1) if arms[k - j] is not None]
         moment = sum(products) * side if products else 0.0
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
         moment = moment if restoring is None else moment + restoring
@@ -303,9 +302,7 @@ class Stepper(eqx.Module):
         """Taylor coefficients of the opening angle about a state, in time/unit."""
         stretch = keep(self.scene.p * unit, state.local)
         speed = state.velocity * stretch
-        return opening_series(
-            self.scene.table, stretch, state.side, angle, speed, state.uplifting, forcing, self.order
-        )
+        return opening_series(self.scene.table, stretch, state.side, angle, speed, state.uplifting, forcing, self.order)
 
     def _rock(self, state: State, forcing, unit, room, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
@@ -326,7 +323,9 @@ class Stepper(eqx.Module):
         signs = self._signs(state, coefficients)
         turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
         crossing = (opening >= saddle) != state.beyond
-        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
+        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(
+            _bend(coefficients, length), state.local
+        )
         steady = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top_speed > state.fastest * stretch) & ~steady
         eventful = (turning | crossing | faster | (opening <= 0)) & rocking
@@ -379,9 +378,7 @@ class Stepper(eqx.Module):
             return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
 
         velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, scaled[2]))
-        acceleration = jnp.where(
-            state.uplifting, 1.0, of(jnp.where(state.steady, 0.0, scaled[2]), scaled[3])
-        )
+        acceleration = jnp.where(state.uplifting, 1.0, of(jnp.where(state.steady, 0.0, scaled[2]), scaled[3]))
         return velocity, acceleration
 
     def _land(self, state, passed, scaled, forcing, signs, faster, length, unit, needed) -> State:
@@ -477,7 +474,9 @@ class Stepper(eqx.Module):
         weakest = jnp.minimum(here, there)
         safe = jnp.where(weakest > 0, weakest, 1.0)
         decay = jnp.where(e < 1, 1 - e * e, 1.0)
-        remaining = 2 * rebound * (1 / jnp.where(weakest > 0, here, 1.0) + e / jnp.where(weakest > 0, there, 1.0)) / decay
+        remaining = (
+            2 * rebound * (1 / jnp.where(weakest > 0, here, 1.0) + e / jnp.where(weakest > 0, there, 1.0)) / decay
+        )
         per_unit = jnp.where(length > 0, length, 1.0)
         steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / per_unit
         window = 2 * remaining / (scene.p * unit)  # hops at half the deceleration, in units
@@ -531,7 +530,11 @@ def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
     """From where to look for events: a block that leaves rest has them all at its start."""
     one = jnp.ones_like(saddle)
     lead = jnp.where(state.uplifting, 3 * scaled[3], scaled[2])
-    order = jnp.where(state.uplifting, fall_bound([0.0 * one] * 4 + scaled[4:], one, 2), fall_bound([0.0 * one] * 3 + scaled[3:], one, 2))
+    order = jnp.where(
+        state.uplifting,
+        fall_bound([0.0 * one] * 4 + scaled[4:], one, 2),
+        fall_bound([0.0 * one] * 3 + scaled[3:], one, 2),
+    )
     tiny = jnp.finfo(saddle.dtype).tiny
     clear = jnp.clip(lead / jnp.maximum(order, tiny), 0.0, 0.5)
     below_saddle = jnp.sqrt(saddle / (4 * sum(jnp.abs(c) for c in scaled) + tiny))

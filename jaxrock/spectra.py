@@ -1,5 +1,6 @@
 """Whole surfaces: rocking spectra and overturning maps, many scenes in chunks of one compiled shape."""
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -99,12 +100,8 @@ def rocking_spectrum(
     period = _axis("period", period)
     Block(alpha, 1.0, restitution)  # raises here, where values are known
 
-    def one(period, scene):
-        alpha, motion, restitution = scene
-        return outcome(Block(alpha, 2 * jnp.pi / period, restitution), motion, model, engine=engine)
-
     scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
-    found = _in_chunks(one, (period,), scene, "spectrum", progress)
+    found = _in_chunks(_under_motion(model, engine), (period,), scene, "spectrum", progress)
     scale = (scene[0], 2 * jnp.pi / period * scene[0])
     return _spectrum(period, found, scale)
 
@@ -186,16 +183,10 @@ def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, e
     ratio, intensity = _axis("frequency_ratio", frequency_ratio), _axis("intensity", intensity)
     Block(alpha, 1.0, restitution)
 
-    def one(intensity, ratio, scene):
-        alpha, restitution = scene
-        block = Block(alpha, jnp.ones_like(alpha), restitution)
-        motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
-        return outcome(block, motion, model, engine=engine)
-
     scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
     # Neighbours in intensity share a chunk: they move alike.
     columns, rows = (x.ravel() for x in jnp.meshgrid(ratio, intensity, indexing="ij"))
-    found = _in_chunks(one, (rows, columns), scene, label, progress)
+    found = _in_chunks(_under_pulse(pulse, model, engine), (rows, columns), scene, label, progress)
     shape = (ratio.size, intensity.size)
     return jax.tree.map(lambda x: x.reshape(shape).T, found), ratio, intensity
 
@@ -219,36 +210,64 @@ def _spectrum(abscissa, found: Outcome, scale) -> Spectrum:
     )
 
 
-def _in_chunks(function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None):
-    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape."""
-    size = axes[0].size
-    block = min(_BLOCK, -(-size // _LANES) * _LANES)
+# One function for each kind of surface, so that a second surface of a kind is not compiled again.
+
+
+@functools.lru_cache(maxsize=32)
+def _under_motion(model: Model, engine: Series | None) -> Callable:
+    def one(period, scene):
+        alpha, motion, restitution = scene
+        return outcome(Block(alpha, 2 * jnp.pi / period, restitution), motion, model, engine=engine)
+
+    return one
+
+
+@functools.lru_cache(maxsize=32)
+def _under_pulse(pulse: Callable, model: Model, engine: Series | None) -> Callable:
+    def one(intensity, ratio, scene):
+        alpha, restitution = scene
+        block = Block(alpha, jnp.ones_like(alpha), restitution)
+        motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
+        return outcome(block, motion, model, engine=engine)
+
+    return one
+
+
+@functools.lru_cache(maxsize=32)
+def _runner(function: Callable) -> Callable:
+    """`function(*point, scene)` over flat axes whose length is a multiple of the lanes."""
 
     def run(axes, scene):
         chunks = [axis.reshape(-1, _LANES) for axis in axes]
         found = jax.lax.map(lambda chunk: jax.vmap(lambda *point: function(*point, scene))(*chunk), chunks)
         return jax.tree.map(lambda x: x.reshape(-1), found)
 
+    return jax.jit(run, compiler_options=_compiler_options())
+
+
+@functools.cache
+def _compiler_options() -> dict | None:
+    """The options, where this backend and this jaxlib know them."""
+    if jax.default_backend() != "cpu":
+        return None
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=_CPU_OPTIONS)(1.0)
+    except Exception:  # reported by an internal error type
+        return None
+    return _CPU_OPTIONS
+
+
+def _in_chunks(function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None):
+    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape."""
+    size = axes[0].size
+    block = min(_BLOCK, -(-size // _LANES) * _LANES)
     blocks = -(-size // block)
     padded = [jnp.concatenate([axis, jnp.full(blocks * block - size, axis[-1])]) for axis in axes]
-    parts, compiled = [], None
+    run, parts = _runner(function), []
     bar = Progress(size, label, progress)
     for i in range(blocks):
         part = [axis[i * block : (i + 1) * block] for axis in padded]
-        if compiled is None:
-            compiled = _compile(run, part, scene)
         # Results wait in host memory, whatever the size of the surface.
-        parts.append(jax.tree.map(np.asarray, compiled(part, scene)))
+        parts.append(jax.tree.map(np.asarray, run(part, scene)))
         bar.update(min((i + 1) * block, size))
     return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)
-
-
-def _compile(function: Callable, *arguments):
-    """Compile for speed; fall back on the defaults where this jaxlib does not know the options."""
-    lowered = jax.jit(function).lower(*arguments)
-    if jax.default_backend() == "cpu":
-        try:
-            return lowered.compile(_CPU_OPTIONS)
-        except Exception:  # an unknown option is reported by an internal error type
-            pass
-    return lowered.compile()

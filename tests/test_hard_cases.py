@@ -17,11 +17,12 @@ model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_free_rocking_in_closed_form(start):
     """Impact times and velocities of a freely rocking linear block from hops of 1e-8 to the brink (Housner 1963)."""
     alpha, p, e = 0.2, 1.7, 0.9
-    response = rk.simulate(
-        rk.Block(alpha, p, e), STILL, rk.Linear(), initial=(start * alpha, 0.0), duration=60.0
-    )
+    response = rk.simulate(rk.Block(alpha, p, e), STILL, rk.Linear(), initial=(start * alpha, 0.0), duration=60.0)
     energy = start * (2 - start)  # over that of the saddle
-    times, speeds = [np.arccosh(1 / (1 - start)) / p if start > 0.5 else np.arctanh(np.sqrt(energy)) / p], [p * alpha * np.sqrt(energy)]
+    times, speeds = (
+        [np.arccosh(1 / (1 - start)) / p if start > 0.5 else np.arctanh(np.sqrt(energy)) / p],
+        [p * alpha * np.sqrt(energy)],
+    )
     while len(times) < 30:
         energy *= e**2
         times.append(times[-1] + 2 * np.arctanh(np.sqrt(energy)) / p)
@@ -177,9 +178,7 @@ def test_margin_is_smooth_through_the_boundary(model):
     """At every change of verdict along the intensity the margin goes through zero with the same slope."""
     block = rk.Block(0.2, 1.0, 0.9)
     threshold = float(model.table(block).threshold)
-    margin = jax.jit(
-        jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a * threshold, 2 * jnp.pi / 2.2), model).margin)
-    )
+    margin = jax.jit(jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a * threshold, 2 * jnp.pi / 2.2), model).margin))
     grid = np.linspace(1.02, 7.0, 1200)
     values = np.asarray(margin(grid))
     changes = np.flatnonzero(np.diff(np.sign(values)))

@@ -105,22 +105,16 @@ def test_series_is_the_acceleration_around_a_point(name):
 
 
 @each_moving
-def test_shorter_series_is_the_beginning_of_a_longer_one(name):
+def test_shorter_series_in_another_unit(name):
+    """A shorter series is the beginning of a longer one; its terms go with the powers of the unit."""
     piece, local, _ = points(name, np.array([0.0, 0.11, 0.37, 0.5, 0.83, 0.999]))
     unit = np.full(len(piece), 0.1)
-    long = series(MOTIONS[name], piece, local, unit, ORDER)
-    for order in (0, 1, 4):
-        short = series(MOTIONS[name], piece, local, unit, order)
+    long = np.asarray(series(MOTIONS[name], piece, local, unit, ORDER))
+    for order in (0, 3):
+        short = np.asarray(series(MOTIONS[name], piece, local, unit / 2, order))
         assert short.shape[1] == min(order + 1, long.shape[1])
-        np.testing.assert_allclose(short, long[:, : short.shape[1]], rtol=1e-13, atol=1e-15 * size(name))
-
-
-@each_moving
-def test_terms_of_the_series_go_with_powers_of_the_unit(name):
-    piece, local, _ = points(name, np.array([0.0, 0.11, 0.37, 0.5, 0.83, 0.999]))
-    unit = np.full(len(piece), 0.1)
-    coarse, fine = (np.asarray(series(MOTIONS[name], piece, local, u, ORDER)) for u in (unit, unit / 2))
-    np.testing.assert_allclose(fine * 2.0 ** np.arange(coarse.shape[1]), coarse, rtol=1e-13, atol=1e-15 * size(name))
+        expected = long[:, : order + 1] * 0.5 ** np.arange(short.shape[1])
+        np.testing.assert_allclose(short, expected, rtol=1e-13, atol=1e-15 * size(name))
 
 
 @each
@@ -178,11 +172,11 @@ def test_value_at_a_jump_is_the_one_after_it(motion, values):
 
 def test_acceleration_has_the_shape_of_the_time():
     motion, time = MOTIONS["triangle"], np.linspace(-0.5, 2.0, 12).reshape(3, 2, 2)
-    found = motion.acceleration(time)
+    found = acceleration(motion, time)
     assert found.shape == (3, 2, 2)
-    np.testing.assert_array_equal(found.ravel(), motion.acceleration(time.ravel()))
-    assert motion.acceleration(0.8).shape == ()
-    assert motion.acceleration(np.zeros((0,))).shape == (0,)
+    np.testing.assert_array_equal(found.ravel(), acceleration(motion, time.ravel()))
+    assert acceleration(motion, 0.8).shape == ()
+    assert acceleration(motion, np.zeros((0,))).shape == (0,)
 
 
 # --------------------------------------------------------------------- formulas, written again
@@ -308,18 +302,18 @@ def slopes(amplitude, duration, shape, time):
     return jnp.stack(jax.vmap(jax.grad(at, (0, 1, 2)), (None, None, None, 0))(amplitude, duration, shape, time))
 
 
-DERIVATIVE_SHAPES = [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 4e-3, 0.00999, 0.0101, 0.1, 1.0, 12.0, 39.9, 45.0, 300.0, 700.0]
+DERIVATIVE_SHAPES = [0.0, 1e-300, 1e-12, 1e-4, 0.00999, 0.0101, 1.0, 12.0, 39.9, 45.0, 700.0]
 
 
 @pytest.mark.parametrize("shape", sorted({*DERIVATIVE_SHAPES, *(-shape for shape in DERIVATIVE_SHAPES)}))
 def test_derivatives_of_the_exponential_pulse(shape):
-    """jax.grad against central differences at 40 digits and more."""
+    """jax.grad against central differences at 60 digits, which leave 40."""
     values = (0.8, 0.6)
     time = 0.6 * np.array([0.001, 0.013, 0.1, 0.31, 0.45, 0.499, 0.52, 0.7, 0.93, 0.998])
     found = np.asarray(slopes(*values, shape, time))
-    with mp.workdps(120):
+    with mp.workdps(60):
         numbers = [mp.mpf(x) for x in (*values, shape)]
-        step = mp.mpf(10) ** -30
+        step = mp.mpf(10) ** -20
 
         def slope(t, which):
             sides = []
@@ -331,7 +325,7 @@ def test_derivatives_of_the_exponential_pulse(shape):
 
         exact = np.array([[slope(t, which) for t in time.tolist()] for which in range(3)])
     # Where the pulse is constant to rounding (e^-40) so are its derivatives.
-    tiny = 1e-16 * np.abs(exact).max(axis=1, keepdims=True) + 1e-17
+    tiny = 1e-16 * np.abs(exact).max(axis=1, keepdims=True) + 5e-17
     np.testing.assert_array_less(np.abs(found - exact), 1e-9 * np.abs(exact) + tiny)
 
 
@@ -399,7 +393,7 @@ def test_arithmetic(combined, rule):
 def test_shifted(name, delay):
     motion, knots = MOTIONS[name], facts(name)[0]
     shifted = motion.shifted(delay)
-    np.testing.assert_array_equal(tables(shifted)[0], np.append(0.0, knots + delay))
+    np.testing.assert_allclose(tables(shifted)[0], np.append(0.0, knots + delay), rtol=2 * EPS)
     expected = np.asarray(acceleration(motion, TIMES))
     time = TIMES + delay
     # A time that rounds onto the other side of a jump is no error.

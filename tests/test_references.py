@@ -119,7 +119,9 @@ def test_sine_impacts(references):
             compared += count
             # Errors grow like exp(p t) where the block hovers near the saddle.
             growth = np.exp(2 * np.pi / ratio)
-            np.testing.assert_allclose(response.impact_times[:count], times[inside], rtol=0, atol=1e-12 + 1e-17 * growth)
+            np.testing.assert_allclose(
+                response.impact_times[:count], times[inside], rtol=0, atol=1e-12 + 1e-17 * growth
+            )
             np.testing.assert_allclose(
                 response.impact_velocities[:count] / ALPHA, speeds[inside], rtol=0, atol=1e-12 + 1e-17 * growth
             )

@@ -185,7 +185,7 @@ def test_eager_jit_vmap_and_loop_agree(model):
     loop = [one(a) for a in amplitudes]
     for many in (jax.vmap(one)(amplitudes), jax.jit(jax.vmap(one))(amplitudes)):
         for i, single in enumerate(loop):
-            lane = jax.tree.map(lambda x: x[i], many)
+            lane = jax.tree.map(lambda x, i=i: x[i], many)
             np.testing.assert_allclose(lane.max_rotation, single.max_rotation, rtol=1e-13)
             np.testing.assert_allclose(lane.margin, single.margin, rtol=1e-11)
             assert int(lane.impact_count) == int(single.impact_count)

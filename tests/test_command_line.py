@@ -1,0 +1,307 @@
+"""The command line: what it writes and prints, and one clear line where the input is bad."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.__main__ import main
+
+STEPS = np.arange(60)
+SAMPLES = np.round(0.5 * np.sin(0.3 * STEPS) * np.exp(-0.04 * STEPS), 5)  # g
+AT2 = (
+    "PEER STRONG MOTION DATABASE RECORD\nACCELERATION TIME SERIES IN UNITS OF G\nNPTS=  60, DT= .02 SEC\n"
+    + "\n".join("".join(f"{a:15.7E}" for a in row) for row in SAMPLES.reshape(-1, 5))
+)
+BLOCK = rk.Block.from_dimensions(0.6, 3.0)
+# With a restitution and a duration, all runs on the file compile once.
+GIVEN = ("--restitution", "0.9", "--duration", "4")
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture
+def at2(tmp_path):
+    path = tmp_path / "motion.AT2"
+    path.write_text(AT2)
+    return str(path)
+
+
+@pytest.fixture
+def column(tmp_path):
+    """The same record as a column of cm/s2."""
+    path = tmp_path / "motion.csv"
+    path.write_text("acceleration\n" + "\n".join(repr(float(a) * 980.665) for a in SAMPLES))
+    return str(path)
+
+
+@pytest.fixture
+def command(tmp_path, capsys):
+    """Run a command; return its exit status, its table as a dictionary, and its error stream."""
+
+    def run(*words):
+        capsys.readouterr()
+        status = main([*map(str, words), "--out", str(tmp_path / "out")])
+        printed = capsys.readouterr()
+        rows = (re.split(r"\s{2,}", line.strip()) for line in printed.out.splitlines() if line.startswith("  "))
+        return status, {row[0]: row[1] if len(row) > 1 else "" for row in rows}, printed.err
+
+    return run
+
+
+def table_of(path):
+    """Header and numbers of a CSV file."""
+    header, *rows = path.read_text().splitlines()
+    return header.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
+
+
+def is_figure(path):
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 5000
+
+
+def test_run_on_the_built_in_record(command, tmp_path):
+    status, table, errors = command("run")
+    record = rk.example_record()
+    result, response = rk.outcome(BLOCK, record), rk.simulate(BLOCK, record)
+    assert status == 0 and errors == ""
+    assert table["record"] == record.name
+    assert table["peak ground acceleration"] == "0.3110"
+    assert table["block, width x height"] == "0.6 x 3"
+    assert table["slenderness alpha"] == "0.1974"
+    assert table["frequency parameter p"] == f"{float(BLOCK.p):.4f}"
+    assert table["restitution"] == f"{1 - 1.5 * 0.04 / 1.04:.4f}"
+    assert table["uplift threshold"] == "0.2000"
+    assert table["impacts"] == str(result.impact_count)
+    assert table["peak rotation"] == f"{float(result.max_rotation):.6f}"
+    assert table["at time"] == f"{float(result.time_of_max):.4f}"
+    assert table["peak angular velocity"] == f"{float(result.max_velocity):.6f}"
+    assert table["margin (0: boundary)"] == f"{float(result.margin):+.4f}"
+    assert table["verdict"] == "stands"
+    assert table["status"] == "The response was computed."
+    header, history = table_of(tmp_path / "out" / "history.csv")
+    assert header == ["time_s", "rotation_rad", "velocity_rad_per_s"]
+    np.testing.assert_allclose(history, np.stack([response.time, response.rotation, response.velocity], 1), rtol=1e-11)
+    header, impacts = table_of(tmp_path / "out" / "impacts.csv")
+    assert header == ["time_s", "velocity_before_rad_per_s"]
+    np.testing.assert_allclose(impacts, np.stack([response.impact_times, response.impact_velocities], 1), rtol=1e-11)
+    assert is_figure(tmp_path / "out" / "history.png") and is_figure(tmp_path / "out" / "phase.png")
+
+
+def test_run_on_files(command, at2, column, tmp_path):
+    """The same record as AT2 in g and as a column in cm/s2: the same table."""
+    status, table, errors = command("run", at2, *GIVEN)
+    assert status == 0 and errors == ""
+    assert table["record"] == "motion"
+    assert table["peak ground acceleration"] == f"{np.abs(SAMPLES).max():.4f}"
+    assert table["verdict"] == "stands"
+    assert float(table["peak rotation / alpha"]) > 0
+    again = command("run", column, "--dt", "0.02", "--unit", "cm/s2", *GIVEN)
+    assert again == (0, table, "")
+    _, history = table_of(tmp_path / "out" / "history.csv")
+    assert history[-1, 0] == 4.0
+
+
+def test_run_of_a_block_that_overturns(command, at2):
+    status, table, _ = command("run", at2, *GIVEN, "--scale", "8")
+    assert status == 0
+    assert table["verdict"] == "OVERTURNS"
+    assert table["restitution"] == "0.9000"
+    assert table["peak rotation"] == table["peak angular velocity"] == "overturned"
+    assert float(table["margin (0: boundary)"]) < 0
+
+
+def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
+    status, table, _ = command("run", at2, *GIVEN, "--scale", "0.1")
+    assert status == 0
+    assert (table["verdict"], table["impacts"], table["peak rotation"]) == ("stands", "0", "0.000000")
+    assert (tmp_path / "out" / "impacts.csv").read_text() == "time_s,velocity_before_rad_per_s\n"
+
+
+def test_run_that_cannot_be_completed(command, at2):
+    """Impacts that never die out: exit status 1, and the reason."""
+    status, table, errors = command("run", at2, "--restitution", "1", "--duration", "1e6")
+    assert status == 1
+    assert errors.startswith("jaxrock: the history is not complete: The step budget was used up")
+    assert errors.count("\n") == 1
+
+
+def test_spectrum(command, column, tmp_path):
+    described = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9")
+    status, table, errors = command("spectrum", column, *described, "--shortest", 1, "--longest", 4, "--points", 5)
+    assert status == 0 and errors == ""
+    assert (table["block sizes"], table["not computed"]) == ("5", "0")
+    header, rows = table_of(tmp_path / "out" / "spectrum.csv")
+    assert header[0] == "two_pi_over_p_s" and len(header) == 6
+    np.testing.assert_allclose(rows[:, 0], [1, 1.75, 2.5, 3.25, 4])
+    assert table["of these overturn"] == str(int(rows[:, 4].sum()))
+    alpha = np.arctan(0.2)
+    for period, rotation, velocity, impacts, lost, margin in rows:
+        p = 2 * np.pi / period
+        result = rk.outcome(rk.Block(alpha, p, 0.9), rk.Record(SAMPLES, 0.02, "motion"))
+        assert (impacts, lost) == (result.impact_count, result.overturned)
+        expected = [result.max_rotation / alpha, result.max_velocity / (p * alpha), result.margin]
+        np.testing.assert_allclose([rotation, velocity, margin], expected, rtol=1e-7)
+    assert is_figure(tmp_path / "out" / "spectrum.png")
+
+
+def check_map(folder, points):
+    """A map's file agrees with itself; return the states."""
+    header, rows = table_of(folder / "map.csv")
+    assert header == ["frequency_ratio", "intensity", "state", "max_rotation_over_alpha", "impacts", "margin"]
+    ratio, intensity, state, rotation, impacts, margin = rows.T
+    assert rows.shape == (points**2, 6)
+    np.testing.assert_allclose(np.unique(ratio), np.linspace(0.3, 8.0, points), rtol=1e-11)
+    np.testing.assert_allclose(np.unique(intensity), np.linspace(1.02, 10.0, points), rtol=1e-11)
+    np.testing.assert_array_equal(state > 0, margin < 0)
+    np.testing.assert_array_equal(state > 0, np.isinf(rotation))
+    np.testing.assert_array_equal(state == 2, (margin < 0) & (impacts > 0))
+    # Long and strong pulses overturn; the shortest and weakest do not.
+    assert state[(ratio == ratio.min()) & (intensity == intensity.max())] == 1
+    assert state[(ratio == ratio.max()) & (intensity == intensity.min())] == 0
+    assert is_figure(folder / "map.png")
+    return state
+
+
+def test_map(command, tmp_path):
+    status, table, errors = command("map", "--points", "8", "--pulse", "cosine", "--model", "linear")
+    assert status == 0 and errors == ""
+    state = check_map(tmp_path / "out", 8)
+    names = {"safe": 0, "overturned without impact": 1, "overturned after impacts": 2, "not computed": -1}
+    assert {name: int(count) for name, count in table.items()} == {
+        name: np.count_nonzero(state == value) for name, value in names.items()
+    }
+
+
+def test_as_a_program(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxrock", "map", "--points", "4", "--out", str(tmp_path / "new" / "folder")],
+        cwd=Path(rk.__file__).parents[1],
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    check_map(tmp_path / "new" / "folder", 4)
+
+
+@pytest.mark.parametrize(
+    "words, mentioned",
+    [
+        ([], ["run", "spectrum", "map", "examples:"]),
+        (["run"], ["--width", "--height", "--duration", "--dt", "--unit", "--column", "--scale", "--restitution"]),
+        (["spectrum"], ["--slenderness", "--shortest", "--longest", "--points", "--model", "--out"]),
+        (["map"], ["--pulse", "--alpha", "--frequency-ratio", "--intensity", "--points"]),
+    ],
+    ids=["jaxrock", "run", "spectrum", "map"],
+)
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help(capsys, words, mentioned, option):
+    with pytest.raises(SystemExit) as stopped:
+        main([*words, option])
+    assert stopped.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith("usage: jaxrock")
+    assert all(word in text for word in mentioned)
+
+
+FILE = ["run", "motion.txt", "--unit", "g", "--dt", "0.02"]
+BAD = {
+    "missing file": (["run", "missing.AT2"], r"No such file or directory: '\S*missing.AT2'"),
+    "folder": (["run", "."], "Is a directory"),
+    "no numbers": (["run", "words.txt"], "File `words.txt`: no line holds columns of numbers"),
+    "no unit": (["run", "motion.txt", "--dt", "0.02"], "Argument `unit` must be 'g', 'm/s2' or 'cm/s2'"),
+    "wrong unit": ([*FILE, "--unit", "ft/s2"], "Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft/s2'"),
+    "no dt": (["run", "motion.txt", "--unit", "g"], "Argument `dt` must be given"),
+    "dt 0": ([*FILE, "--dt", "0"], "Argument `dt` must be positive and finite, but is 0.0"),
+    "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `dt` must be positive and finite, but is -0.01"),
+    "dt NaN": ([*FILE, "--dt", "nan"], "Argument `dt` must be positive and finite, but is nan"),
+    "column 3": ([*FILE, "--column", "3"], "Argument `column` must be 0 to 0, .*, but is 3"),
+    "column -1": ([*FILE, "--column", "-1"], "Argument `column` must be an integer, 0 or more, but is -1"),
+    "dt without file": (["run", "--dt", "0.01"], "Option --dt describes a file, but no RECORD is given"),
+    "unit without file": (["spectrum", "--unit", "g"], "Option --unit describes a file, but no RECORD is given"),
+    "width negative": (["run", "--width", "-0.6"], "Argument `width` must be positive and finite, but is -0.6"),
+    "width 0": (["run", "--width", "0"], "Argument `width` must be positive and finite, but is 0.0"),
+    "height NaN": (["run", "--height", "nan"], "Argument `height` must be positive and finite, but is nan"),
+    "stocky": (["run", "--width", "6"], "Argument `alpha` must be at most 0.955"),
+    "restitution 2": (["run", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
+    "duration 0": (["run", "--duration", "0"], "Argument `duration` must be positive and finite, but is 0.0"),
+    "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, but is nan"),
+    "spectrum, missing file": (["spectrum", "missing.AT2"], "No such file or directory"),
+    "spectrum, points 0": (["spectrum", "--points", "0"], "Argument `--points` must be at least 1, but is 0"),
+    "spectrum, slenderness 0": (
+        ["spectrum", "--slenderness", "0"],
+        "Argument `--slenderness` must be positive, but is 0.0",
+    ),
+    "spectrum, restitution 2": (["spectrum", "--restitution", "2"], "Argument `restitution` must be in"),
+    "spectrum, shortest 0": (["spectrum", "--shortest", "0"], "`--shortest` and `--longest` must be positive and"),
+    "spectrum, order": (["spectrum", "--shortest", "9"], "must be positive and in order, but are 9.0 and 8.0"),
+    "spectrum, longest NaN": (["spectrum", "--longest", "nan"], "must be positive and in order, but are 0.5 and nan"),
+    "spectrum, longest inf": (["spectrum", "--longest", "inf"], "must be .*finite.*inf"),
+    "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
+    "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
+    "map, restitution 2": (["map", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
+    "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), but is 2.0"),
+    "map, ratio from 0": (
+        ["map", "--frequency-ratio", "0", "8"],
+        "`frequency_ratio` must be positive and finite, but is 0.0",
+    ),
+    "map, intensity negative": (
+        ["map", "--intensity", "-1", "8"],
+        "`intensity` must be positive and finite, but is -1.0",
+    ),
+    "map, ratio to inf": (["map", "--frequency-ratio", "1", "inf"], "must be .*finite.*inf"),
+    "map, intensity to inf": (["map", "--intensity", "1", "inf"], "must be .*finite.*inf"),
+}
+
+
+@pytest.mark.parametrize("words, error", BAD.values(), ids=BAD)
+def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
+    """Exit status 2, one line on the error stream, nothing else printed, nothing written."""
+    (tmp_path / "motion.txt").write_text("\n".join(map(str, SAMPLES)))
+    (tmp_path / "words.txt").write_text("shaken, not stirred\n")
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert re.fullmatch(rf"jaxrock: error: .*{error}.*\n", printed.err)
+    assert printed.out == ""
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    "words, error",
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["rock"], "invalid choice: 'rock'"),
+        (["map", "--points", "many"], "argument --points: invalid int value: 'many'"),
+        (["map", "--pulse", "wave"], "argument --pulse: invalid choice: 'wave'"),
+        (["map", "--intensity", "2"], "argument --intensity: expected 2 arguments"),
+        (["run", "--width", "wide"], "argument --width: invalid float value: 'wide'"),
+        (["run", "--colour", "red"], "unrecognized arguments: --colour"),
+    ],
+)
+def test_bad_words(capsys, words, error):
+    """What argparse refuses: usage, then one line."""
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(r"jaxrock( run| map)?: error: ", last) and error in last
+
+
+def test_folder_that_is_a_file(capsys, at2, tmp_path):
+    (tmp_path / "out").write_text("in the way")
+    assert main(["run", at2, *GIVEN, "--out", str(tmp_path / "out")]) == 2
+    assert re.fullmatch(r"jaxrock: error: .*File exists: '\S*out'\n", capsys.readouterr().err)
+    assert (tmp_path / "out").read_text() == "in the way"

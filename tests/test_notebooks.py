@@ -1,0 +1,22 @@
+"""Every notebook runs from top to bottom, with fewer points; the files are left alone."""
+
+from pathlib import Path
+
+import pytest
+
+nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient is installed")
+nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook(path, monkeypatch):
+    monkeypatch.setenv("JAXROCK_NOTEBOOK_POINTS", "24")
+    notebook = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS

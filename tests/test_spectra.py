@@ -1,0 +1,107 @@
+"""Surfaces against single responses, and what they should look like."""
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxrock as rk
+
+RATIOS, INTENSITIES = np.linspace(0.4, 8.0, 23), np.linspace(1.02, 9.0, 17)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return rk.overturning_map(RATIOS, INTENSITIES, alpha=0.2, restitution=0.9)
+
+
+def test_map_is_made_of_outcomes(surface):
+    """The map's own compilation (wide vectors, fused multiply-add, padded chunks) against plain calls."""
+    block = rk.Block(0.2, 1.0, 0.9)
+    one = jax.jit(lambda a, w: rk.outcome(block, rk.SinePulse(a * jnp.tan(0.2), 2 * jnp.pi / w)))
+    assert surface.state.shape == (17, 23)
+    assert np.all(surface.status == rk.Status.successful)
+    for i in range(0, 17, 3):
+        for j in range(0, 23, 4):
+            single = one(INTENSITIES[i], RATIOS[j])
+            state = 0 if not single.overturned else 1 if single.impact_count == 0 else 2
+            assert int(surface.state[i, j]) == state
+            assert int(surface.impact_count[i, j]) == int(single.impact_count)
+            np.testing.assert_allclose(surface.margin[i, j], single.margin, rtol=1e-9, atol=1e-13)
+            np.testing.assert_allclose(surface.max_rotation[i, j], single.max_rotation / 0.2, rtol=1e-12)
+
+
+def test_map_has_the_three_regions(surface):
+    """Without impact at low frequency, after impacts beyond, safe at high frequency (Zhang & Makris 2001)."""
+    assert int(surface.state[-1, 0]) == 1
+    assert int(surface.state[-1, -1]) == 2
+    assert int(surface.state[0, -1]) == 0
+    assert set(np.unique(surface.state)) == {0, 1, 2}
+
+
+def test_no_impact_limit_of_the_linear_block():
+    """Dimitrakopoulos & DeJong (2012), 3.10: from here up the linear block overturns without impact."""
+    ratio, limit = 2.0, None
+    low, high = 1.2, 6.0
+
+    def edge(a):  # B = 0 with the constants of 3.7, written with the growth coordinate at the end of the pulse
+        psi = np.arcsin(1 / a)
+        end = (2 * np.pi - psi) / ratio
+        taus = np.linspace(0, end, 200001)
+        forcing = np.exp(-taus) * a * np.sin(ratio * taus + psi)
+        return np.trapezoid(forcing, taus) - 1
+
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if edge(middle) < 0 else (low, middle)
+    limit = (low + high) / 2
+    result = rk.overturning_map([ratio], [limit * (1 - 1e-6), limit * (1 + 1e-6)], restitution=0.9, model=rk.Linear())
+    assert int(result.state[1, 0]) == 1 and int(result.state[0, 0]) != 1
+
+
+def test_self_similar_spectrum():
+    """In the linear model rotation/alpha depends on intensity and frequency ratio alone."""
+    ratio, intensity = np.array([4.0, 8.0, 16.0]), [1.5, 3.0]
+    a = rk.self_similar_spectrum(ratio, intensity, alpha=0.05, restitution=0.85, model=rk.Linear())
+    b = rk.self_similar_spectrum(ratio, intensity, alpha=0.3, restitution=0.85, model=rk.Linear())
+    assert a.max_rotation.shape == (2, 3)
+    np.testing.assert_allclose(a.max_rotation, b.max_rotation, rtol=1e-13)
+    np.testing.assert_allclose(a.margin, b.margin, rtol=1e-12)
+
+
+def test_rocking_spectrum_of_a_record():
+    """Point by point the same as single outcomes; bigger blocks of one slenderness are safer here."""
+    record = rk.example_record()
+    period = np.array([1.0, 2.0, 3.0, 5.0, 8.0])
+    alpha = np.arctan(0.2)
+    spectrum = rk.rocking_spectrum(alpha, record, period)
+    assert np.all(spectrum.status == rk.Status.successful)
+    np.testing.assert_array_equal(spectrum.overturned, [True, True, False, False, False])
+    for i in (1, 2, 4):
+        single = rk.outcome(rk.Block(alpha, 2 * np.pi / period[i]), record)
+        np.testing.assert_allclose(spectrum.max_rotation[i], single.max_rotation / alpha, rtol=1e-9)
+        np.testing.assert_allclose(
+            spectrum.max_velocity[i], single.max_velocity / (alpha * 2 * np.pi / period[i]), rtol=1e-9
+        )
+
+
+def test_progress_bar(capsys):
+    rk.overturning_map([2.0, 3.0], [1.5, 2.0], restitution=0.9, progress=True)
+    assert "4/4" in capsys.readouterr().err
+    rk.overturning_map([2.0, 3.0], [1.5, 2.0], restitution=0.9, progress=False)
+    assert capsys.readouterr().err == ""
+
+
+def test_figures(surface, tmp_path):
+    """Every function draws into given axes or its own, and returns them."""
+    response = rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.5, 1.1))
+    axes = rk.plot.history(response)
+    assert len(axes) == 3 and axes[2].get_xlabel() == "time [s]"
+    assert "manifold" in rk.plot.phase(response).get_legend().get_texts()[0].get_text()
+    spectrum = rk.self_similar_spectrum([2.0, 4.0], [1.5, 3.0], restitution=0.9)
+    assert len(rk.plot.spectrum(spectrum)) == 2
+    _, axis = plt.subplots()
+    assert rk.plot.overturning(surface, axis) is axis
+    axis.figure.savefig(tmp_path / "map.png")
+    plt.close("all")
