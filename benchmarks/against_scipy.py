@@ -31,7 +31,7 @@ import jaxrock as rk  # noqa: E402
 
 SIZES = ((1.0, 5.0), (0.5, 3.0), (0.8, 5.0))  # blocks under the record: width x height [m]
 ALPHA, P, RESTITUTION = 0.2, 1.0, 0.9  # the block of the map
-SIDE, LANES, POINTS, SEED = 256, 32, 1024, 20261121
+SIDE, POINTS, SEED = 256, 1024, 20261121
 REPEATS_JAX, REPEATS_SCIPY = 20, 5
 
 
@@ -112,7 +112,7 @@ def grid():
 
 
 def jaxrock_map():
-    """The whole map by `rk.overturning_map`: time of the first call and of later ones [s], cores busy, peaks, verdicts."""
+    """The map by `rk.overturning_map`: time of the first call and of later ones [s], cores busy, peaks, verdicts."""
     ratio, intensity = np.linspace(0.3, 8.0, SIDE), np.linspace(1.05, 10.0, SIDE)
 
     def surface():

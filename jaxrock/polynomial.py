@@ -83,6 +83,20 @@ def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Sca
     return horner(_falls(coefficients, sign, order), length)
 
 
+def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
+    """Step at which the last two coefficients drop below `size`, at most `cap`."""
+    order = len(coefficients) - 1
+    last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
+    tiny = jnp.finfo(last.dtype).tiny
+    ratio = size / jnp.maximum(last, tiny)
+    if order & (order - 1) == 0:  # a power of two: repeated square roots vectorise
+        for _ in range(order.bit_length() - 1):
+            ratio = jnp.sqrt(ratio)
+    else:
+        ratio = ratio ** (1 / order)
+    return jnp.minimum(jnp.where(last > tiny, ratio, jnp.inf), cap)
+
+
 class Watch(NamedTuple):
     """A quantity whose first sign change is wanted: sign (derivative of the polynomial - offset), positive at first."""
 

@@ -14,7 +14,8 @@ from jaxrock.free import FreeStage, free_stage
 from jaxrock.models import Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.scene import Scene
-from jaxrock.series import Series, State, Stepper, initial_state, surpasses
+from jaxrock.series import Series, Stepper
+from jaxrock.state import State, initial_state, surpasses
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, "..."]

@@ -8,6 +8,7 @@ lane needs is not taken.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -15,9 +16,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._keep import keep
-from jaxrock.models import Angle, Table
-from jaxrock.polynomial import Landing, Watch, derivative, fall_bound, first_event, jet, keeps_sign, rescaled
+from jaxrock.models import Angle, opening_series
+from jaxrock.polynomial import (
+    Landing,
+    Watch,
+    derivative,
+    fall_bound,
+    first_event,
+    jet,
+    keeps_sign,
+    rescaled,
+    step_length,
+)
 from jaxrock.scene import Scene
+from jaxrock.state import State, surpasses
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, ""]
@@ -58,101 +70,6 @@ class Series(eqx.Module):
         return self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2
 
 
-class State(eqx.Module):
-    """Where a lane is, and what it has seen so far. Velocities are per p t, angles in rad."""
-
-    piece: Int[Array, ""]
-    local: Scalar  # time since the start of the piece [s]
-    side: Scalar  # corner it stands on: +1, -1; 0 at rest
-    opening: Scalar  # side * rotation
-    velocity: Scalar  # of the opening
-    uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
-    beyond: Flag  # past the saddle
-    steady: Flag  # a velocity extremum: the acceleration is zero here, to rounding
-    peak: Scalar
-    peak_time: Scalar
-    fastest: Scalar
-    impacts: Int[Array, ""]
-    impact_time: Scalar  # of the last impact [s]
-    impact_velocity: Scalar  # of the rotation, just before it
-    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
-    closeness_beyond: Scalar  # the same since the saddle was last crossed outward
-    overturned: Flag
-    done: Flag
-    status: Status
-    steps: Int[Array, ""]
-
-
-def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
-    """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
-    velocity = velocity / scene.p
-    side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
-    opening, outward = jnp.abs(rotation), side * velocity
-    zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
-    count = jnp.zeros_like(opening, jnp.int32)
-    # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
-    unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
-    return State(
-        piece=count,
-        local=zero,
-        side=side,
-        opening=opening,
-        velocity=outward,
-        uplifting=no,
-        beyond=opening >= scene.table.saddle,
-        steady=no,
-        peak=opening,
-        peak_time=zero,
-        fastest=jnp.abs(outward),
-        impacts=count,
-        impact_time=zero,
-        impact_velocity=zero,
-        closeness=jnp.where(side == 0, unlifted, 1.0),
-        closeness_beyond=jnp.full_like(opening, jnp.inf),
-        overturned=no,
-        done=no,
-        status=Status.where(jnp.isfinite(rotation) & jnp.isfinite(velocity), Status.successful, Status.not_finite),
-        steps=count,
-    )
-
-
-def opening_series(
-    table: Table, stretch: Scalar, side, angle: Angle, speed, uplifting, forcing: list, order: int
-) -> list[Scalar]:
-    """Taylor coefficients of the opening angle from x'' = -stretch^2 [restoring(x) + side u arm(x)].
-
-    `stretch` is p times the unit of time, `speed` the velocity per unit. The sine and cosine of the angle
-    follow their own recurrences (Jorba & Zou 2005).
-    """
-    x = [angle.value, speed]
-    slopes = [speed]  # (k + 1) x_{k+1}
-    sine, cosine, arms = [angle.sine], [angle.cosine], []
-    scale = -(stretch**2)
-    for k in range(order - 1):
-        if table.trigonometric and k > 0:
-            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
-            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
-
-        def combine(constant, line, of_sine, of_cosine, k):
-            terms = [] if constant is None or k > 0 else [constant]
-            terms += [] if line is None else [line * x[k]]
-            terms += [] if of_sine is None else [of_sine * sine[k]]
-            terms += [] if of_cosine is None else [of_cosine * cosine[k]]
-            return sum(terms) if terms else None
-
-        arms.append(combine(table.m0, None, table.ms, table.mc, k))
-        products = [forcing[j] * arms[k - j] for j in range(min(k, len(forcing) - 1) + 1) if arms[k - j] is not None]
-        moment = sum(products) * side if products else 0.0
-        restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
-        moment = moment if restoring is None else moment + restoring
-        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))), stretch)
-        if k == 0:
-            term = jnp.where(uplifting, 0.0, term)  # by continuity, exactly
-        x.append(term)
-        slopes.append((k + 2) * term)
-    return x
-
-
 def _when(needed: Flag, function: Callable, value: State) -> State:
     """`function(value, needed, inside)` where needed; under vmap the function runs only if some lane needs it.
 
@@ -166,25 +83,6 @@ def _when(needed: Flag, function: Callable, value: State) -> State:
         return jnp.zeros_like(first), function(value, first, lambda x: keep(x, jnp.where(first, 0.0, -1.0)))
 
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
-
-
-def surpasses(value: Scalar, best: Scalar) -> Flag:
-    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
-    return value > best * (1 + 4096 * jnp.finfo(best.dtype).eps)
-
-
-def _step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
-    """Step at which the last two coefficients drop below `size`, at most `cap`."""
-    order = len(coefficients) - 1
-    last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
-    tiny = jnp.finfo(last.dtype).tiny
-    ratio = size / jnp.maximum(last, tiny)
-    if order & (order - 1) == 0:  # a power of two: repeated square roots vectorise
-        for _ in range(order.bit_length() - 1):
-            ratio = jnp.sqrt(ratio)
-    else:
-        ratio = ratio ** (1 / order)
-    return jnp.minimum(jnp.where(last > tiny, ratio, jnp.inf), cap)
 
 
 class Stepper(eqx.Module):
@@ -227,17 +125,18 @@ class Stepper(eqx.Module):
         rocked = self._rock(state, forcing, unit, room, ~resting)
         after = jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked)
         good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-        return eqx.tree_at(
-            lambda s: (s.steps, s.status, s.done),
+        return replace(
             after,
-            (state.steps + 1, Status.where(good, after.status, Status.not_finite), after.done | ~good),
+            steps=state.steps + 1,
+            status=Status.where(good, after.status, Status.not_finite),
+            done=after.done | ~good,
         )
 
     def _wait(self, state: State, forcing, unit, room) -> State:
         """At rest: go on to the knot, or to where the acceleration exceeds the threshold."""
         scene, threshold = self.scene, self.scene.table.threshold
         truncated = len(forcing) > self.order  # else a polynomial: exact
-        length = _step_length(forcing, self.tolerance * threshold, room) if truncated else room
+        length = step_length(forcing, self.tolerance * threshold, room) if truncated else room
         never = scene.ceilings[state.piece] <= threshold
         length = jnp.where(jnp.isfinite(length), length, 0.0)
         scaled = rescaled(forcing, length)
@@ -249,7 +148,7 @@ class Stepper(eqx.Module):
         full = length >= room
         piece, local, over = self._advance(state, length * unit, full)
         piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
-        waited = eqx.tree_at(lambda s: (s.piece, s.local, s.done), state, (piece, local, over | never))
+        waited = replace(state, piece=piece, local=local, done=over | never)
 
         def search(waited, needed, inside):
             series = rescaled(forcing, inside(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
@@ -261,14 +160,11 @@ class Stepper(eqx.Module):
             value, rate = landing.jet
             met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
             early = landing.x < 1
-            cut = eqx.tree_at(
-                lambda s: (s.piece, s.local, s.done),
+            cut = replace(
                 waited,
-                (
-                    jnp.where(early, state.piece, waited.piece),
-                    jnp.where(early, state.local + landing.x * length * unit, waited.local),
-                    waited.done & ~early,
-                ),
+                piece=jnp.where(early, state.piece, waited.piece),
+                local=jnp.where(early, state.local + landing.x * length * unit, waited.local),
+                done=waited.done & ~early,
             )
             return self._lift(cut, value, met, jnp.ones_like(met))
 
@@ -280,15 +176,12 @@ class Stepper(eqx.Module):
 
     def _lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
         """Leave rest where `lifts`: positive acceleration drives negative rotation."""
-        return eqx.tree_at(
-            lambda s: (s.side, s.uplifting, s.beyond, s.steady),
+        return replace(
             state,
-            (
-                jnp.where(lifts, -jnp.sign(acceleration), state.side),
-                jnp.where(lifts, continuous, state.uplifting),
-                jnp.where(lifts, False, state.beyond),
-                jnp.where(lifts, False, state.steady),
-            ),
+            side=jnp.where(lifts, -jnp.sign(acceleration), state.side),
+            uplifting=jnp.where(lifts, continuous, state.uplifting),
+            beyond=jnp.where(lifts, False, state.beyond),
+            steady=jnp.where(lifts, False, state.steady),
         )
 
     def angle(self, state: State) -> Angle:
@@ -312,7 +205,7 @@ class Stepper(eqx.Module):
         coefficients = self.expand(state, angle, forcing, unit)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
         size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: max(self.order // 2, 4)]))))
-        length = _step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
+        length = step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
         length = jnp.where(full, room, length)
         length = keep(length, state.local)
@@ -336,23 +229,19 @@ class Stepper(eqx.Module):
         ceiling = scene.ceilings[state.piece]
         escaped = (state.velocity >= 0) & state.beyond
         escaped = escaped & (table.restoring(angle) + ceiling * table.arm(angle) <= 0)
-        flat = opening >= jnp.pi / 2 if scene.falls_flat else jnp.zeros_like(escaped)
 
         piece, local, over = self._advance(state, length * unit, full)
         moved = (length > 0) & rocking
-        passed = eqx.tree_at(
-            lambda s: (s.piece, s.local, s.opening, s.velocity, s.uplifting, s.steady, s.fastest, s.done),
+        passed = replace(
             state,
-            (
-                piece,
-                local,
-                opening,
-                jnp.where(moved, velocity, state.velocity),
-                state.uplifting & ~moved,
-                state.steady & ~moved,
-                jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
-                over,
-            ),
+            piece=piece,
+            local=local,
+            opening=opening,
+            velocity=jnp.where(moved, velocity, state.velocity),
+            uplifting=state.uplifting & ~moved,
+            steady=state.steady & ~moved,
+            fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
+            done=over,
         )
 
         def land(passed, needed, inside):
@@ -361,15 +250,11 @@ class Stepper(eqx.Module):
             return self._land(state, passed, scaled, series, signs, faster, length, unit, needed)
 
         stepped = _when(eventful & moved, land, passed)
-        if self.history:
-            low = stepped.opening < jnp.pi / 2
-            overturned = state.overturned | escaped
-            overturned = overturned | ~low if scene.falls_flat else overturned
-            return eqx.tree_at(
-                lambda s: (s.overturned, s.done), stepped, (overturned, stepped.done | (overturned & ~low))
-            )
-        overturned = escaped | (flat & (stepped.opening >= jnp.pi / 2)) | stepped.overturned
-        return eqx.tree_at(lambda s: (s.overturned, s.done), stepped, (overturned, stepped.done | overturned))
+        down = stepped.opening >= jnp.pi / 2
+        overturned = state.overturned | escaped | down if scene.falls_flat else state.overturned | escaped
+        # A history goes on to the ground; for an outcome the verdict is enough.
+        ends = overturned & down if self.history else overturned
+        return replace(stepped, overturned=overturned, done=stepped.done | ends)
 
     def _signs(self, state: State, scaled) -> tuple[Scalar, Scalar]:
         """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
@@ -401,19 +286,16 @@ class Stepper(eqx.Module):
         impact = impact & (speed <= 0)
         early = landing.x < 1
         elapsed = landing.x * length * unit
-        landed = eqx.tree_at(
-            lambda s: (s.piece, s.local, s.opening, s.velocity, s.beyond, s.steady, s.fastest, s.done),
+        landed = replace(
             passed,
-            (
-                jnp.where(early, state.piece, passed.piece),
-                jnp.where(early, state.local + elapsed, passed.local),
-                jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
-                jnp.where(turning, 0.0, speed),
-                state.beyond ^ crossing,
-                extremum,
-                jnp.maximum(state.fastest, jnp.abs(speed)),
-                passed.done & ~early,
-            ),
+            piece=jnp.where(early, state.piece, passed.piece),
+            local=jnp.where(early, state.local + elapsed, passed.local),
+            opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
+            velocity=jnp.where(turning, 0.0, speed),
+            beyond=state.beyond ^ crossing,
+            steady=extremum,
+            fastest=jnp.maximum(state.fastest, jnp.abs(speed)),
+            done=passed.done & ~early,
         )
         landed = self._note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
         return self._impact(landed, impact, speed, forcing, landing, length, unit)
@@ -445,15 +327,12 @@ class Stepper(eqx.Module):
         beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
         higher = turning & outward
         first = higher & surpasses(opening, state.peak)
-        return eqx.tree_at(
-            lambda s: (s.peak, s.peak_time, s.closeness, s.closeness_beyond),
+        return replace(
             state,
-            (
-                jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
-                jnp.where(first, self.time(state), state.peak_time),
-                closeness,
-                beyond,
-            ),
+            peak=jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
+            peak_time=jnp.where(first, self.time(state), state.peak_time),
+            closeness=closeness,
+            closeness_beyond=beyond,
         )
 
     def _impact(self, state: State, impact: Flag, speed, forcing, landing: Landing, length, unit) -> State:
@@ -490,32 +369,18 @@ class Stepper(eqx.Module):
         more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
         wait = jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
-        return eqx.tree_at(
-            lambda s: (
-                s.impacts,
-                s.impact_time,
-                s.impact_velocity,
-                s.side,
-                s.opening,
-                s.velocity,
-                s.local,
-                s.beyond,
-                s.uplifting,
-                s.steady,
-            ),
+        return replace(
             state,
-            (
-                state.impacts + (impact & (speed < 0)) + more,
-                jnp.where(impact, self.time(state), state.impact_time),
-                jnp.where(impact, state.side * speed, state.impact_velocity),
-                jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),
-                jnp.where(impact, 0.0, state.opening),
-                jnp.where(rests, 0.0, jnp.where(impact, rebound, state.velocity)),
-                state.local + wait,
-                state.beyond & ~impact,
-                state.uplifting & ~impact,
-                state.steady & ~impact,
-            ),
+            impacts=state.impacts + (impact & (speed < 0)) + more,
+            impact_time=jnp.where(impact, self.time(state), state.impact_time),
+            impact_velocity=jnp.where(impact, state.side * speed, state.impact_velocity),
+            side=jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),
+            opening=jnp.where(impact, 0.0, state.opening),
+            velocity=jnp.where(rests, 0.0, jnp.where(impact, rebound, state.velocity)),
+            local=state.local + wait,
+            beyond=state.beyond & ~impact,
+            uplifting=state.uplifting & ~impact,
+            steady=state.steady & ~impact,
         )
 
 

@@ -20,8 +20,8 @@ AT2 = (
     + "\n".join("".join(f"{a:15.7E}" for a in row) for row in SAMPLES.reshape(-1, 5))
 )
 BLOCK = rk.Block.from_dimensions(0.6, 3.0)
-# With a restitution and a duration, all runs on the file compile once.
-GIVEN = ("--restitution", "0.9", "--duration", "4")
+# With the same kinds of options, all runs on the file compile once.
+GIVEN = ("--restitution", "0.9", "--model", "linear", "--duration", "4")
 
 
 @pytest.fixture(autouse=True)
@@ -102,6 +102,7 @@ def test_run_on_files(command, at2, column, tmp_path):
     status, table, errors = command("run", at2, *GIVEN)
     assert status == 0 and errors == ""
     assert table["record"] == "motion"
+    assert table["uplift threshold"] == f"{np.arctan(0.2):.4f}"
     assert table["peak ground acceleration"] == f"{np.abs(SAMPLES).max():.4f}"
     assert table["verdict"] == "stands"
     assert float(table["peak rotation / alpha"]) > 0
@@ -136,7 +137,7 @@ def test_run_that_cannot_be_completed(command, at2):
 
 
 def test_spectrum(command, column, tmp_path):
-    described = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9")
+    described = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9", "--model", "linear")
     status, table, errors = command("spectrum", column, *described, "--shortest", 1, "--longest", 4, "--points", 5)
     assert status == 0 and errors == ""
     assert (table["block sizes"], table["not computed"]) == ("5", "0")
@@ -147,7 +148,7 @@ def test_spectrum(command, column, tmp_path):
     alpha = np.arctan(0.2)
     for period, rotation, velocity, impacts, lost, margin in rows:
         p = 2 * np.pi / period
-        result = rk.outcome(rk.Block(alpha, p, 0.9), rk.Record(SAMPLES, 0.02, "motion"))
+        result = rk.outcome(rk.Block(alpha, p, 0.9), rk.Record(SAMPLES, 0.02, "motion"), rk.Linear())
         assert (impacts, lost) == (result.impact_count, result.overturned)
         expected = [result.max_rotation / alpha, result.max_velocity / (p * alpha), result.margin]
         np.testing.assert_allclose([rotation, velocity, margin], expected, rtol=1e-7)

@@ -1,0 +1,79 @@
+"""The state of a lane: one block under one motion, on its way."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.models import Angle
+from jaxrock.scene import Scene
+from jaxrock.status import Status
+
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
+
+
+class State(eqx.Module):
+    """Where a lane is, and what it has seen so far. Velocities are per p t, angles in rad."""
+
+    piece: Int[Array, ""]
+    local: Scalar  # time since the start of the piece [s]
+    side: Scalar  # corner it stands on: +1, -1; 0 at rest
+    opening: Scalar  # side * rotation
+    velocity: Scalar  # of the opening
+    uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
+    beyond: Flag  # past the saddle
+    steady: Flag  # a velocity extremum: the acceleration is zero here, to rounding
+    peak: Scalar
+    peak_time: Scalar
+    fastest: Scalar
+    impacts: Int[Array, ""]
+    impact_time: Scalar  # of the last impact [s]
+    impact_velocity: Scalar  # of the rotation, just before it
+    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
+    closeness_beyond: Scalar  # the same since the saddle was last crossed outward
+    overturned: Flag
+    done: Flag
+    status: Status
+    steps: Int[Array, ""]
+
+
+def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
+    """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
+    velocity = velocity / scene.p
+    side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    opening, outward = jnp.abs(rotation), side * velocity
+    zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
+    count = jnp.zeros_like(opening, jnp.int32)
+    beyond = opening >= scene.table.saddle
+    # Squared distance from standing still in balance, for a block that starts beyond it.
+    start = Angle(opening, jnp.sin(opening), jnp.cos(opening))
+    stillness = (outward**2 + scene.table.restoring(start) ** 2) / scene.table.restoring_at_rest**2
+    # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
+    unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
+    return State(
+        piece=count,
+        local=zero,
+        side=side,
+        opening=opening,
+        velocity=outward,
+        uplifting=no,
+        beyond=beyond,
+        steady=no,
+        peak=opening,
+        peak_time=zero,
+        fastest=jnp.abs(outward),
+        impacts=count,
+        impact_time=zero,
+        impact_velocity=zero,
+        closeness=jnp.where(side == 0, unlifted, 1.0),
+        closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
+        overturned=no,
+        done=no,
+        status=Status.where(jnp.isfinite(rotation) & jnp.isfinite(velocity), Status.successful, Status.not_finite),
+        steps=count,
+    )
+
+
+def surpasses(value: Scalar, best: Scalar) -> Flag:
+    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
+    return value > best * (1 + 4096 * jnp.finfo(best.dtype).eps)
