@@ -33,10 +33,10 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     """
     array = as_real(name, value)
     message = f"Argument `{name}` must {allowed}"
-    if isinstance(array, jax.core.Tracer):
-        return eqx.error_if(array, ~jnp.all(holds(array)), message + ".")
-    known = np.asarray(array)
-    good = np.broadcast_to(np.asarray(holds(known)), known.shape)
+    good = holds(array)
+    if isinstance(array, jax.core.Tracer) or isinstance(good, jax.core.Tracer):
+        return eqx.error_if(array, ~jnp.all(good), message + ".")
+    known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
     if not good.all():
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array

@@ -91,9 +91,14 @@ class Response(eqx.Module):
 
         **Raises:** ValueError for a time outside the history.
         """
-        last = np.nextafter(np.asarray(self.duration), np.inf) if not _traced(self.duration) else self.duration
-        time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= last * (1 + 1e-12)))
+        self._check_single()
+        end = self.duration * (1 + 1e-12)  # a time computed as the duration may round past it
+        time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
         return _evaluate(self, time)
+
+    def _check_single(self):
+        if jnp.ndim(self.node_times) > 1:
+            raise ValueError("This response holds many scenes: call it, and read its events, inside jax.vmap.")
 
     def _events(self, times, values, found):
         """Events in order; trimmed to their number where that is known."""
@@ -118,8 +123,7 @@ class Response(eqx.Module):
         return self._gather(one)
 
     def _gather(self, one):
-        if self.node_times.ndim > 1:
-            raise ValueError("This response holds many scenes: read its events inside jax.vmap.")
+        self._check_single()
         return self._events(*one(self.nodes, self.impacted, self.stepper.scene.p))
 
     @property
