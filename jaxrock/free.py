@@ -85,12 +85,9 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
     manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
     deficit = (manifold - speed) * (manifold + speed)  # 2 (energy of the saddle - energy)
 
-    def turning_closeness(gap_at_peak_deficit):
-        """Squared acceleration at the turning point of a given deficit, over that at rest."""
-        half_sine2 = gap_at_peak_deficit / 4  # sin^2(gap/2)
-        restoring2 = gap_at_peak_deficit * (1 - half_sine2) if table.sinusoidal else gap_at_peak_deficit
-        share = gap_at_peak_deficit / base**2  # 1 - energy/energy of the saddle
-        return jnp.maximum(share, weight * table.stiffness * restoring2)
+    def turning_closeness(gap2):
+        """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+        return weight * table.stiffness * (gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2)
 
     def peak_of(deficit):
         missing = jnp.sqrt(jnp.maximum(deficit, 0.0))

@@ -33,6 +33,11 @@ class Angle(NamedTuple):
     sine: Scalar
     cosine: Scalar
 
+    @classmethod
+    def of(cls, value: Scalar) -> "Angle":
+        """An angle from its value."""
+        return cls(value, jnp.sin(value), jnp.cos(value))
+
 
 class Table(eqx.Module):
     """Coefficients of restoring moment and overturning arm, both over m g R (module docstring)."""

@@ -29,16 +29,20 @@ class Outcome(eqx.Module):
     - `max_velocity`: largest |angular velocity| [rad/s]; infinite if the block overturned.
     - `time_of_max`: when `max_rotation` was reached [s]; infinite if the block overturned.
     - `impact_count`: impacts during the motion, and the one after it if that one decides the verdict. The
-      impacts without end of a block that comes to rest are counted while they matter.
+      impacts without end of a block that comes to rest are counted down to hops of rounding height.
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
     - `status`: a `Status`. With any other than successful the numbers are not results.
 
-    The margin is the smallest squared distance (velocity / p sin alpha)^2 + (acceleration / p^2 sin alpha)^2 from
-    standing still in balance (Voyagaki et al. 2012, 3.11), over turning points and crossings of the unstable
-    equilibrium; negative, over those since the last outward crossing, if the block overturned. At a turning
-    point below the equilibrium it is at least 1 - E/E_crit by position, which it equals in a free linear stage.
-    A block that never uplifts has 2 - peak acceleration/threshold, 1 or more. (Linear model: alpha for sin alpha.)
+    The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11),
+    (velocity/p sin alpha)^2 + (acceleration/p^2 sin alpha)^2, over turning points and crossings of the
+    unstable equilibrium, the acceleration with or without the shaking, whichever is larger; if the block overturned,
+    its negative over those since the last outward crossing. It is at most 1, except for a block that never uplifts:
+    2 - bound of the acceleration/threshold. In a free linear stage it is 1 - E/E_crit. (In the linear model
+    alpha stands for sin alpha.)
+    Its sign is the verdict's; it passes through zero smoothly where a block comes to balance on its corner, and
+    jumps where the shaking itself throws a stocky block flat, or where an impact or a turning point is only just
+    grazed. Long after the start of a record the passage through zero can be narrower than the last digit.
     """
 
     max_rotation: Scalar

@@ -181,15 +181,13 @@ class Stepper(eqx.Module):
             side=jnp.where(lifts, -jnp.sign(acceleration), state.side),
             uplifting=jnp.where(lifts, continuous, state.uplifting),
             beyond=jnp.where(lifts, False, state.beyond),
-            steady=jnp.where(lifts, False, state.steady),
+            extremal=jnp.where(lifts, False, state.extremal),
         )
 
     def angle(self, state: State) -> Angle:
         """The opening angle of a state with its sine and cosine."""
-        x = state.opening
-        if not self.scene.table.trigonometric:
-            return Angle(x, x, x)
-        return Angle(x, keep(jnp.sin(x), state.local), keep(jnp.cos(x), state.local))
+        angle = Angle.of(state.opening)
+        return Angle(angle.value, keep(angle.sine, state.local), keep(angle.cosine, state.local))
 
     def expand(self, state: State, angle: Angle, forcing, unit) -> list[Scalar]:
         """Taylor coefficients of the opening angle about a state, in time/unit."""
@@ -219,8 +217,8 @@ class Stepper(eqx.Module):
         top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(
             _bend(coefficients, length), state.local
         )
-        steady = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
-        faster = (top_speed > state.fastest * stretch) & ~steady
+        monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
+        faster = (top_speed > state.fastest * stretch) & ~monotone
         eventful = (turning | crossing | faster | (opening <= 0)) & rocking
         if self.history:
             eventful = eventful | (rocking & (opening >= jnp.pi / 2))
@@ -239,7 +237,7 @@ class Stepper(eqx.Module):
             opening=opening,
             velocity=jnp.where(moved, velocity, state.velocity),
             uplifting=state.uplifting & ~moved,
-            steady=state.steady & ~moved,
+            extremal=state.extremal & ~moved,
             fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
             done=over,
         )
@@ -256,14 +254,16 @@ class Stepper(eqx.Module):
         ends = overturned & down if self.history else overturned
         return replace(stepped, overturned=overturned, done=stepped.done | ends)
 
-    def _signs(self, state: State, scaled) -> tuple[Scalar, Scalar]:
+    def _signs(self, state: State, coefficients) -> tuple[Scalar, Scalar]:
         """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
 
         def of(value, following):
             return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
 
-        velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, scaled[2]))
-        acceleration = jnp.where(state.uplifting, 1.0, of(jnp.where(state.steady, 0.0, scaled[2]), scaled[3]))
+        velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
+        acceleration = jnp.where(
+            state.uplifting, 1.0, of(jnp.where(state.extremal, 0.0, coefficients[2]), coefficients[3])
+        )
         return velocity, acceleration
 
     def _land(self, state, passed, scaled, forcing, signs, faster, length, unit, needed) -> State:
@@ -293,7 +293,7 @@ class Stepper(eqx.Module):
             opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
             velocity=jnp.where(turning, 0.0, speed),
             beyond=state.beyond ^ crossing,
-            steady=extremum,
+            extremal=extremum,
             fastest=jnp.maximum(state.fastest, jnp.abs(speed)),
             done=passed.done & ~early,
         )
@@ -306,22 +306,22 @@ class Stepper(eqx.Module):
         if self.history:
             return always
         # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
+        table = self.scene.table
         fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
         rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
-        top = jnp.where(fall > 0, state.opening + rise, jnp.inf)
-        share = self.scene.table.manifold(jnp.minimum(top, self.scene.table.saddle))
-        share = (share / self.scene.table.manifold(jnp.zeros_like(top))) ** 2
-        return state.beyond | (top >= state.peak) | (share < state.closeness)
+        top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, table.saddle), table.saddle)
+        least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
+        return state.beyond | (top >= state.peak) | (least < state.closeness)
 
     def _note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
         """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
         table = self.scene.table
-        at_rest = table.restoring_at_rest
-        stillness = (speed / at_rest) ** 2 + (bend / at_rest) ** 2
-        base, height = table.manifold(jnp.zeros_like(opening)), table.manifold(jnp.minimum(opening, table.saddle))
+        # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
+        # instant, far from its saddle, is not in balance.
+        pull = jnp.maximum(jnp.abs(bend), jnp.abs(table.restoring(Angle.of(opening))))
+        stillness = (speed**2 + pull**2) / table.restoring_at_rest**2
         turn = turning & (outward | state.beyond)
-        at_turn = jnp.where(state.beyond, stillness, jnp.maximum((height / base) ** 2, stillness))
-        closeness = jnp.where(turn, jnp.minimum(state.closeness, at_turn), state.closeness)
+        closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
         beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
         beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
@@ -338,33 +338,32 @@ class Stepper(eqx.Module):
     def _impact(self, state: State, impact: Flag, speed, forcing, landing: Landing, length, unit) -> State:
         """Change side with the restitution; come to rest where the impacts to come no longer matter.
 
-        After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come
-        last 2 v (1/a + e/a')/(1 - e^2). They are replaced by rest if they are certain to end before the
-        threshold is reached: what follows does not depend on them. Each is slower by e, so those above the
-        tolerance can be counted.
+        After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come last
+        2 v (1/a + e/a')/(1 - e^2). They are replaced by rest where it is certain that they end before the forcing
+        has changed by half of the weaker deceleration (so all speeds stay below e^(1/2) those of constant forcing,
+        and all hops end within four times that time), and that none is higher, faster or closer to overturning than
+        what has been. Each is slower by e, so those above the tolerance can be counted.
         """
-        scene, e = self.scene, self.scene.restitution
+        scene, table, e = self.scene, self.scene.table, self.scene.restitution
         rebound = e * jnp.abs(speed)
         side = -state.side
-        acceleration = jet(forcing, landing.x, 0)[0]
-        table = scene.table
-        push = side * acceleration * table.arm_at_rest
+        push = side * jet(forcing, landing.x, 0)[0] * table.arm_at_rest
         here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
-        weakest = jnp.minimum(here, there)
-        safe = jnp.where(weakest > 0, weakest, 1.0)
-        decay = jnp.where(e < 1, 1 - e * e, 1.0)
-        remaining = (
-            2 * rebound * (1 / jnp.where(weakest > 0, here, 1.0) + e / jnp.where(weakest > 0, there, 1.0)) / decay
-        )
-        per_unit = jnp.where(length > 0, length, 1.0)
-        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / per_unit
-        window = 2 * remaining / (scene.p * unit)  # hops at half the deceleration, in units
-        steady = steepest * window * table.arm_at_rest <= weakest / 2
-        within = window <= (1 - landing.x) * length
+        weaker = jnp.minimum(here, there)
+        held = (weaker > 0) & (e < 1)
+        here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
+        remaining = 2 * rebound * (1 / here + e / there) / jnp.where(held, 1 - e * e, 1.0)
+        window = 4 * remaining / (scene.p * unit)  # in units of time
+        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / jnp.where(length > 0, length, 1.0)
+        dies = held & (steepest * window * table.arm_at_rest <= weaker / 2) & (window <= (1 - landing.x) * length)
         # Speed of a hop as high as the tolerance; a history shows the hops down to there.
-        low = jnp.sqrt(2 * safe * 100 * self.tolerance * scene.alpha)
-        dies = (weakest > 0) & (e < 1) & steady & within
-        dies = dies & (rebound <= low) if self.history else dies
+        low = jnp.sqrt(200 * self.tolerance * scene.alpha * jnp.minimum(here, there))
+        if self.history:
+            dies = dies & (rebound <= low)
+        else:
+            highest = 3 * rebound**2 * jnp.maximum(1 / here, e * e / there)
+            least = (table.restoring(Angle.of(jnp.minimum(highest, table.saddle))) / table.restoring_at_rest) ** 2
+            dies = dies & (highest <= state.peak) & (2 * rebound <= state.fastest) & (least >= state.closeness)
         rests = impact & (dies | (rebound == 0))
         more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
@@ -380,7 +379,7 @@ class Stepper(eqx.Module):
             local=state.local + wait,
             beyond=state.beyond & ~impact,
             uplifting=state.uplifting & ~impact,
-            steady=state.steady & ~impact,
+            extremal=state.extremal & ~impact,
         )
 
 
@@ -392,16 +391,13 @@ def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:
 
 
 def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
-    """From where to look for events: a block that leaves rest has them all at its start."""
-    one = jnp.ones_like(saddle)
+    """From where to look for events: a block that leaves rest has opening, velocity and (continuous motion)
+    acceleration zero at its start, and all three are positive up to here."""
+    one, zero = jnp.ones_like(saddle), jnp.zeros_like(saddle)
     lead = jnp.where(state.uplifting, 3 * scaled[3], scaled[2])
-    order = jnp.where(
-        state.uplifting,
-        fall_bound([0.0 * one] * 4 + scaled[4:], one, 2),
-        fall_bound([0.0 * one] * 3 + scaled[3:], one, 2),
-    )
+    rest = [zero, zero, zero, jnp.where(state.uplifting, 0.0, scaled[3]), *scaled[4:]]
     tiny = jnp.finfo(saddle.dtype).tiny
-    clear = jnp.clip(lead / jnp.maximum(order, tiny), 0.0, 0.5)
+    clear = jnp.clip(lead / jnp.maximum(fall_bound(rest, one, 2), tiny), 0.0, 0.5)
     below_saddle = jnp.sqrt(saddle / (4 * sum(jnp.abs(c) for c in scaled) + tiny))
     leaving = (state.opening == 0) & (state.velocity == 0)
     return jnp.where(leaving, jnp.minimum(clear, below_saddle), 0.0)

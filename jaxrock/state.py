@@ -22,7 +22,7 @@ class State(eqx.Module):
     velocity: Scalar  # of the opening
     uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
     beyond: Flag  # past the saddle
-    steady: Flag  # a velocity extremum: the acceleration is zero here, to rounding
+    extremal: Flag  # the velocity has an extremum here: the acceleration is zero, to rounding
     peak: Scalar
     peak_time: Scalar
     fastest: Scalar
@@ -46,8 +46,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     count = jnp.zeros_like(opening, jnp.int32)
     beyond = opening >= scene.table.saddle
     # Squared distance from standing still in balance, for a block that starts beyond it.
-    start = Angle(opening, jnp.sin(opening), jnp.cos(opening))
-    stillness = (outward**2 + scene.table.restoring(start) ** 2) / scene.table.restoring_at_rest**2
+    stillness = (outward**2 + scene.table.restoring(Angle.of(opening)) ** 2) / scene.table.restoring_at_rest**2
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
     return State(
@@ -58,14 +57,14 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         velocity=outward,
         uplifting=no,
         beyond=beyond,
-        steady=no,
+        extremal=no,
         peak=opening,
         peak_time=zero,
         fastest=jnp.abs(outward),
         impacts=count,
         impact_time=zero,
         impact_velocity=zero,
-        closeness=jnp.where(side == 0, unlifted, 1.0),
+        closeness=jnp.where(side == 0, unlifted, jnp.where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
         closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
         overturned=no,
         done=no,

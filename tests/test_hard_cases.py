@@ -200,6 +200,43 @@ def test_margin_is_smooth_through_the_boundary(model):
         assert abs(slopes[0]) > 1e-3
 
 
+def test_hops_that_grow_are_not_rest():
+    """Forcing just below the threshold lifts the next hop above all before: it must not be taken for dying out."""
+    strength, e, start = jnp.meshgrid(jnp.linspace(0.1, 0.95, 8), jnp.linspace(0.3, 0.9, 6), jnp.logspace(-5, -1, 8))
+
+    @jax.jit
+    @jax.vmap
+    def both(strength, e, start):
+        block, push = rk.Block(0.2, 1.0, e), rk.RectangularPulse(0.2 * strength, 30.0)
+        initial = (0.2 * start, 0.0)
+        engine = rk.Series(max_steps=2000)
+        result = rk.outcome(block, push, rk.Linear(), initial=initial, engine=engine)
+        response = rk.simulate(block, push, rk.Linear(), initial=initial, duration=29.0, engine=engine)
+        return result, (response.max_rotation, response.margin, response.status)
+
+    result, (peak, margin, status) = both(strength.ravel(), e.ravel(), start.ravel())
+    assert np.all(result.status == rk.Status.successful) and np.all(status == rk.Status.successful)
+    np.testing.assert_allclose(result.max_rotation, peak, rtol=1e-12)
+    np.testing.assert_allclose(result.margin, margin, rtol=1e-10)
+    assert np.any(np.asarray(peak) > 0.2 * start.ravel() * 1.01)
+
+
+def test_thrown_flat_and_back_within_a_step():
+    """The peak passes pi/2 for an instant (SciPy: 1.0008 pi/2): the block has fallen."""
+    result = outcome(rk.Block(1.0, 1.0, 0.5), rk.SinePulse(29.476, 0.7853981633974483))
+    assert result.overturned and result.margin < 0
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-9])
+def test_margin_of_an_initial_tilt(distance):
+    """A still block released at either side of its balance point."""
+    margins = [
+        float(outcome(rk.Block(0.2, 1.0, 0.5), STILL, rk.Linear(), initial=(0.2 * (1 + s * distance), 0.0)).margin)
+        for s in (-1, 1)
+    ]
+    np.testing.assert_allclose(margins, [distance**2, -(distance**2)], rtol=1e-6)
+
+
 RECORDS = {
     "zero": np.zeros(50),
     "one sample": np.array([0.9]),
