@@ -91,6 +91,23 @@ def _model(arguments):
     return rk.Linear() if arguments.model == "linear" else rk.Housner()
 
 
+def _check_range(option: str, ends) -> None:
+    """Both ends of a range are positive, finite and in order."""
+    low, high = ends
+    if not 0 < low <= high < float("inf"):
+        raise ValueError(f"Argument `{option}` must be positive, finite and in order, but is {low:g} to {high:g}.")
+
+
+def _complete(status) -> int:
+    """Exit status of a surface: 1, with a message, where some scenes were not computed."""
+    import jaxrock as rk
+
+    if bool(np.all(np.asarray(status == rk.Status.successful))):
+        return 0
+    print("jaxrock: some scenes were not computed (impacts that do not die out)", file=sys.stderr)
+    return 1
+
+
 def _table(rows: list[tuple[str, str, str]]) -> str:
     widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
     return "\n".join(f"  {name:<{widths[0]}}  {value:>{widths[1]}}  {unit}".rstrip() for name, value, unit in rows)
@@ -158,11 +175,7 @@ def _spectrum(arguments) -> int:
         raise ValueError(f"Argument `--points` must be at least 1, but is {arguments.points}.")
     if not arguments.slenderness > 0:
         raise ValueError(f"Argument `--slenderness` must be positive, but is {arguments.slenderness}.")
-    if not 0 < arguments.shortest <= arguments.longest:
-        raise ValueError(
-            f"Arguments `--shortest` and `--longest` must be positive and in order, but are {arguments.shortest} "
-            f"and {arguments.longest}."
-        )
+    _check_range("--shortest, --longest", (arguments.shortest, arguments.longest))
     record = _motion(arguments)
     period = np.linspace(arguments.shortest, arguments.longest, arguments.points)
     alpha = np.arctan(1 / arguments.slenderness)
@@ -186,7 +199,7 @@ def _spectrum(arguments) -> int:
                result.impact_count, lost, result.margin)  # fmt: skip
     print(f"wrote {arguments.out / 'spectrum.csv'}")
     _save(rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
-    return 0
+    return _complete(result.status)
 
 
 def _map(arguments) -> int:
@@ -194,6 +207,8 @@ def _map(arguments) -> int:
 
     if arguments.points < 2:
         raise ValueError(f"Argument `--points` must be at least 2, but is {arguments.points}.")
+    _check_range("--frequency-ratio", arguments.frequency_ratio)
+    _check_range("--intensity", arguments.intensity)
     ratio = np.linspace(*arguments.frequency_ratio, arguments.points)
     intensity = np.linspace(*arguments.intensity, arguments.points)
     result = rk.overturning_map(
@@ -214,7 +229,7 @@ def _map(arguments) -> int:
                )  # fmt: skip
     print(f"wrote {arguments.out / 'map.csv'}")
     _save(rk.plot.overturning(result).figure, arguments.out / "map.png")
-    return 0
+    return _complete(result.status)
 
 
 def main(words: list[str] | None = None) -> int:
@@ -225,6 +240,8 @@ def main(words: list[str] | None = None) -> int:
 
     matplotlib.use("Agg")
     try:
+        if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
+            raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
         return {"run": _run, "spectrum": _spectrum, "map": _map}[arguments.command](arguments)
     except (ValueError, OSError) as error:
         print(f"jaxrock: error: {error}", file=sys.stderr)

@@ -57,6 +57,13 @@ def not_nan(name: str, value: Values) -> Inexact[Array, "..."]:
     return checked(name, value, "be a number", lambda x: x == x)
 
 
+def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
+    """Return `array` if it is one number."""
+    if array.ndim:
+        raise ValueError(f"Argument `{name}` must be one number, but has shape {array.shape}. Use jax.vmap for many.")
+    return array
+
+
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return `value` if it is one of the allowed words."""
     if value not in allowed:

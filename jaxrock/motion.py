@@ -88,6 +88,19 @@ class AbstractMotion(eqx.Module):
         return Summed(self, -other)
 
 
+class _Label:
+    """A name that compiled functions do not see: all labels are equal, so that a new name compiles nothing."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def __eq__(self, other):
+        return isinstance(other, _Label)
+
+    def __hash__(self):
+        return 0
+
+
 class Record(AbstractMotion):
     """An accelerogram: straight lines between equally spaced samples.
 
@@ -104,7 +117,7 @@ class Record(AbstractMotion):
 
     samples: Inexact[Array, "*batch n"]
     dt: Inexact[Array, "..."]
-    name: str = eqx.field(static=True)
+    label: _Label = eqx.field(static=True)
 
     def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
         samples = finite("acceleration", acceleration)
@@ -112,7 +125,12 @@ class Record(AbstractMotion):
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
         self.samples = samples
         self.dt = positive("dt", dt)
-        self.name = name
+        self.label = _Label(name)
+
+    @property
+    def name(self) -> str:
+        """Where the record comes from."""
+        return self.label.text
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import Values, as_real, checked
+from jaxrock._checks import Values, as_real, checked, scalar
 from jaxrock.block import Block
 from jaxrock.free import FreeStage, free_stage
 from jaxrock.models import Housner, Model
@@ -207,6 +207,7 @@ def simulate(
         raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
     if duration is not None:
         duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
+        duration = scalar("duration", duration)
     response = _simulate(block, motion, model, _start(initial), duration, engine or Series())
     time = jnp.linspace(jnp.zeros_like(response.duration), response.duration, samples)
     rotation, velocity = _evaluate(response, time)
@@ -230,7 +231,7 @@ def _start(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
     rotation = checked(
         "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)
     )
-    return rotation, as_real("initial[1]", velocity)
+    return scalar("initial[0]", rotation), scalar("initial[1]", as_real("initial[1]", velocity))
 
 
 @jax.jit

@@ -47,14 +47,16 @@ def column(tmp_path):
 
 @pytest.fixture
 def command(tmp_path, capsys):
-    """Run a command; return its exit status, its table as a dictionary, and its error stream."""
+    """Run a command; return its exit status, its table as a dictionary (its title as `title`), and its error stream."""
 
     def run(*words):
         capsys.readouterr()
         status = main([*map(str, words), "--out", str(tmp_path / "out")])
         printed = capsys.readouterr()
-        rows = (re.split(r"\s{2,}", line.strip()) for line in printed.out.splitlines() if line.startswith("  "))
-        return status, {row[0]: row[1] if len(row) > 1 else "" for row in rows}, printed.err
+        first, *lines = printed.out.splitlines()
+        title, rest = ("", [first, *lines]) if first.startswith("  ") else (first, lines)
+        rows = (re.split(r"\s{2,}", line.strip()) for line in rest if line.startswith("  "))
+        return status, {"title": title} | {row[0]: row[1] for row in rows}, printed.err
 
     return run
 
@@ -74,7 +76,7 @@ def test_run_on_the_built_in_record(command, tmp_path):
     record = rk.example_record()
     result, response = rk.outcome(BLOCK, record), rk.simulate(BLOCK, record)
     assert status == 0 and errors == ""
-    assert table["record"] == record.name
+    assert table["title"] == record.name
     assert table["peak ground acceleration"] == "0.3110"
     assert table["block, width x height"] == "0.6 x 3"
     assert table["slenderness alpha"] == "0.1974"
@@ -87,7 +89,6 @@ def test_run_on_the_built_in_record(command, tmp_path):
     assert table["peak angular velocity"] == f"{float(result.max_velocity):.6f}"
     assert table["margin (0: boundary)"] == f"{float(result.margin):+.4f}"
     assert table["verdict"] == "stands"
-    assert table["status"] == "The response was computed."
     header, history = table_of(tmp_path / "out" / "history.csv")
     assert header == ["time_s", "rotation_rad", "velocity_rad_per_s"]
     np.testing.assert_allclose(history, np.stack([response.time, response.rotation, response.velocity], 1), rtol=1e-11)
@@ -101,7 +102,7 @@ def test_run_on_files(command, at2, column, tmp_path):
     """The same record as AT2 in g and as a column in cm/s2: the same table."""
     status, table, errors = command("run", at2, *GIVEN)
     assert status == 0 and errors == ""
-    assert table["record"] == "motion"
+    assert table["title"] == "motion"
     assert table["uplift threshold"] == f"{np.arctan(0.2):.4f}"
     assert table["peak ground acceleration"] == f"{np.abs(SAMPLES).max():.4f}"
     assert table["verdict"] == "stands"
@@ -132,8 +133,7 @@ def test_run_that_cannot_be_completed(command, at2):
     """Impacts that never die out: exit status 1, and the reason."""
     status, table, errors = command("run", at2, "--restitution", "1", "--duration", "1e6")
     assert status == 1
-    assert errors.startswith("jaxrock: the history is not complete: The step budget was used up")
-    assert errors.count("\n") == 1
+    assert re.fullmatch(r"jaxrock: these are not results: The step budget was used up .*\n", errors)
 
 
 def test_spectrum(command, column, tmp_path):
@@ -178,7 +178,7 @@ def test_map(command, tmp_path):
     assert status == 0 and errors == ""
     state = check_map(tmp_path / "out", 8)
     names = {"safe": 0, "overturned without impact": 1, "overturned after impacts": 2, "not computed": -1}
-    assert {name: int(count) for name, count in table.items()} == {
+    assert {name: int(table[name]) for name in names} == {
         name: np.count_nonzero(state == value) for name, value in names.items()
     }
 
@@ -246,9 +246,12 @@ BAD = {
         "Argument `--slenderness` must be positive, but is 0.0",
     ),
     "spectrum, restitution 2": (["spectrum", "--restitution", "2"], "Argument `restitution` must be in"),
-    "spectrum, shortest 0": (["spectrum", "--shortest", "0"], "`--shortest` and `--longest` must be positive and"),
-    "spectrum, order": (["spectrum", "--shortest", "9"], "must be positive and in order, but are 9.0 and 8.0"),
-    "spectrum, longest NaN": (["spectrum", "--longest", "nan"], "must be positive and in order, but are 0.5 and nan"),
+    "spectrum, shortest 0": (["spectrum", "--shortest", "0"], "`--shortest, --longest` must be positive, finite"),
+    "spectrum, order": (["spectrum", "--shortest", "9"], "must be positive, finite and in order, but is 9 to 8"),
+    "spectrum, longest NaN": (
+        ["spectrum", "--longest", "nan"],
+        "must be positive, finite and in order, but is 0.5 to nan",
+    ),
     "spectrum, longest inf": (["spectrum", "--longest", "inf"], "must be .*finite.*inf"),
     "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
@@ -256,11 +259,11 @@ BAD = {
     "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), but is 2.0"),
     "map, ratio from 0": (
         ["map", "--frequency-ratio", "0", "8"],
-        "`frequency_ratio` must be positive and finite, but is 0.0",
+        "`--frequency-ratio` must be positive, finite and in order, but is 0 to 8",
     ),
     "map, intensity negative": (
         ["map", "--intensity", "-1", "8"],
-        "`intensity` must be positive and finite, but is -1.0",
+        "`--intensity` must be positive, finite and in order, but is -1 to 8",
     ),
     "map, ratio to inf": (["map", "--frequency-ratio", "1", "inf"], "must be .*finite.*inf"),
     "map, intensity to inf": (["map", "--intensity", "1", "inf"], "must be .*finite.*inf"),
@@ -304,5 +307,5 @@ def test_bad_words(capsys, words, error):
 def test_folder_that_is_a_file(capsys, at2, tmp_path):
     (tmp_path / "out").write_text("in the way")
     assert main(["run", at2, *GIVEN, "--out", str(tmp_path / "out")]) == 2
-    assert re.fullmatch(r"jaxrock: error: .*File exists: '\S*out'\n", capsys.readouterr().err)
+    assert re.fullmatch(r"jaxrock: error: Argument `--out` must be a folder, .* is a file\.\n", capsys.readouterr().err)
     assert (tmp_path / "out").read_text() == "in the way"
