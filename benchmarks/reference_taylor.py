@@ -1,336 +1,493 @@
-"""Reference responses of a Housner block: Taylor series in 40-digit arithmetic, with events isolated by sign counts.
+"""Reference responses of a rocking block: Taylor series in 40-digit arithmetic, with events isolated by sign counts.
 
-    theta'' = -p^2 [sin(s alpha - theta) + u(t) cos(s alpha - theta)],     theta' *= restitution at theta = 0
+    nonlinear: theta'' = -p^2 [sin(s alpha - theta) + u(t) cos(s alpha - theta)], uplift at |u| > tan(alpha)
+    linear:    theta'' = -p^2 [s alpha - theta + u(t)],                           uplift at |u| > alpha
+    theta' *= restitution at theta = 0
 
-It shares no code and no method with jaxrock: mpmath numbers, order 30, roots bracketed by Descartes' rule of signs
-on Bernstein coefficients (no root of the series can be missed), hops followed one by one down to 1e-22 p alpha. Where
-it cannot decide it raises. Inputs are float64 numbers taken as exact. Answers are kept in `reference_taylor.json`.
+It shares no code and no method with jaxrock: numbers of mpmath or gmpy2, order 30, roots bracketed by Descartes' rule
+of signs on Bernstein coefficients (no root of the series can be missed; float64 only where its rounding cannot
+change a sign), hops followed one by one down to 1e-22 p alpha. Where it cannot decide it raises. Inputs are float64
+numbers taken as exact. `reference` keeps its answers in `reference_taylor.json`; `answers` keeps nothing.
 
-    python benchmarks/reference_taylor.py        # compute some answers again, at another order and precision
+    python benchmarks/reference_taylor.py        # checks: closed forms, energy, other orders and precisions
 """
 
+import concurrent.futures
+import copy
+import functools
 import hashlib
 import json
+import math
+import multiprocessing
 import pathlib
 from dataclasses import dataclass, field
+from operator import mul
 
-from mpmath import mp, mpf
+import numpy as np
+from reference_motions import Arithmetic, Motion, motion, sign
+from reference_roots import roots, rough_bernstein, slopes_of, value_at
 
 DIGITS, ORDER = 40, 30
 CACHE = pathlib.Path(__file__).with_suffix(".json")
 FINITE_DIFFERENCE = "1e-10"  # relative change of the amplitude for condition numbers
+SMALL_HOP = 1e-6  # impacts above this speed over p alpha are counted on their own
+SHORT_STEP, SHORT_ORDER = 1e-3, 16  # steps of hops, times p, and the order that serves them
+REST = -22  # a block slower than 10^REST p alpha after an impact rests
 
 
-class Sine:
-    """One full cycle of amplitude sin(2 pi t/period) [g]: a motion of one piece."""
-
-    pieces = 1
-
-    def __init__(self, amplitude, period):
-        self.amplitude, self.rate, self.period = mpf(amplitude), 2 * mp.pi / mpf(period), mpf(period)
-
-    def length(self, piece):
-        """Duration of a piece [s]."""
-        return self.period
-
-    def series(self, piece, local, order):
-        """Taylor coefficients of the acceleration [g] about `local` seconds into a piece."""
-        sine, cosine = mp.sin(self.rate * local), mp.cos(self.rate * local)
-        terms = [self.amplitude * sine, self.amplitude * cosine * self.rate]
-        for k in range(2, order + 1):
-            terms.append(-terms[k - 2] * self.rate**2 / (k * (k - 1)))
-        return terms
-
-    def uplift(self, piece, local, threshold):
-        """First time in the piece, from `local` on, at which |u| exceeds the threshold (None: never)."""
-        if abs(self.amplitude) <= threshold:
-            return None
-        angle = mp.asin(threshold / abs(self.amplitude))
-        now = self.rate * local
-        starts = [angle, mp.pi + angle]
-        if any(start < now < start + mp.pi - 2 * angle for start in starts):
-            return local
-        later = [start for start in starts if start >= now]
-        return min(later) / self.rate if later else None
+def dot(first, second):
+    """Sum of products, to the end of the shorter one."""
+    return sum(map(mul, first, second))
 
 
-class Lines:
-    """An accelerogram [g]: straight lines between samples dt apart, times a factor."""
+class Quiet(Motion):
+    """No acceleration, for ever."""
 
-    def __init__(self, samples, dt, factor=1):
-        self.samples, self.dt = [mpf(float(u)) * factor for u in samples], mpf(float(dt))
-        self.pieces = len(self.samples) - 1
+    duration, amplitude = math.inf, 0
 
-    def length(self, piece):
-        """Duration of a piece [s]."""
-        return self.dt
-
-    def series(self, piece, local, order):
-        """Taylor coefficients of the acceleration [g] about `local` seconds into a piece."""
-        slope = (self.samples[piece + 1] - self.samples[piece]) / self.dt
-        return [self.samples[piece] + slope * local, slope]
-
-    def uplift(self, piece, local, threshold):
-        """First time in the piece, from `local` on, at which |u| exceeds the threshold (None: never)."""
-        now, slope = self.series(piece, local, 1)
-        if abs(now) > threshold:
-            return local
-        last = self.samples[piece + 1]
-        if abs(last) <= threshold:
-            return None
-        return local + (mp.sign(last) * threshold - now) / slope
+    def series(self, piece, local, unit, order):
+        """Taylor coefficients of the acceleration [g]."""
+        return []
 
 
-def expand(alpha, p, side, x, v, forcing, order, continuous):
-    """Taylor coefficients of the opening angle x = side * theta [rad, s].
-
-    `continuous`: the block leaves rest where |u| passes the threshold, so that its acceleration is zero by definition.
-    """
-    opening, slopes = [x, v], [v]  # slopes[k] = (k + 1) opening[k + 1]
-    sine, cosine = [mp.sin(alpha - x)], [mp.cos(alpha - x)]
-    for k in range(order - 1):
-        if k > 0:
-            sine.append(-mp.fdot(slopes[:k], cosine[k - 1 :: -1]) / k)
-            cosine.append(mp.fdot(slopes[:k], sine[k - 1 :: -1]) / k)
-        pushes = min(k + 1, len(forcing))
-        push = mp.fdot(forcing[:pushes], cosine[k : k - pushes : -1] if pushes <= k else cosine[k::-1])
-        term = -p * p * (sine[k] + side * push) / ((k + 1) * (k + 2))
-        if k == 0 and continuous:
-            term = mpf(0)
-        opening.append(term)
-        slopes.append((k + 2) * term)
-    return opening
+# A block on its way
 
 
-def step_length(coefficients):
-    """Step for which the last two terms fall below the working tolerance."""
-    order = len(coefficients) - 1
-    tolerance = mpf(10) ** (4 - mp.dps)
-    last = {order - 1: abs(coefficients[-2]), order: abs(coefficients[-1])}
-    return min(((tolerance / size) ** (mpf(1) / k) for k, size in last.items() if size), default=mp.inf)
+@dataclass
+class Block:
+    """A block and the arithmetic to follow it with."""
 
+    arithmetic: Arithmetic
+    alpha: object
+    p: object
+    restitution: object
+    linear: bool = False
+    order: int = ORDER
 
-def without_roots_at_zero(coefficients):
-    """The polynomial divided by t as often as it vanishes at t = 0 exactly."""
-    lowest = next((k for k, c in enumerate(coefficients) if c), len(coefficients))
-    return coefficients[lowest:]
+    def __post_init__(self):
+        number = self.arithmetic.number
+        self.alpha, self.p, self.restitution = number(self.alpha), number(self.p), number(self.restitution)
+        self.threshold = self.alpha if self.linear else self.arithmetic.tan(self.alpha)
+        self.half_turn = self.arithmetic.pi / 2
+        self.tolerance = self.arithmetic.power_of_ten(4 - self.arithmetic.digits)
+        self.tie = 1 + self.arithmetic.power_of_ten(10 - self.arithmetic.digits)
 
+    def deficit(self, x, v):
+        """2 (energy of the balanced block - energy)/p^2."""
+        away = self.alpha - x if self.linear else 2 * self.arithmetic.sin((self.alpha - x) / 2)
+        return away**2 - (v / self.p) ** 2
 
-def bernstein(coefficients, length):
-    """Bernstein coefficients of a polynomial on [0, length]."""
-    degree = len(coefficients) - 1
-    scaled = [c * length**k / mp.binomial(degree, k) for k, c in enumerate(coefficients)]
-    for level in range(1, degree + 1):  # a table of sums: b_i = sum_k binomial(i, k) scaled_k
-        for i in range(degree, level - 1, -1):
-            scaled[i] += scaled[i - 1]
-    return scaled
-
-
-def halves(values):
-    """Bernstein coefficients on both halves of the interval (de Casteljau)."""
-    left, right, row = [values[0]], [values[-1]], values
-    while len(row) > 1:
-        row = [(a + b) / 2 for a, b in zip(row, row[1:])]
-        left.append(row[0])
-        right.append(row[-1])
-    return left, right[::-1]
-
-
-def polish(coefficients, low, high):
-    """The one root in [low, high] at whose ends the polynomial differs in sign: Newton inside a bracket."""
-    slopes = [k * c for k, c in enumerate(coefficients)][:0:-1]
-    downward = coefficients[::-1]
-    sign_low = mp.sign(mp.polyval(downward, low))
-    x = (low + high) / 2
-    for _ in range(400):
-        value, slope = mp.polyval(downward, x), mp.polyval(slopes, x)
-        if value == 0:
-            return x
-        low, high = (x, high) if mp.sign(value) == sign_low else (low, x)
-        guess = x - value / slope if slope else low
-        guess = guess if low < guess < high else (low + high) / 2
-        if abs(guess - x) <= mpf(10) ** (2 - mp.dps) * high:
-            return guess
-        x = guess
-    raise ArithmeticError("A root did not converge.")
-
-
-def first_root(coefficients, length):
-    """Smallest root in (0, length] of a polynomial, roots at zero left out; None if there is none."""
-    polynomial = without_roots_at_zero(coefficients)
-    if not polynomial or abs(polynomial[0]) > sum(abs(c) * length**k for k, c in enumerate(polynomial) if k):
-        return None
-    pending = [(mpf(0), mpf(1), bernstein(polynomial, length))]
-    while pending:
-        low, high, values = pending.pop()
-        signs = [mp.sign(b) for b in values if b]
-        changes = sum(a != b for a, b in zip(signs, signs[1:]))
-        if changes == 1:
-            return polish(polynomial, low * length, high * length)
-        if changes == 0 and values[-1] == 0:
-            return high * length
-        if changes > 1:
-            if high - low < mpf(10) ** (-mp.dps // 2):
-                raise ArithmeticError("Two roots too close to tell apart: a grazing impact.")
-            middle, (left, right) = (low + high) / 2, halves(values)
-            pending += [(middle, high, right), (low, middle, left)]
-    return None
+    def apex(self, deficit):
+        """Opening angle at which a block of this deficit turns back."""
+        root = self.arithmetic.sqrt(deficit)
+        return self.alpha - (root if self.linear else 2 * self.arithmetic.asin(root / 2))
 
 
 @dataclass
 class Path:
-    """A block on its way: where it is in the motion, its state, and what has happened."""
+    """Where a block is in the motion, its state, and what has happened."""
 
     piece: int = 0
-    local: mpf = field(default_factory=mpf)
+    local: object = 0
+    start: object = 0  # time at which the piece starts
     side: int = 0  # 0 at rest
-    x: mpf = field(default_factory=mpf)
-    v: mpf = field(default_factory=mpf)
-    peak: mpf = field(default_factory=mpf)
-    impacts: int = 0
-    continuous: bool = False
+    x: object = 0  # opening angle: side * rotation
+    v: object = 0
+    continuous: bool = False  # leaves rest where |u| passes the threshold: its acceleration is zero by definition
     overturned: bool = False
+    peak: object = 0
+    peak_time: object = 0
+    fastest: object = 0
+    impacts: int = 0
+    turns: int = 0
+    height: object = 0  # greatest opening since the last impact
+    slowest: object = math.inf  # smallest impact speed
+    grazing: object = math.inf  # smallest impact speed over p sqrt(alpha height of the arc before)
+    dip: object = math.inf  # smallest opening at an inward turning point
+    impact_times: list = field(default_factory=list)
+    impact_velocities: list = field(default_factory=list)  # before impact, with the sign of theta'
+    times: list = field(default_factory=list)  # where states are asked for, rising
+    states: list = field(default_factory=list)
+
+    @property
+    def time(self):
+        """Time from the start of the motion [s]."""
+        return self.start + self.local
+
+    def top(self, x, time, tie):
+        """Note an opening angle; of equal ones the first is the peak."""
+        if x > self.peak * tie:
+            self.peak_time = time
+        self.peak = max(self.peak, x)
+
+    def next_piece(self, motion):
+        """Go on to the start of the next piece."""
+        self.start = motion.start(self.piece) + motion.length(self.piece)
+        self.piece, self.local = self.piece + 1, 0 * self.local
 
 
-def wait(path, motion, threshold):
-    """At rest: go to the uplift, or to the next piece."""
-    time = motion.uplift(path.piece, path.local, threshold)
-    if time is None:
-        path.piece, path.local = path.piece + 1, mpf(0)
-        return
-    acceleration = motion.series(path.piece, time, 1)[0]
-    path.local, path.side, path.x, path.v = time, -int(mp.sign(acceleration)), mpf(0), mpf(0)
-    path.continuous = abs(abs(acceleration) - threshold) < mpf(10) ** (8 - mp.dps)
+def expand(block, path, p, v, forcing, order):
+    """Taylor coefficients of the opening angle in units of time in which p, v and the forcing are given.
 
-
-def rock(path, motion, alpha, p, restitution, order):
-    """One Taylor step, cut at the first event: impact, turning point, fallen flat, or the end of the piece."""
-    forcing = motion.series(path.piece, path.local, order)
-    x = expand(alpha, p, path.side, path.x, path.v, forcing, order, path.continuous)
-    v = [k * c for k, c in enumerate(x)][1:]
-    path.continuous = False
-    room = motion.length(path.piece) - path.local
-    step = min(step_length(x), room)
-    events = {"end": step}
-    for name, polynomial in (("impact", x), ("turn", v), ("flat", [x[0] - mp.pi / 2] + x[1:])):
-        root = first_root(polynomial, step)
-        if root is not None:
-            events[name] = root
-    event = min(events, key=events.get)
-    time = events[event]
-    path.x, path.v = mp.polyval(x[::-1], time), mp.polyval(v[::-1], time)
-    if path.x < 0 and event != "impact":
-        raise ArithmeticError("The block fell through the floor.")
-    path.local += time
-    if event == "end" and step == room:
-        path.piece, path.local = path.piece + 1, mpf(0)
-    if event == "turn":
-        path.v, path.peak = mpf(0), max(path.peak, path.x)
-    if event == "flat":
-        path.overturned = True
-    if event == "impact":
-        path.impacts += 1
-        path.x, path.v, path.side = mpf(0), -restitution * path.v, -path.side
-        if path.v < mpf(10) ** -22 * p * alpha:
-            path.side, path.v = 0, mpf(0)
-
-
-def free_rocking(path, alpha, p, restitution):
-    """After the motion: 2 (energy of the balanced block - energy)/p^2 gives the verdict and the last peak."""
-    missing = (2 * mp.sin((alpha - path.x) / 2)) ** 2 - (path.v / p) ** 2
-    balanced = (2 * mp.sin(alpha / 2)) ** 2
-    path.peak = max(path.peak, path.x)
-    outward = path.v >= 0
-    if not outward and (path.x < alpha or missing < 0):  # it gets to an impact
-        missing = balanced - restitution**2 * (balanced - missing)
-        path.impacts += missing < 0
-    elif path.x >= alpha:  # outward, or turning back outward
-        path.overturned = True
-        return
-    path.overturned = missing < 0
-    if not path.overturned:
-        path.peak = max(path.peak, alpha - 2 * mp.asin(mp.sqrt(missing) / 2))
-
-
-def respond(alpha, p, restitution, motion, order=ORDER):
-    """Follow a block at rest through a motion and the free rocking after it.
-
-    **Returns:** a `Path`: its peak [rad] counts unless overturned.
+    **Returns:** the coefficients, and whether they fall below the tolerance for a step of one unit.
     """
-    alpha, p, restitution = mpf(alpha), mpf(p), mpf(restitution)
-    path, threshold = Path(), mp.tan(alpha)
+    square, side, number = -p * p, path.side, block.arithmetic.number
+    opening, slopes = [path.x, v], [v]
+    small, tolerance = 0, block.tolerance * min(number(1), abs(path.x) + abs(v))
+    sine, cosine = ([], []) if block.linear else ([s] for s in block.arithmetic.sin_cos(block.alpha - path.x))
+    for k in range(order - 1):
+        if block.linear:
+            term = (block.alpha if k == 0 else 0) - opening[k] + (side * forcing[k] if k < len(forcing) else 0)
+        else:
+            if k:
+                back = cosine[::-1]
+                cosine.append(dot(slopes, sine[::-1]) / k)
+                sine.append(-dot(slopes, back) / k)
+            term = sine[k] + side * dot(forcing, cosine[::-1])
+        term = number(0) if path.continuous and k == 0 else square * term / ((k + 1) * (k + 2))
+        opening.append(term)
+        slopes.append((k + 2) * term)
+        small = small + 1 if abs(term) < tolerance else 0
+        if small == 4 and k > 7:
+            return opening, True
+    return opening, small >= 4
+
+
+def step_length(block, coefficients):
+    """Step for which the last four terms fall below the tolerance.
+
+    Two would not do: at resonance (linear, pulse frequency p) pairs of terms vanish.
+    """
+    order, log2 = len(coefficients) - 1, block.arithmetic.log2
+    allowed = float(log2(block.tolerance))
+    last = [(k, coefficients[k]) for k in range(order - 3, order + 1) if coefficients[k]]
+    return min((2.0 ** min(((allowed - float(log2(abs(c)))) / k), 900.0) for k, c in last), default=math.inf)
+
+
+def longest(block, path, motion):
+    """Longest step worth trying [s]: to the end of the piece, within reach of its series, not far beyond a hop."""
+    number = block.arithmetic.number
+    room = motion.length(path.piece) - path.local
+    unit = min(room, number(min(10 / float(block.p), motion.reach(path.piece, path.local, block.order))))
+    if not path.x and not path.continuous:
+        forcing = motion.series(path.piece, path.local, 1, 0)
+        term = expand(block, path, block.p, path.v, forcing, 2)[0][2]
+        if term < 0:
+            unit = min(unit, 2 * path.v / -term)
+    return unit, unit == room
+
+
+def note_extremes(block, path, unit, c, rough, end):
+    """Turning points and the greatest speed on a step of one unit up to `end`."""
+    arithmetic, v = block.arithmetic, slopes_of(c)
+    rough_v = rough[1:] * np.arange(1, len(rough))
+    for root in roots(arithmetic, v, rough_v):
+        if root > end:
+            break
+        x = value_at(c, root)
+        if value_at(slopes_of(v), root) > 0:
+            path.dip = min(path.dip, x)
+        path.turns += 1
+        path.height = max(path.height, x)
+        path.top(x, path.time + root * unit, block.tie)
+    path.fastest = max(path.fastest, abs(value_at(v, end)) / unit)
+    bounds, error = rough_bernstein(rough_v)
+    if np.abs(bounds).max() + error > float(path.fastest * unit) * (1 + 1e-12):
+        a = slopes_of(v)
+        inner = [root for root in roots(arithmetic, a) if root < end]
+        path.fastest = max([path.fastest, *(abs(value_at(v, root)) / unit for root in inner)])
+
+
+def note_states(path, until, rotation, velocity):
+    """States at the times asked for up to `until`, from functions of the time since the path's."""
+    while len(path.states) < len(path.times) and path.times[len(path.states)] <= until:
+        since = path.times[len(path.states)] - path.time
+        path.states.append((rotation(since), velocity(since)))
+
+
+def wait(block, path, motion):
+    """At rest: go to the uplift, or to the next piece."""
+    local = motion.uplift(path.piece, path.local, block.threshold)
+    until = path.start + (motion.length(path.piece) if local is None else local)
+    note_states(path, until, lambda since: 0 * block.alpha, lambda since: 0 * block.alpha)
+    if local is None:
+        path.next_piece(motion)
+        return
+    acceleration = motion.series(path.piece, local, 1, 0)[0]
+    path.local, path.side, path.x, path.v = local + 0 * block.alpha, -sign(acceleration), 0 * block.p, 0 * block.p
+    path.continuous = abs(abs(acceleration) - block.threshold) < block.tolerance * 10**4
+
+
+def rock(block, path, motion):
+    """One Taylor step, cut at the first event: impact, fallen flat, or the end of the piece."""
+    unit, whole = longest(block, path, motion)
+    if unit <= 0:
+        path.next_piece(motion)
+        return
+    order = SHORT_ORDER if block.p * unit < SHORT_STEP else block.order
+    forcing = motion.series(path.piece, path.local, unit, order)
+    c, converged = expand(block, path, block.p * unit, path.v * unit, forcing, order)
+    step = 1.0 if converged else step_length(block, c)
+    if step < 1:
+        step, whole = block.arithmetic.number(step), False
+        unit, power = unit * step, 1
+        for k in range(1, len(c)):
+            power = power * step
+            c[k] = c[k] * power
+    path.continuous = False
+    rough = np.array([float(a) for a in c])
+    impact = next(iter(roots(block.arithmetic, c, rough)), None)
+    flat = None
+    if not block.linear and rough_bernstein(rough)[0].max() > 1.57:
+        flat = next(iter(roots(block.arithmetic, [c[0] - block.half_turn, *c[1:]])), None)
+    if flat is not None and (impact is None or flat < impact):
+        path.overturned, impact = True, None
+    end = flat if path.overturned else block.arithmetic.number(1) if impact is None else impact
+    note_extremes(block, path, unit, c, rough, end)
+    slopes, side = slopes_of(c), path.side
+    if path.times:
+        rotation = lambda since: side * value_at(c, since / unit)  # noqa: E731
+        note_states(path, path.time + end * unit, rotation, lambda since: side * value_at(slopes, since / unit) / unit)
+    path.x, path.v, path.local = value_at(c, end), value_at(slopes, end) / unit, path.local + end * unit
+    if impact is not None:
+        land(block, path)
+    elif path.x < 0:
+        raise ArithmeticError("The block fell through the floor.")
+    elif whole and not path.overturned:
+        path.next_piece(motion)
+
+
+def land(block, path):
+    """Impact: lose speed and change the side, or come to rest."""
+    speed, scale = -path.v, block.p * block.alpha
+    path.impacts += 1
+    path.impact_times.append(path.time)
+    path.impact_velocities.append(path.side * path.v)
+    path.slowest = min(path.slowest, speed)
+    if path.height > 0:
+        path.grazing = min(path.grazing, speed / (block.p * block.arithmetic.sqrt(block.alpha * path.height)))
+    path.x, path.v, path.side, path.height = 0 * speed, block.restitution * speed, -path.side, 0
+    if path.v < block.arithmetic.power_of_ten(REST) * scale:
+        path.side, path.v = 0, 0 * speed
+
+
+def lost(block, path, motion):
+    """Whether no acceleration still to come can bring a block of the linear model back."""
+    growth = path.x - block.alpha + path.v / block.p
+    return block.linear and path.side != 0 and growth > motion.bound(path.piece)
+
+
+def free_rocking(block, path):
+    """After the motion: the energy gives the verdict, the last peak and the greatest speed."""
+    missing, balanced = block.deficit(path.x, path.v), block.deficit(0 * path.x, 0 * path.v)
+    path.top(path.x, path.time, block.tie)
+    path.fastest = max(path.fastest, abs(path.v))
+    after, outward = missing, path.v >= 0
+    if not outward and (path.x < block.alpha or missing < 0):  # it gets to an impact
+        path.fastest = max(path.fastest, block.p * block.arithmetic.sqrt(balanced - missing))
+        after = balanced - block.restitution**2 * (balanced - missing)
+        path.impacts += after < 0
+    elif path.x >= block.alpha:  # outward, or turning back outward
+        path.overturned = True
+        return
+    path.overturned = after < 0
+    if not path.overturned:
+        if outward:
+            path.fastest = max(path.fastest, block.p * block.arithmetic.sqrt(balanced - missing))
+        path.top(block.apex(after), None, block.tie)
+
+
+def free_peak_time(block, path):
+    """Time of the first outward turning point of the free rocking, by Taylor steps (None: not found)."""
+    path, quiet = copy.deepcopy(path), Quiet()
+    path.start, path.piece, path.local, path.times = path.time, 0, 0 * path.x, []
+    path.turns, path.peak = 0, 0 * path.x
+    for _ in range(1000):
+        rock(block, path, quiet)
+        if path.turns or path.overturned:
+            return path.peak_time if path.turns else None
+    return None
+
+
+def respond(block, motion, initial=(0, 0), times=()):
+    """Follow a block from its initial rotation and velocity through a motion and the free rocking after it.
+
+    **Arguments:** `times`: where states are wanted [s], rising, also after the motion.
+
+    **Returns:** a `Path`: its peak [rad] counts unless overturned; `states` to the last time before overturning.
+    """
+    zero = 0 * block.alpha
+    rotation, velocity = (block.arithmetic.number(value) for value in initial)
+    side = sign(rotation) or sign(velocity)
+    path = Path(local=zero, start=zero, side=side, x=side * rotation, v=side * velocity, times=list(times))
+    path.peak = path.height = path.x = path.x + zero
+    path.fastest = abs(path.v)
+    path.overturned = not block.linear and path.x >= block.half_turn
+    note_states(path, zero, lambda since: rotation, lambda since: velocity)
     while path.piece < motion.pieces and not path.overturned:
         if path.side == 0:
-            wait(path, motion, threshold)
+            wait(block, path, motion)
+        elif not path.times and lost(block, path, motion):
+            path.overturned = True
         else:
-            rock(path, motion, alpha, p, restitution, order)
+            rock(block, path, motion)
+    end = copy.deepcopy(path)
     if path.side != 0 and not path.overturned:
-        free_rocking(path, alpha, p, restitution)
+        free_rocking(block, path)
+        if not path.overturned and path.peak_time is None:
+            path.peak_time = free_peak_time(block, end)
+    if len(path.states) < len(path.times):
+        end = _on_for_states(block, end)
+        path.states, path.impact_times, path.impact_velocities = end.states, end.impact_times, end.impact_velocities
     return path
 
 
-def _motion(kind, numbers, factor):
-    return Sine(mpf(numbers[0]) * factor, numbers[1]) if kind == "sine" else Lines(*numbers, factor)
+def _on_for_states(block, path):
+    """Go on after the motion, by Taylor steps, to the last time asked for."""
+    quiet = Quiet()
+    path.start, path.piece, path.local = path.time, 0, 0 * path.x
+    while len(path.states) < len(path.times) and not path.overturned:
+        if path.side:
+            rock(block, path, quiet)
+        else:
+            note_states(path, math.inf, lambda since: 0 * path.x, lambda since: 0 * path.x)
+    return path
 
 
-def _key(block, kind, numbers):
-    """What the answer depends on, exactly."""
-    if kind == "sine":
-        return " ".join([kind, *(repr(float(x)) for x in (*block, *numbers))])
-    digest = hashlib.sha256(repr([float(u) for u in numbers[0]]).encode()).hexdigest()[:16]
-    return " ".join([kind, *(repr(float(x)) for x in block), digest, repr(float(numbers[1]))])
+# Scenes and answers
 
 
-def compute(block, kind, numbers):
-    """The answer of `reference`, computed."""
-    with mp.workdps(DIGITS):
-        path = respond(*block, _motion(kind, numbers, mpf(1)))
-        answer = {"peak": None, "impacts": path.impacts, "overturned": bool(path.overturned), "condition": None}
-        if not path.overturned:
-            change = mpf(FINITE_DIFFERENCE)
-            sides = [respond(*block, _motion(kind, numbers, 1 + s * change)) for s in (1, -1)]
-            answer["peak"] = mp.nstr(path.peak, 28)
-            if path.peak and not any(side.overturned for side in sides):
-                answer["condition"] = float(abs(sides[0].peak - sides[1].peak) / (2 * change * path.peak))
-    return answer
+def _scene(scene):
+    """A scene with all its four parts."""
+    block, kind, numbers, *options = scene
+    return block, kind, numbers, options[0] if options else {}
 
 
-def reference(cases, announce=print):
-    """Answers for many cases, from the cache where it has them; new ones are added to it.
+def follow(scene, factor=1, times=(), arithmetic=None, order=ORDER):
+    """The `Path` of a scene, inside the arithmetic's context."""
+    numbers, kind, shape, options = _scene(scene)
+    a = arithmetic or Arithmetic(DIGITS)
+    block = Block(a, *numbers, options.get("model", "nonlinear") == "linear", order)
+    return respond(
+        block, motion(a, kind, shape, factor, options.get("delay", 0)), options.get("initial", (0, 0)), times
+    )
+
+
+def answer(scene, condition=False, arithmetic=None, order=ORDER):
+    """The response to one scene; see `answers`."""
+    a = arithmetic or Arithmetic(DIGITS)
+    with a.context():
+        path = follow(scene, 1, (), a, order)
+        scale = a.number(scene[0][0]) * a.number(scene[0][1])
+        safe = not path.overturned
+        known = {
+            "overturned": bool(path.overturned),
+            "peak": a.text(path.peak) if safe else None,
+            "impacts": int(path.impacts),
+            "impacts_large": sum(abs(v) > SMALL_HOP * scale for v in path.impact_velocities),
+            "max_velocity": a.text(path.fastest) if safe else None,
+            "time_of_peak": a.text(path.peak_time + 0 * scale) if safe and path.peak_time is not None else None,
+            "slowest_impact": float(path.slowest / scale) if path.impact_velocities else None,
+            "grazing": float(path.grazing) if path.grazing < math.inf else None,
+            "dip": float(path.dip / a.number(scene[0][0])) if path.dip < math.inf else None,
+            "condition": None,
+        }
+        if condition and safe:
+            known["condition"] = _condition(scene, path, a, order)
+    return known
+
+
+def _condition(scene, path, a, order):
+    """|d ln peak/d ln amplitude| by a central difference (None: nothing moves, or it overturns within it)."""
+    change = a.number(FINITE_DIFFERENCE)
+    sides = [follow(scene, 1 + s * change, (), a, order) for s in (1, -1)]
+    if not path.peak or any(side.overturned for side in sides):
+        return None
+    return float(abs(sides[0].peak - sides[1].peak) / (2 * change * path.peak))
+
+
+def _answer_or_error(condition, scene):
+    try:
+        return answer(scene, condition)
+    except ArithmeticError as error:
+        return {"error": str(error)}
+
+
+def answers(scenes, condition=False, workers=1):
+    """Responses to many scenes, not kept.
 
     **Arguments:**
 
-    - `cases`: (block, kind, numbers): block = (alpha, p, restitution); kind "sine" with (amplitude [g], period [s]),
-      or "record" with (samples [g], dt [s]).
+    - `scenes`: (block, kind, numbers) or (block, kind, numbers, options): block = (alpha, p, restitution); kind and
+      numbers of the motion as in `reference_motions.motion`; options a dict of `model` ("nonlinear" or "linear"),
+      `initial` (rotation [rad], velocity [rad/s]) and `delay` (quiet time before the motion [s]).
+    - `condition`: whether to find `condition` too, at three times the cost.
+    - `workers`: processes.
 
-    **Returns:** a dict each: `peak` (28 digits as text, rad; None if overturned), `impacts`, `overturned`, and
-    `condition`, |d ln peak/d ln amplitude| (None if overturned, or if it overturns within the difference of 1e-10).
+    **Returns:** a dict each: `overturned`; `peak` [rad], `max_velocity` [rad/s] and `time_of_peak` [s], 28 digits as
+    text, None if overturned; `impacts` (every hop of the motion, and one after it if it overturns from there) and
+    `impacts_large` (of the motion, above 1e-6 p alpha); `slowest_impact` (least speed over p alpha), `grazing` (least
+    speed over p sqrt(alpha height), height the greatest opening before that impact) and `dip` (least opening over
+    alpha where it turns outward again without touching) of the motion, None where there is none; `condition`,
+    |d ln peak/d ln amplitude| or None. Where it cannot decide: `error`, the reason, alone.
+    """
+    judge = functools.partial(_answer_or_error, condition)
+    if workers == 1:
+        return [judge(scene) for scene in scenes]
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        return list(pool.map(judge, scenes, chunksize=max(1, min(32, len(scenes) // (4 * workers)))))
+
+
+def history(scene, times=(), arithmetic=None):
+    """States and impacts of one scene.
+
+    **Returns:** a dict: `states`, (rotation, velocity) at the rising `times` (fewer if it overturns before the last);
+    `impact_times` [s] and `impact_velocities` (before impact), to the end of the motion or a little past the last
+    time, whichever is later; `overturned`. Numbers are mpmath's.
+    """
+    a = arithmetic or Arithmetic(DIGITS)
+    with a.context():
+        path = follow(scene, 1, [a.number(time) for time in times], a)
+    return {
+        "states": [(a.mpf(x), a.mpf(v)) for x, v in path.states],
+        "impact_times": [a.mpf(time) for time in path.impact_times],
+        "impact_velocities": [a.mpf(v) for v in path.impact_velocities],
+        "overturned": bool(path.overturned),
+    }
+
+
+def _key(scene):
+    """What the answer depends on, exactly."""
+    block, kind, numbers, options = _scene(scene)
+    words = [kind, *(repr(float(x)) for x in block)]
+    if kind == "record":
+        digest = hashlib.sha256(repr([float(u) for u in numbers[0]]).encode()).hexdigest()[:16]
+        words += [digest, repr(float(numbers[1]))]
+    else:
+        words += [repr(float(x)) for x in numbers]
+    return " ".join(words + [f"{name}={options[name]!r}" for name in sorted(options)])
+
+
+def reference(cases, announce=print, workers=1):
+    """Answers for many scenes with their condition, from the cache where it has them; new ones are added to it.
+
+    **Arguments:** `cases`: scenes as in `answers`.
+
+    **Returns:** a dict each, as `answers`; older entries hold `peak`, `impacts`, `overturned` and `condition` only.
     """
     cache = json.loads(CACHE.read_text()) if CACHE.exists() else {}
-    keys = [_key(*case) for case in cases]
-    missing = [(key, case) for key, case in zip(keys, cases) if key not in cache]
-    for done, (key, case) in enumerate(missing):
-        cache[key] = compute(*case)
-        if done % 50 == 0 or case[1] == "record" or done + 1 == len(missing):
-            announce(f"reference: {done + 1} of {len(missing)} new responses")
-            CACHE.write_text(json.dumps(cache, indent=0, sort_keys=True))
+    keys = [_key(case) for case in cases]
+    missing = list({key: case for key, case in zip(keys, cases) if key not in cache}.items())
+    for first in range(0, len(missing), 50):
+        part = missing[first : first + 50]
+        cache |= zip([key for key, _ in part], answers([case for _, case in part], True, workers))
+        announce(f"reference: {first + len(part)} of {len(missing)} new responses")
+        CACHE.write_text(json.dumps(cache, indent=0, sort_keys=True))
     return [cache[key] for key in keys]
 
 
-def check(count=20, digits=60, order=40):
-    """Compute some cached pulse responses again, at another precision and order; return the worst difference."""
-    cache = json.loads(CACHE.read_text())
-    worst = 0.0
-    for key in [key for key in sorted(cache) if key.startswith("sine")][:: max(1, len(cache) // count)]:
-        numbers = [float(word) for word in key.split()[1:]]
-        with mp.workdps(digits):
-            path = respond(*numbers[:3], Sine(*numbers[3:]), order)
-            if path.overturned != cache[key]["overturned"]:
-                raise AssertionError(f"Another verdict: {key}")
-            if not path.overturned:
-                worst = max(worst, float(abs(path.peak - mpf(cache[key]["peak"])) / numbers[0]))
-    return worst
-
-
 if __name__ == "__main__":
-    print(f"largest difference of peak/alpha against 60 digits and order 40: {check():.1e}")
+    import reference_checks
+
+    reference_checks.main()

@@ -8,8 +8,9 @@ velocity after an impact over that before it.
 import importlib
 from typing import TYPE_CHECKING
 
+from jaxrock.arcs import Diffrax as Diffrax
 from jaxrock.block import Block as Block
-from jaxrock.models import Housner as Housner, Linear as Linear
+from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,

@@ -23,6 +23,8 @@ class FreeStage(eqx.Module):
     peak_time: Scalar
     fastest: Scalar  # largest speed still to come
     closeness: Scalar  # smallest squared distance from standing still in balance still to come
+    deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
+    share: Scalar  # of an error of the present energy that is left in it
 
 
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
@@ -129,6 +131,9 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
         lost_closeness,
         jnp.where(lost_after_impact, -deficit_after * weight, jnp.where(swings, safe_closeness, jnp.inf)),
     )
+    impacts_first = ~lost_at_once & ~outward
+    turns_inside = past_inward & (jnp.abs(deficit) < jnp.abs(deficit_after))  # it has to pass the saddle first
+    decisive = jnp.where(impacts_first & ~turns_inside, deficit_after, deficit)
     return FreeStage(
         overturned=lost_at_once | lost_after_impact,
         impacts=lost_after_impact.astype(jnp.int32),
@@ -136,4 +141,6 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
         peak_time=jnp.where(outward, time_out, time_in) / rate,
         fastest=jnp.where(swings, arrival * rate, 0.0),
         closeness=closeness,
+        deficit=decisive * table.stiffness,
+        share=jnp.where(impacts_first & ~turns_inside, restitution**2, 1.0),
     )

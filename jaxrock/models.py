@@ -9,13 +9,16 @@ acceleration u (g), every model of a rigid symmetric block reads
 A coefficient that a model does not have is None, so that nothing is computed for it.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
 from jaxrock._keep import keep
+from jaxrock._trigonometry import sine_cosine
 from jaxrock.block import Block
 
 Scalar = Inexact[ArrayLike, ""]
@@ -35,8 +38,8 @@ class Angle(NamedTuple):
 
     @classmethod
     def of(cls, value: Scalar) -> "Angle":
-        """An angle from its value."""
-        return cls(value, jnp.sin(value), jnp.cos(value))
+        """An angle from its value, between 0 and pi/2 or a little beyond."""
+        return cls(value, *sine_cosine(jnp.asarray(value)))
 
 
 class Table(eqx.Module):
@@ -62,6 +65,15 @@ class Table(eqx.Module):
     def arm(self, angle: Angle) -> Scalar:
         """Overturning moment over m R u g at an opening angle."""
         return _sum_of((self.m0, 1.0), (self.ms, angle.sine), (self.mc, angle.cosine))
+
+    def repulsion(self, angle: Angle, push: Scalar) -> Scalar:
+        """How fast nearby angles part, per angle: minus the derivative of restoring + push arm (push = side u)."""
+        restoring = _sum_of((self.r1, 1.0), (self.rs, angle.cosine), (self.rc, -angle.sine))
+        return -restoring - push * _sum_of((self.ms, angle.cosine), (self.mc, -angle.sine))
+
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u."""
+        return -(self.restoring(angle) + push * self.arm(angle))
 
     @property
     def restoring_at_rest(self) -> Scalar:
@@ -165,4 +177,134 @@ class Linear(eqx.Module):
         return False
 
 
-Model = Housner | Linear
+class Equation(eqx.Module):
+    """A model of your own, written as functions; the diffrax engine solves it.
+
+    With the opening angle x = |rotation| [rad], velocity v = dx/d(p t), side s and ground acceleration u [g]:
+
+        d^2x/d(p t)^2 = -[restoring(x, block) + s u arm(x, block) + dissipation(x, v, block)]
+
+    **Arguments:**
+
+    - `restoring`: restoring moment over m g R; positive at x = 0. Its first zero is the unstable equilibrium.
+    - `arm`: overturning arm over R; positive at x = 0. None: 1.
+    - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
+    - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
+    - `falls_flat`: whether a rotation of pi/2 means that the block lies on its side.
+
+    The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
+    Equinox modules may carry parameters to differentiate. A block that has stopped below its unstable equilibrium
+    after the motion counts as safe: what dissipates does not lift.
+
+    **Raises:** ValueError where neither or both ways are used.
+    """
+
+    _acceleration: "_Function"
+    falls_flat: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        restoring: Callable | None = None,
+        arm: Callable | None = None,
+        dissipation: Callable | None = None,
+        *,
+        acceleration: Callable | None = None,
+        falls_flat: bool = True,
+    ):
+        if (restoring is None) == (acceleration is None) or (acceleration is not None and (arm or dissipation)):
+            raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
+        parts = (restoring, arm, dissipation) if acceleration is None else (acceleration,)
+        self._acceleration = _Function(parts)
+        self.falls_flat = falls_flat
+
+    def table(self, block: Block) -> "EquationTable":
+        """What the engine asks of the equation, for one block."""
+        return EquationTable(self._acceleration, block)
+
+
+class _Function(eqx.Module):
+    """Functions, as leaves where they are modules (with parameters) and static where they are plain."""
+
+    modules: tuple
+    plain: tuple = eqx.field(static=True)
+
+    def __init__(self, parts: tuple):
+        self.modules = tuple(f if isinstance(f, eqx.Module) else None for f in parts)
+        self.plain = tuple(None if isinstance(f, eqx.Module) else f for f in parts)
+
+    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block) -> Scalar:
+        parts = [m if m is not None else f for m, f in zip(self.modules, self.plain)]
+        if len(parts) == 1:
+            return parts[0](x, v, push, block)
+        restoring, arm, dissipation = parts
+        moment = restoring(x, block) + push * (1.0 if arm is None else arm(x, block))
+        return -moment if dissipation is None else -moment - dissipation(x, v, block)
+
+
+class EquationTable(eqx.Module):
+    """What a `Table` tells, for a model that is given as functions."""
+
+    function: _Function
+    block: Block
+    restoring_at_rest: Scalar
+    arm_at_rest: Scalar
+    saddle: Scalar  # first zero of the restoring moment, at most pi/2
+
+    def __init__(self, function: _Function, block: Block):
+        self.function, self.block = function, block
+        zero = Angle.of(jnp.zeros_like(block.alpha))
+        self.restoring_at_rest = eqx.error_if(
+            self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."
+        )
+        self.arm_at_rest = eqx.error_if(
+            self.arm(zero), self.arm(zero) <= 0, "The overturning arm must be positive at rotation 0."
+        )
+        self.saddle = self._first_zero()
+
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u."""
+        return jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
+
+    def restoring(self, angle: Angle) -> Scalar:
+        """Restoring moment over m g R at an opening angle."""
+        zero = jnp.zeros_like(angle.value)
+        return -self.acceleration(angle, zero, zero)
+
+    def arm(self, angle: Angle) -> Scalar:
+        """Overturning moment over m R u g at an opening angle."""
+        zero = jnp.zeros_like(angle.value)
+        return self.acceleration(angle, zero, zero) - self.acceleration(angle, zero, zero + 1)
+
+    def repulsion(self, angle: Angle, push: Scalar) -> Scalar:
+        """How fast nearby angles part, per angle."""
+        zero = jnp.zeros_like(angle.value)
+        return jax.grad(lambda x: self.acceleration(Angle.of(x), zero, push))(angle.value)
+
+    @property
+    def threshold(self) -> Scalar:
+        """Ground acceleration at which the block uplifts [g]."""
+        return self.restoring_at_rest / self.arm_at_rest
+
+    def _first_zero(self) -> Scalar:
+        """Where the block balances: a scan, bisection, and a Newton step that carries the derivatives."""
+
+        def moment(x):
+            return self.restoring(Angle.of(x))
+
+        grid = jnp.linspace(0.0, jnp.pi / 2, 257, dtype=self.block.alpha.dtype)
+        falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
+        first = jnp.argmax(falls)
+
+        def halve(_, bracket):
+            low, high = bracket
+            middle = (low + high) / 2
+            above = jax.lax.stop_gradient(moment(middle)) > 0
+            return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+        low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
+        low = jax.lax.stop_gradient(low)
+        root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
+        return jnp.where(jnp.any(falls), root, jnp.pi / 2)
+
+
+Model = Housner | Linear | Equation

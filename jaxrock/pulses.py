@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import checked, finite, not_nan, one_of, positive
 from jaxrock._keep import keep
+from jaxrock._trigonometry import sine_cosine_of_any
 from jaxrock.motion import AbstractMotion
 
 Real = Inexact[Array, "..."]
@@ -20,8 +21,8 @@ def _one_piece(end: Real) -> Real:
 
 def _sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, local: Real) -> list[Real]:
     """Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
-    sine, cosine = amplitude * jnp.sin(angle), amplitude * jnp.cos(angle)
-    return _harmonic(keep(sine, local), keep(cosine, local) * rate * unit, rate * unit, order)
+    sine, cosine = sine_cosine_of_any(angle)
+    return _harmonic(keep(amplitude * sine, local), keep(amplitude * cosine, local) * rate * unit, rate * unit, order)
 
 
 def _harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
@@ -258,8 +259,9 @@ class CosinePulse(AbstractMotion):
 
     def series(self, piece, local, unit, order):
         rate = 2 * math.pi / self.period
-        cosine, sine = self.amplitude * jnp.cos(rate * local), self.amplitude * jnp.sin(rate * local)
-        return _harmonic(keep(cosine, local), keep(-sine, local) * rate * unit, rate * unit, order)
+        sine, cosine = sine_cosine_of_any(rate * local)
+        value, slope = keep(self.amplitude * cosine, local), keep(-self.amplitude * sine, local) * rate * unit
+        return _harmonic(value, slope, rate * unit, order)
 
 
 # Peak of |y^3 - 3y| e^(-y^2/2), at y^2 = 3 - sqrt(6).

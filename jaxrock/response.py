@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import Values, as_real, checked, scalar
+from jaxrock.arcs import Diffrax
 from jaxrock.block import Block
-from jaxrock.free import FreeStage, free_stage
-from jaxrock.models import Housner, Model
+from jaxrock.engine import AbstractEngine, AbstractStepper
+from jaxrock.models import Equation, Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.scene import Scene
-from jaxrock.series import Series, Stepper
+from jaxrock.series import Series
 from jaxrock.state import State, initial_state, surpasses
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, "..."]
-_OUTCOME_STEPS = 100_000
 
 
 class Outcome(eqx.Module):
@@ -32,6 +32,7 @@ class Outcome(eqx.Module):
       impacts without end of a block that comes to rest are counted down to hops of rounding height.
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
+    - `error`: estimated standard error of `max_rotation` from rounding and tolerance [rad]; infinite if overturned.
     - `status`: a `Status`. With any other than successful the numbers are not results.
 
     The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11),
@@ -51,6 +52,7 @@ class Outcome(eqx.Module):
     impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
     margin: Scalar
+    error: Scalar
     status: Status
 
 
@@ -78,7 +80,7 @@ class Response(eqx.Module):
     margin: Scalar
     status: Status
     duration: Scalar
-    stepper: Stepper
+    stepper: AbstractStepper
     nodes: State  # every step's start, one axis more; nodes past the last repeat it at time inf
     node_times: Inexact[Array, "..."]
     impacted: Bool[Array, "..."]
@@ -161,7 +163,7 @@ def outcome(
     model: Model = Housner(),
     *,
     initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
-    engine: Series | None = None,
+    engine: AbstractEngine | None = None,
 ) -> Outcome:
     """Tell what becomes of a block under a motion and in the free stage after it.
 
@@ -169,15 +171,15 @@ def outcome(
 
     - `block`: a `Block` of scalars (use `jax.vmap` for many).
     - `motion`: any motion; the ground rests after its end.
-    - `model`: `Housner()` (nonlinear) or `Linear()`.
+    - `model`: `Housner()` (nonlinear), `Linear()`, or an `Equation` of your own.
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
-    - `engine`: `Series(...)`; None takes its defaults.
+    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
 
     **Returns:** an `Outcome`.
 
     **Raises:** ValueError for arguments outside their ranges; arrays where scalars are wanted.
     """
-    return _outcome(block, motion, model, _start(initial), engine or Series())
+    return _outcome(block, motion, model, _start(initial), _engine(engine, model))
 
 
 def simulate(
@@ -187,7 +189,7 @@ def simulate(
     *,
     initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     duration: ArrayLike | None = None,
-    engine: Series | None = None,
+    engine: AbstractEngine | None = None,
     samples: int = 2001,
 ) -> Response:
     """Compute the history of a block under a motion.
@@ -208,10 +210,16 @@ def simulate(
     if duration is not None:
         duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
         duration = scalar("duration", duration)
-    response = _simulate(block, motion, model, _start(initial), duration, engine or Series())
+    response = _simulate(block, motion, model, _start(initial), duration, _engine(engine, model))
     time = jnp.linspace(jnp.zeros_like(response.duration), response.duration, samples)
     rotation, velocity = _evaluate(response, time)
     return eqx.tree_at(lambda r: (r.time, r.rotation, r.velocity), response, (time, rotation, velocity))
+
+
+def _engine(engine: AbstractEngine | None, model: Model) -> AbstractEngine:
+    if engine is not None:
+        return engine
+    return Diffrax() if isinstance(model, Equation) else Series()
 
 
 _warned = False
@@ -237,44 +245,30 @@ def _start(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
 @jax.jit
 def _outcome(block, motion, model, initial, engine) -> Outcome:
     scene = Scene.of(block, motion, model)
-    stepper = Stepper(
-        scene=scene,
-        stop=jnp.full_like(scene.p, jnp.inf),
-        order=engine.order_for(scene),
-        tolerance=engine.tolerance_for(scene),
-        history=False,
-    )
-    budget = engine.max_steps or _OUTCOME_STEPS
+    stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state)
+    budget = engine.budget(scene, history=False)
+    state = engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
     return _conclude(stepper, state)
 
 
-def _conclude(stepper: Stepper, state: State) -> Outcome:
+def _conclude(stepper: AbstractStepper, state: State) -> Outcome:
     """Add the free stage to a state at the end of the motion (or where the block was lost)."""
-    scene = stepper.scene
-    moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-    stage: FreeStage = free_stage(scene.table, scene.restitution, state.opening, state.velocity, moving)
-    overturned = state.overturned | stage.overturned
-    closeness = jnp.minimum(state.closeness, stage.closeness)
-    # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
-    beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
-    higher = surpasses(stage.peak, state.peak)
-    status = Status.where(state.done, state.status, Status.step_budget_exhausted)
+    final = stepper.finish(state)
+    overturned = final.overturned
 
     def unless_overturned(value):
         return jnp.where(overturned, jnp.inf, value)
 
     return Outcome(
-        max_rotation=unless_overturned(jnp.maximum(state.peak, stage.peak)),
-        max_velocity=unless_overturned(jnp.maximum(state.fastest, stage.fastest) * scene.p),
-        time_of_max=unless_overturned(
-            jnp.where(higher, stepper.time(state) + stage.peak_time / scene.p, state.peak_time)
-        ),
-        impact_count=state.impacts + stage.impacts,
+        max_rotation=unless_overturned(final.peak),
+        max_velocity=unless_overturned(final.fastest * stepper.scene.p),
+        time_of_max=unless_overturned(final.peak_time),
+        impact_count=final.impacts,
         overturned=overturned,
-        margin=jnp.where(overturned, -beyond, closeness),
-        status=status,
+        margin=jnp.where(overturned, -final.closeness_beyond, final.closeness),
+        error=unless_overturned(final.error),
+        status=Status.where(state.done, final.status, Status.step_budget_exhausted),
     )
 
 
@@ -283,14 +277,7 @@ def _simulate(block, motion, model, initial, duration, engine) -> Response:
     scene = Scene.of(block, motion, model)
     dtype = scene.p.dtype
     stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration, dtype)
-    stepper = Stepper(
-        scene=scene,
-        stop=stop,
-        order=engine.order_for(scene),
-        tolerance=engine.tolerance_for(scene),
-        history=True,
-    )
-    budget = engine.max_steps or 4096 + 2 * scene.pieces
+    stepper, budget = engine.stepper(scene, stop, history=True), engine.budget(scene, history=True)
     state = initial_state(scene, *(jnp.asarray(x, dtype) for x in initial))
     nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
 
@@ -302,8 +289,8 @@ def _simulate(block, motion, model, initial, duration, engine) -> Response:
         state = stepper.advance(state)
         return state, store(nodes, state)
 
-    state, nodes = jax.lax.while_loop(
-        lambda carry: ~carry[0].done & (carry[0].steps < budget), step, (state, store(nodes, state))
+    state, nodes = engine.loop(
+        lambda carry: ~carry[0].done & (carry[0].steps < budget), step, (state, store(nodes, state)), budget
     )
     final = _conclude(stepper, state)
     index = jnp.arange(budget + 1)
@@ -334,22 +321,16 @@ def _simulate(block, motion, model, initial, duration, engine) -> Response:
 
 @jax.jit
 def _evaluate(response: Response, time):
-    """Expand the series again about the step that holds each time."""
+    """Follow the block from the node before each time."""
     stepper = response.stepper
 
     def at(t):
         index = jnp.clip(jnp.searchsorted(response.node_times, t, side="right") - 1, 0, response.node_times.size - 1)
         node = jax.tree.map(lambda x: x[index], response.nodes)
-        forcing, unit = stepper.forcing(node)
-        x = jnp.minimum(t, response.duration) - response.node_times[index]
-        coefficients = stepper.expand(node, stepper.angle(node), forcing, unit)
-        opening, speed = coefficients[-1], jnp.zeros_like(unit)
-        for c in reversed(coefficients[:-1]):
-            speed = speed * (x / unit) + opening
-            opening = opening * (x / unit) + c
+        opening, speed = stepper.evaluate(node, jnp.minimum(t, response.duration) - response.node_times[index])
         # The last node is the end of the history: the block lies, rests, or is caught in motion there.
         lies = node.done & (node.opening >= jnp.pi / 2)
-        velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed / unit)
+        velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed)
         velocity = jnp.where(lies, 0.0, velocity)
         return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity
 

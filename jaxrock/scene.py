@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock.block import Block
-from jaxrock.models import Model, Table
+from jaxrock.models import EquationTable, Model, Table
 from jaxrock.motion import AbstractMotion
 
 Scalar = Inexact[ArrayLike, ""]
@@ -26,7 +26,7 @@ def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array,
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion."""
 
-    table: Table
+    table: Table | EquationTable
     p: Scalar
     alpha: Scalar
     restitution: Scalar

@@ -7,18 +7,18 @@ waits for the threshold. Under `jax.vmap` lanes advance together, each at its ow
 lane needs is not taken.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import ArrayLike, Bool, Inexact
 
 from jaxrock._keep import keep
-from jaxrock.models import Angle, opening_series
+from jaxrock.engine import AbstractEngine, AbstractStepper, when
+from jaxrock.free import free_stage
+from jaxrock.models import Angle, Table, opening_series
 from jaxrock.polynomial import (
-    Landing,
     Watch,
     derivative,
     fall_bound,
@@ -35,8 +35,11 @@ from jaxrock.status import Status
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
+_OUTCOME_STEPS = 100_000
+_SURE = 8.0  # standard errors beyond which a verdict is not in doubt
 
-class Series(eqx.Module):
+
+class Series(AbstractEngine):
     """Settings of the series engine.
 
     **Arguments:**
@@ -61,31 +64,28 @@ class Series(eqx.Module):
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"Argument `max_steps` must be at least 1, but is {self.max_steps}.")
 
-    def order_for(self, scene: Scene) -> int:
-        """Order of the steps: short pieces of a record need few terms."""
-        return self.order or (8 if scene.pieces > 32 else 16)
+    def stepper(self, scene: Scene, stop: Scalar, history: bool) -> "TaylorStepper":
+        """This engine at work on a scene; short pieces of a record need few terms."""
+        if not isinstance(scene.table, Table):
+            raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
+        return TaylorStepper(
+            scene=scene,
+            stop=stop,
+            order=self.order or (8 if scene.pieces > 32 else 16),
+            tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
+            history=history,
+        )
 
-    def tolerance_for(self, scene: Scene) -> float:
-        """Local error over alpha."""
-        return self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2
+    def budget(self, scene: Scene, history: bool) -> int:
+        """Largest number of steps."""
+        return self.max_steps or (4096 + 2 * scene.pieces if history else _OUTCOME_STEPS)
 
-
-def _when(needed: Flag, function: Callable, value: State) -> State:
-    """`function(value, needed, inside)` where needed; under vmap the function runs only if some lane needs it.
-
-    What the function makes from values outside must pass through `inside` first: otherwise XLA moves it
-    out of the branch, and every step pays for it.
-    """
-
-    def body(carry):
-        first, value = carry
-        # The flag changes in the loop: what depends on it stays in the loop.
-        return jnp.zeros_like(first), function(value, first, lambda x: keep(x, jnp.where(first, 0.0, -1.0)))
-
-    return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
+    def loop(self, unfinished, step, carry, budget: int):
+        """A loop that stops at the last lane; forward mode only."""
+        return jax.lax.while_loop(unfinished, step, carry)
 
 
-class Stepper(eqx.Module):
+class TaylorStepper(AbstractStepper):
     """One scene with the engine's settings, and how far to follow it."""
 
     scene: Scene
@@ -94,95 +94,54 @@ class Stepper(eqx.Module):
     tolerance: float = eqx.field(static=True)
     history: bool = eqx.field(static=True)  # follow an overturning block down to the ground
 
-    def time(self, state: State) -> Scalar:
-        """Time of a state [s]."""
-        return self.scene.knots[state.piece] + state.local
-
     def forcing(self, state: State) -> tuple[list[Scalar], Scalar]:
         """Taylor coefficients of the ground acceleration [g] about a state, in time/unit, and the unit [s]."""
         terms, unit = self.scene.forcing(state.piece, state.local, self.order)
         return [keep(u, state.local) for u in terms], keep(unit, state.local)
 
-    def _room(self, state: State, unit: Scalar) -> Scalar:
-        """Time to the next knot or the stop, in units."""
-        to_knot = self.scene.lengths[state.piece] - state.local
-        return jnp.maximum(jnp.minimum(to_knot, self.stop - self.time(state)), 0.0) / unit
-
-    def _advance(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
-        """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
-        to_knot = self.scene.lengths[state.piece] - state.local
-        ends = full & (to_knot <= self.stop - self.time(state))
-        piece = state.piece + ends
-        over = jnp.where(jnp.isfinite(self.stop), full & ~ends, piece >= self.scene.pieces)
-        return piece, jnp.where(ends, 0.0, state.local + elapsed), over
-
     def advance(self, state: State) -> State:
         """One step of a lane: waiting at rest, or rocking."""
         forcing, unit = self.forcing(state)
-        room = self._room(state, unit)
         resting = state.side == 0
-        waited = self._wait(state, forcing, unit, room)
-        rocked = self._rock(state, forcing, unit, room, ~resting)
-        after = jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked)
-        good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-        return replace(
-            after,
-            steps=state.steps + 1,
-            status=Status.where(good, after.status, Status.not_finite),
-            done=after.done | ~good,
-        )
+        waited = self.wait(state, forcing, unit, self.order, self.tolerance)
+        rocked = self._rock(state, forcing, unit, ~resting)
+        return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
 
-    def _wait(self, state: State, forcing, unit, room) -> State:
-        """At rest: go on to the knot, or to where the acceleration exceeds the threshold."""
-        scene, threshold = self.scene, self.scene.table.threshold
-        truncated = len(forcing) > self.order  # else a polynomial: exact
-        length = step_length(forcing, self.tolerance * threshold, room) if truncated else room
-        never = scene.ceilings[state.piece] <= threshold
-        length = jnp.where(jnp.isfinite(length), length, 0.0)
-        scaled = rescaled(forcing, length)
-        slope = scaled[1] if len(scaled) > 1 else jnp.zeros_like(length)
-        gap = threshold - jnp.abs(scaled[0])
-        slack = 8 * jnp.finfo(gap.dtype).eps * threshold
-        touching = jnp.abs(gap) <= slack
-        lifts = (gap < -slack) | (touching & (jnp.sign(scaled[0]) * slope > 0))
-        full = length >= room
-        piece, local, over = self._advance(state, length * unit, full)
-        piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
-        waited = replace(state, piece=piece, local=local, done=over | never)
-
-        def search(waited, needed, inside):
-            series = rescaled(forcing, inside(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
-            # A threshold that is only touched (or was just left) is not met again at once.
-            start = jnp.where(touching, 1e-8, 0.0).astype(gap.dtype)
-            one = jnp.ones_like(gap)
-            watches = [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)]
-            landing = first_event([inside(c) for c in series], watches, start, needed)
-            value, rate = landing.jet
-            met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
-            early = landing.x < 1
-            cut = replace(
-                waited,
-                piece=jnp.where(early, state.piece, waited.piece),
-                local=jnp.where(early, state.local + landing.x * length * unit, waited.local),
-                done=waited.done & ~early,
-            )
-            return self._lift(cut, value, met, jnp.ones_like(met))
-
-        reachable = ~lifts & ~never & (state.side == 0)
-        reachable = reachable & (sum(jnp.abs(c) for c in scaled) >= threshold)
-        waited = _when(reachable, search, waited)
-        lifted = self._lift(state, scaled[0], lifts, touching)
-        return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
-
-    def _lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
-        """Leave rest where `lifts`: positive acceleration drives negative rotation."""
+    def finish(self, state: State) -> State:
+        """The free stage by energy."""
+        scene, table = self.scene, self.scene.table
+        moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
+        stage = free_stage(table, scene.restitution, state.opening, state.velocity, moving)
+        # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
+        beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
+        higher = surpasses(stage.peak, state.peak)
+        # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
+        slope = -2 * table.restoring(Angle.of(state.opening))
+        off = state.spread.along(slope, -2 * state.velocity) * stage.share
+        toss_up = moving & (jnp.abs(stage.deficit) <= _SURE * off) & (state.status == Status.successful)
+        steepness = 2 * jnp.abs(table.restoring(Angle.of(stage.peak)))
         return replace(
             state,
-            side=jnp.where(lifts, -jnp.sign(acceleration), state.side),
-            uplifting=jnp.where(lifts, continuous, state.uplifting),
-            beyond=jnp.where(lifts, False, state.beyond),
-            extremal=jnp.where(lifts, False, state.extremal),
+            overturned=state.overturned | stage.overturned,
+            closeness=jnp.minimum(state.closeness, stage.closeness),
+            closeness_beyond=beyond,
+            peak=jnp.maximum(state.peak, stage.peak),
+            peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
+            error=jnp.where(higher, off / jnp.where(steepness > 0, steepness, 1.0), state.error),
+            fastest=jnp.maximum(state.fastest, stage.fastest),
+            impacts=state.impacts + stage.impacts,
+            status=Status.where(toss_up, Status.undecided, state.status),
         )
+
+    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+        """Expand the series again about the node."""
+        forcing, unit = self.forcing(node)
+        coefficients = self.expand(node, self.angle(node), forcing, unit)
+        opening, speed = coefficients[-1], jnp.zeros_like(unit)
+        for c in reversed(coefficients[:-1]):
+            speed = speed * (elapsed / unit) + opening
+            opening = opening * (elapsed / unit) + c
+        return opening, speed / unit
 
     def angle(self, state: State) -> Angle:
         """The opening angle of a state with its sine and cosine."""
@@ -195,10 +154,11 @@ class Stepper(eqx.Module):
         speed = state.velocity * stretch
         return opening_series(self.scene.table, stretch, state.side, angle, speed, state.uplifting, forcing, self.order)
 
-    def _rock(self, state: State, forcing, unit, room, rocking: Flag) -> State:
+    def _rock(self, state: State, forcing, unit, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
         scene = self.scene
         table, saddle = scene.table, scene.table.saddle
+        room = self.room(state) / unit
         angle = self.angle(state)
         coefficients = self.expand(state, angle, forcing, unit)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
@@ -228,10 +188,16 @@ class Stepper(eqx.Module):
         escaped = (state.velocity >= 0) & state.beyond
         escaped = escaped & (table.restoring(angle) + ceiling * table.arm(angle) <= 0)
 
-        piece, local, over = self._advance(state, length * unit, full)
+        piece, local, over = self.move_on(state, length * unit, full)
         moved = (length > 0) & rocking
+
+        def spread_at(elapsed):
+            step = self.tolerance * size
+            return self.spread_after(state, angle, state.side * forcing[0], elapsed, (step, step))
+
         passed = replace(
             state,
+            spread=spread_at(length * unit),
             piece=piece,
             local=local,
             opening=opening,
@@ -245,9 +211,9 @@ class Stepper(eqx.Module):
         def land(passed, needed, inside):
             scaled = [inside(c) for c in rescaled(coefficients, inside(length))]
             series = rescaled(forcing, inside(length))
-            return self._land(state, passed, scaled, series, signs, faster, length, unit, needed)
+            return self._land(state, passed, scaled, series, signs, faster, spread_at, length, unit, needed)
 
-        stepped = _when(eventful & moved, land, passed)
+        stepped = when(eventful & moved, land, passed)
         down = stepped.opening >= jnp.pi / 2
         overturned = state.overturned | escaped | down if scene.falls_flat else state.overturned | escaped
         # A history goes on to the ground; for an outcome the verdict is enough.
@@ -266,7 +232,7 @@ class Stepper(eqx.Module):
         )
         return velocity, acceleration
 
-    def _land(self, state, passed, scaled, forcing, signs, faster, length, unit, needed) -> State:
+    def _land(self, state, passed, scaled, forcing, signs, faster, spread_at, length, unit, needed) -> State:
         """Find the first event of a step, move the lane there, and let it happen."""
         scene, saddle = self.scene, self.scene.table.saddle
         one = jnp.ones_like(length)
@@ -288,6 +254,7 @@ class Stepper(eqx.Module):
         elapsed = landing.x * length * unit
         landed = replace(
             passed,
+            spread=spread_at(elapsed),
             piece=jnp.where(early, state.piece, passed.piece),
             local=jnp.where(early, state.local + elapsed, passed.local),
             opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
@@ -297,8 +264,10 @@ class Stepper(eqx.Module):
             fastest=jnp.maximum(state.fastest, jnp.abs(speed)),
             done=passed.done & ~early,
         )
-        landed = self._note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
-        return self._impact(landed, impact, speed, forcing, landing, length, unit)
+        landed = self.note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
+        reach = (1 - landing.x) * length * unit
+        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / jnp.where(length > 0, length * unit, 1.0)
+        return self.impact(landed, impact, speed, jet(forcing, landing.x, 0)[0], steepest, reach)
 
     def _matters(self, state: State, scaled) -> Flag:
         """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
@@ -311,76 +280,8 @@ class Stepper(eqx.Module):
         rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
         top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, table.saddle), table.saddle)
         least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
-        return state.beyond | (top >= state.peak) | (least < state.closeness)
-
-    def _note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
-        """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
-        table = self.scene.table
-        # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
-        # instant, far from its saddle, is not in balance.
-        pull = jnp.maximum(jnp.abs(bend), jnp.abs(table.restoring(Angle.of(opening))))
-        stillness = (speed**2 + pull**2) / table.restoring_at_rest**2
-        turn = turning & (outward | state.beyond)
-        closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
-        closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
-        beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
-        beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
-        higher = turning & outward
-        first = higher & surpasses(opening, state.peak)
-        return replace(
-            state,
-            peak=jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
-            peak_time=jnp.where(first, self.time(state), state.peak_time),
-            closeness=closeness,
-            closeness_beyond=beyond,
-        )
-
-    def _impact(self, state: State, impact: Flag, speed, forcing, landing: Landing, length, unit) -> State:
-        """Change side with the restitution; come to rest where the impacts to come no longer matter.
-
-        After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come last
-        2 v (1/a + e/a')/(1 - e^2). They are replaced by rest where it is certain that they end before the forcing
-        has changed by half of the weaker deceleration (so all speeds stay below e^(1/2) those of constant forcing,
-        and all hops end within four times that time), and that none is higher, faster or closer to overturning than
-        what has been. Each is slower by e, so those above the tolerance can be counted.
-        """
-        scene, table, e = self.scene, self.scene.table, self.scene.restitution
-        rebound = e * jnp.abs(speed)
-        side = -state.side
-        push = side * jet(forcing, landing.x, 0)[0] * table.arm_at_rest
-        here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
-        weaker = jnp.minimum(here, there)
-        held = (weaker > 0) & (e < 1)
-        here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
-        remaining = 2 * rebound * (1 / here + e / there) / jnp.where(held, 1 - e * e, 1.0)
-        window = 4 * remaining / (scene.p * unit)  # in units of time
-        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / jnp.where(length > 0, length, 1.0)
-        dies = held & (steepest * window * table.arm_at_rest <= weaker / 2) & (window <= (1 - landing.x) * length)
-        # Speed of a hop as high as the tolerance; a history shows the hops down to there.
-        low = jnp.sqrt(200 * self.tolerance * scene.alpha * jnp.minimum(here, there))
-        if self.history:
-            dies = dies & (rebound <= low)
-        else:
-            highest = 3 * rebound**2 * jnp.maximum(1 / here, e * e / there)
-            least = (table.restoring(Angle.of(jnp.minimum(highest, table.saddle))) / table.restoring_at_rest) ** 2
-            dies = dies & (highest <= state.peak) & (2 * rebound <= state.fastest) & (least >= state.closeness)
-        rests = impact & (dies | (rebound == 0))
-        more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
-        more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-        wait = jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
-        return replace(
-            state,
-            impacts=state.impacts + (impact & (speed < 0)) + more,
-            impact_time=jnp.where(impact, self.time(state), state.impact_time),
-            impact_velocity=jnp.where(impact, state.side * speed, state.impact_velocity),
-            side=jnp.where(rests, 0.0, jnp.where(impact, side, state.side)),
-            opening=jnp.where(impact, 0.0, state.opening),
-            velocity=jnp.where(rests, 0.0, jnp.where(impact, rebound, state.velocity)),
-            local=state.local + wait,
-            beyond=state.beyond & ~impact,
-            uplifting=state.uplifting & ~impact,
-            extremal=state.extremal & ~impact,
-        )
+        inward = state.velocity < 0  # it may graze the ground
+        return inward | state.beyond | (top >= state.peak) | (least < state.closeness)
 
 
 def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:

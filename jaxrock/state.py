@@ -6,6 +6,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.models import Angle
 from jaxrock.scene import Scene
+from jaxrock.spread import Spread
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, ""]
@@ -25,12 +26,14 @@ class State(eqx.Module):
     extremal: Flag  # the velocity has an extremum here: the acceleration is zero, to rounding
     peak: Scalar
     peak_time: Scalar
+    error: Scalar  # standard error of the peak
     fastest: Scalar
     impacts: Int[Array, ""]
     impact_time: Scalar  # of the last impact [s]
     impact_velocity: Scalar  # of the rotation, just before it
     closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
     closeness_beyond: Scalar  # the same since the saddle was last crossed outward
+    spread: Spread  # of opening and velocity
     overturned: Flag
     done: Flag
     status: Status
@@ -49,6 +52,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     stillness = (outward**2 + scene.table.restoring(Angle.of(opening)) ** 2) / scene.table.restoring_at_rest**2
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
+    eps = jnp.finfo(opening.dtype).eps
     return State(
         piece=count,
         local=zero,
@@ -60,12 +64,14 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         extremal=no,
         peak=opening,
         peak_time=zero,
+        error=zero,
         fastest=jnp.abs(outward),
         impacts=count,
         impact_time=zero,
         impact_velocity=zero,
         closeness=jnp.where(side == 0, unlifted, jnp.where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
         closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
+        spread=Spread.none(opening).plus(eps * opening, eps * outward),
         overturned=no,
         done=no,
         status=Status.where(jnp.isfinite(rotation) & jnp.isfinite(velocity), Status.successful, Status.not_finite),
