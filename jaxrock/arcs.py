@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock.engine import AbstractEngine, AbstractStepper
+from jaxrock.engine import AbstractEngine, AbstractStepper, either
 from jaxrock.models import Angle
 from jaxrock.scene import Scene
 from jaxrock.state import State
@@ -95,7 +95,7 @@ class Diffrax(AbstractEngine):
             return self.controller
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        longest = jnp.minimum(_LONGEST, scene.p * scene.scales[piece])
+        longest = jax.lax.stop_gradient(jnp.minimum(_LONGEST, scene.p * scene.scales[piece]))
         return diffrax.PIDController(rtol=self.rtol, atol=jax.lax.stop_gradient(atol), dtmax=longest)
 
 
@@ -141,7 +141,8 @@ class Illinois(optx.AbstractRootFinder):
     def terminate(self, fn, y, args, options, state, tags):
         """Whether the bracket is as small as rounding allows, or the root is met."""
         small = state.upper - state.lower <= self.atol + self.rtol * jnp.abs(state.upper)
-        return small | (state.at_upper == 0) | (state.at_lower <= 0), optx.RESULTS.successful
+        # A quantity that is only noise may have no root but the start.
+        return small | (state.at_upper == 0) | (state.at_lower <= 0) | (state.count >= 200), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """The last point."""
@@ -155,20 +156,23 @@ class _Arc(eqx.Module):
     start: State
     bend: Scalar  # acceleration at the start
     jerk: Scalar  # its derivative
+    noise: Scalar  # what rounding may make of an acceleration that is zero
     hop: Flag  # too small for its turning point to matter, and certain to come back
     history: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, scene: Scene, start: State, history: bool) -> "_Arc":
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
-        arc = cls(scene, start, zero, zero, no, history)
+        arc = cls(scene, start, zero, zero, zero, no, history)
         y = jnp.stack([start.opening, start.velocity])
         bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
         pull = scene.table.restoring_at_rest + jnp.abs(arc.push(zero)) * scene.table.arm_at_rest
-        rounding = 64 * jnp.finfo(bend.dtype).eps * pull
-        bend = jnp.where(start.uplifting | start.extremal | (jnp.abs(bend) <= rounding), 0.0, bend)
-        return cls(scene, start, bend, jerk, no, history)
+        noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
+        noise = jax.lax.stop_gradient(noise)
+        leaving = (start.opening == 0) & (start.velocity == 0)
+        bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
+        return cls(scene, start, bend, jerk, noise, no, history)
 
     def push(self, time: Scalar) -> Scalar:
         """Side times ground acceleration [g]."""
@@ -186,17 +190,30 @@ class _Arc(eqx.Module):
         gap = opening - self.scene.table.saddle
         return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.scene.table.saddle, 0.0, gap)
 
+    @property
+    def horizon(self) -> Scalar:
+        """Time (p t) for which the acceleration of a block that leaves rest is only noise."""
+        return self.noise / jnp.maximum(self.jerk, self.noise)
+
+    def is_void(self, time: Scalar, y: Pair, event: Flag) -> Flag:
+        """Whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
+        leaving = (self.start.opening == 0) & (self.start.velocity == 0) & (self.bend == 0)
+        return leaving & ((self.jerk <= 0) | (event & (jnp.abs(y[1]) <= self.noise * time)))
+
     def flow(self, time: Scalar, y: Pair) -> Pair:
         """The right-hand side."""
         return jnp.stack([y[1], self.acceleration(time, y)])
 
     def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
         """Ground, turning point, velocity extremum, saddle, certain loss, fallen flat: the first to reach zero ends
-        the arc. Each is divided by how it starts, so that all start at one."""
+        the arc. All start above zero."""
         start, table = self.start, self.scene.table
         ground = _guard(time, y[0], [start.opening, start.velocity, self.bend / 2, self.jerk / 6], True)
         turn = _guard(time, y[1], [start.velocity, self.bend, self.jerk / 2], ~self.hop)
-        extremum = _guard(time, self.acceleration(time, y), [self.bend, self.jerk], ~self.hop)
+        # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
+        rises = jnp.where(self.bend == 0, self.jerk >= 0, self.bend > 0)
+        along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
+        extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
         saddle = _guard(time, y[0] - table.saddle, [self.gap(start.opening), start.velocity], True)
         ceiling = self.scene.ceilings[start.piece]
 
@@ -240,6 +257,7 @@ class ArcStepper(AbstractStepper):
     stop: Scalar
     history: bool = eqx.field(static=True)
     engine: Diffrax
+    doubt: float = eqx.field(static=True, default=2.0)  # a tolerance is more than the error that it leaves
 
     def advance(self, state: State) -> State:
         """One arc of a lane, or a wait at rest."""
@@ -247,7 +265,7 @@ class ArcStepper(AbstractStepper):
         forcing, unit = scene.forcing(state.piece, state.local, _ORDER)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = self.wait(state, forcing, unit, _ORDER, eps)
+        waited = self.wait(state, forcing, unit, _ORDER, eps, either)
         rocked = self._rock(state, _steepest(forcing, unit), unit, ~resting)
         after = self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
@@ -294,12 +312,6 @@ class ArcStepper(AbstractStepper):
             throw=False,
         )
 
-    def _lost(self, state: State) -> Flag:
-        """No forcing that is still to come can bring it back: restoring + ceiling arm < 0 from here on."""
-        table, angle = self.scene.table, Angle.of(state.opening)
-        hold = table.restoring(angle) + self.scene.ceilings[state.piece] * table.arm(angle)
-        return state.beyond & (state.velocity >= 0) & (hold <= 1e-6 * state.velocity)  # it gets over that little
-
     def _is_hop(self, state: State, bend: Scalar, steepest: Scalar, unit: Scalar) -> Flag:
         """Whether the block comes back to the ground at once, without a peak or a speed that matters.
 
@@ -320,23 +332,25 @@ class ArcStepper(AbstractStepper):
     def _rock(self, state: State, steepest: Scalar, unit: Scalar, rocking: Flag) -> State:
         """Rocking: an arc up to its event, the knot, or the stop."""
         scene, engine = self.scene, self.engine
-        lost = self._lost(state) & (not self.history)
+        lost = self.escaped(state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
-        share = _SHARE * jnp.minimum(_usual_step(engine.rtol), scene.p * scene.scales[state.piece])
-        whole = scene.p * room <= share
-        length = jnp.where(whole, scene.p * room, share)
+        share = _SHARE * jnp.minimum(_usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
+        whole = room <= share
+        length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = _Arc.of(scene, state, self.history)
         arc = replace(arc, hop=self._is_hop(state, arc.bend, steepest, unit))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(_first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
         solution = self._solve(arc, length, event)
         time, y = solution.ts[-1], solution.ys[-1]
-        happened = rocking & solution.event_mask & (time > 0)
+        void = rocking & arc.is_void(time, y, solution.event_mask)
+        time = jnp.where(void, jnp.maximum(time, jnp.minimum(arc.horizon, length)), time)
+        y = jnp.where(void, 0.0, y)
+        happened = rocking & solution.event_mask & (time > 0) | void
         guards = arc.guards(time, y)
         fired = happened & (jnp.arange(guards.size) == jnp.argmin(guards))
-        ground, turning, extremum, crossing, escaped, flat = fired
-        lost = lost | (escaped & (y[1] >= 0) & (not self.history))
-        ground = ground | (happened & (y[0] <= 0))
+        ground, turning, _, crossing, _, flat = fired
+        ground = ground | (happened & (y[0] <= 0) & ~void)
         # The saddle is where a free block has its slowest passage: two events in one.
         crossing = crossing | (happened & (arc.gap(y[0]) == 0) & (arc.gap(state.opening) != 0))
         turning, crossing = turning & ~ground, crossing & ~ground
@@ -355,13 +369,13 @@ class ArcStepper(AbstractStepper):
             opening=jnp.where(flat, jnp.pi / 2, jnp.where(crossing, scene.table.saddle, y[0])),
             velocity=jnp.where(turning, 0.0, y[1]),
             uplifting=state.uplifting & ~moved,
-            extremal=jnp.where(moved, extremum, state.extremal),
             beyond=state.beyond ^ crossing,
             fastest=jnp.maximum(state.fastest, jnp.abs(y[1])),
             spread=spread,
             done=over & self.history,  # an outcome goes on through the free stage
         )
-        return self._happen(state, after, arc, (ground, turning, crossing), y, lost, solution.result)
+        after = replace(after, side=jnp.where(void, 0.0, after.side))
+        return self._happen(state, after, arc, (ground & ~void, turning, crossing), y, lost, solution.result)
 
     def _happen(self, before: State, after: State, arc: _Arc, events, y: Pair, lost: Flag, result) -> State:
         """Let the event of an arc happen: peaks, margin, impact, verdict."""
@@ -375,7 +389,7 @@ class ArcStepper(AbstractStepper):
         reach = jnp.minimum(self.room(after), 0.25 * unit)
         after = self.impact(after, ground, y[1], forcing[0], _steepest(forcing, unit), reach)
         down = after.opening >= jnp.pi / 2
-        overturned = before.overturned | lost | self._lost(after)
+        overturned = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
         overturned = overturned | down if scene.falls_flat else overturned
         if not self.history:
             # The impact after the motion counts if the block is lost after it.
@@ -383,7 +397,9 @@ class ArcStepper(AbstractStepper):
             after = replace(after, impacts=jnp.where(quiet, before.impacts + decisive, after.impacts))
         exhausted = result == diffrax.RESULTS.max_steps_reached
         failed = ~exhausted & ~diffrax.is_okay(result)
-        status = Status.where(exhausted, Status.step_budget_exhausted, after.status)
+        balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.bend) <= arc.noise) & (before.side != 0)
+        status = Status.where(balanced, Status.undecided, after.status)
+        status = Status.where(exhausted, Status.step_budget_exhausted, status)
         status = Status.where(failed, Status.solver_failed, status)
         ends = overturned & down if self.history else overturned
         return replace(after, overturned=overturned, status=status, done=after.done | ends | exhausted | failed)
@@ -407,5 +423,7 @@ def _first_step(arc: _Arc, rtol: float) -> Scalar:
     back = jnp.maximum(-bend, tiny)
     root = jnp.sqrt(v * v + 2 * back * x)
     to_ground = jnp.where(v > 0, (v + root) / back, 2 * x / jnp.maximum(root - v, tiny))
-    usual = _usual_step(rtol)
+    # Where the deceleration is only just beginning, it is its growth that turns the block back.
+    to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.jerk, tiny))
+    usual = jnp.minimum(_usual_step(rtol), jnp.where(to_turn > 0, 4 * to_turn, jnp.inf))
     return jnp.where(to_ground > 0, jnp.minimum(jnp.where(arc.hop, 1.1, 0.5) * to_ground, usual), usual)

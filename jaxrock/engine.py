@@ -43,6 +43,11 @@ def when(needed: Flag, function: Callable, value: State) -> State:
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
 
 
+def either(needed: Flag, function: Callable, value: State) -> State:
+    """As `when`, but always computed, so that reverse mode goes through."""
+    return jax.tree.map(lambda a, b: jnp.where(needed, a, b), function(value, needed, lambda x: x), value)
+
+
 class AbstractEngine(eqx.Module):
     """Settings of a way to solve scenes."""
 
@@ -65,6 +70,7 @@ class AbstractStepper(eqx.Module):
     scene: AbstractVar[Scene]
     stop: AbstractVar[Scalar]  # time at which to stop [s]; infinite: at the end of the motion
     history: AbstractVar[bool]  # follow an overturning block down to the ground
+    doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
 
     @abc.abstractmethod
     def advance(self, state: State) -> State:
@@ -99,6 +105,9 @@ class AbstractStepper(eqx.Module):
         """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
         good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
         lost = (after.side != 0) & ~(after.spread.size <= _LOST * self.scene.table.saddle)
+        if not self.history:
+            # In the free stage only the next peak or passage counts, which `note` judges.
+            lost = lost & (before.piece < self.scene.pieces)
         undecided = lost & (after.status == Status.successful)
         status = Status.where(undecided, Status.undecided, after.status)
         return replace(
@@ -108,14 +117,15 @@ class AbstractStepper(eqx.Module):
             done=after.done | ~good,
         )
 
-    def wait(self, state: State, forcing: list[Scalar], unit: Scalar, order: int, tolerance: float) -> State:
-        """At rest: go on to the knot, or to where the acceleration exceeds the threshold."""
+    def wait(self, state: State, forcing: list[Scalar], unit: Scalar, order: int, tolerance: float, branch) -> State:
+        """At rest: go on to the knot, or to where the acceleration exceeds the threshold (`branch`: see `when`)."""
         scene, threshold = self.scene, self.scene.table.threshold
         room = self.room(state) / unit
         truncated = len(forcing) > order  # else a polynomial: exact
         length = step_length(forcing, tolerance * threshold, room) if truncated else room
         never = scene.ceilings[state.piece] <= threshold
-        length = jnp.where(jnp.isfinite(length), length, 0.0)
+        # How far a step goes changes nothing: it has no derivative.
+        room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
         scaled = rescaled(forcing, length)
         slope = scaled[1] if len(scaled) > 1 else jnp.zeros_like(length)
         gap = threshold - jnp.abs(scaled[0])
@@ -129,11 +139,10 @@ class AbstractStepper(eqx.Module):
 
         def search(waited, needed, inside):
             series = rescaled(forcing, inside(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
-            # A threshold that is only touched (or was just left) is not met again at once.
-            start = jnp.where(touching, 1e-8, 0.0).astype(gap.dtype)
-            one = jnp.ones_like(gap)
-            watches = [Watch(0, -one, threshold, True), Watch(0, one, -threshold, True)]
-            landing = first_event([inside(c) for c in series], watches, start, needed)
+            # A threshold that is touched already counts as passed when it is left behind by more than rounding.
+            one, level = jnp.ones_like(gap), threshold + jnp.where(touching, 2 * slack, 0.0)
+            watches = [Watch(0, -one, level, True), Watch(0, one, -level, True)]
+            landing = first_event([inside(c) for c in series], watches, jnp.zeros_like(gap), needed)
             value, rate = landing.jet
             met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
             early = landing.x < 1
@@ -147,7 +156,7 @@ class AbstractStepper(eqx.Module):
 
         reachable = ~lifts & ~never & (state.side == 0)
         reachable = reachable & (sum(jnp.abs(c) for c in scaled) >= threshold)
-        waited = when(reachable, search, waited)
+        waited = branch(reachable, search, waited)
         lifted = self._lift(state, scaled[0], lifts, touching)
         return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
 
@@ -161,6 +170,14 @@ class AbstractStepper(eqx.Module):
             extremal=jnp.where(lifts, False, state.extremal),
         )
 
+    def escaped(self, state: State, angle: Angle) -> Flag:
+        """Whether no forcing still to come can bring it back: restoring + ceiling arm < 0 from here on, for certain."""
+        table = self.scene.table
+        hold = table.restoring(angle) + self.scene.ceilings[state.piece] * table.arm(angle)
+        # At a speed v outward it gets over what still holds, if that is much less than v.
+        outward = state.beyond & (state.velocity >= 0) & (hold <= 1e-6 * state.velocity)
+        return outward & (state.velocity - hold > self.doubt * state.spread.along(1.0, 1.0))
+
     def spread_after(self, state: State, angle: Angle, push: Scalar, elapsed: Scalar, step: tuple) -> Spread:
         """Errors after `elapsed` seconds of rocking; `push`: side times acceleration [g]; `step`: what the engine's
         own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
@@ -169,10 +186,11 @@ class AbstractStepper(eqx.Module):
         clock = eps * p * state.local  # the time of a state is rounded, too
         pull = eps * (table.restoring_at_rest + jnp.abs(push) * table.arm_at_rest)  # of what acceleration is left
         spread = state.spread.after_flow(table.repulsion(angle, push), time)
-        return spread.plus(
+        spread = spread.plus(
             step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
             step[1] + eps * speed + pull * (time + p * state.local),
         )
+        return jax.lax.stop_gradient(spread)  # an error has no derivative
 
     def note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
         """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
@@ -191,19 +209,20 @@ class AbstractStepper(eqx.Module):
         # Turning back just above the ground, within the error of the angle: there may have been an impact.
         grazing = turning & ~outward & (opening <= 4 * state.spread.angle)
         graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(bend) * state.spread.angle), 0.0)
-        status = state.status
+        # Standing still in balance, within the error of the state along which it leaves.
+        balanced = (turning | crossing) & (jnp.hypot(speed, pull) <= self.doubt * state.spread.along(1.0, 1.0))
         if self.scene.falls_flat:
-            level = higher & (jnp.abs(opening - jnp.pi / 2) <= 8 * state.spread.angle)
-            status = Status.where(level & (status == Status.successful), Status.undecided, status)
+            balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= self.doubt * state.spread.angle))
+        undecided = balanced & (state.status == Status.successful)
         return replace(
             state,
             peak=jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
             peak_time=jnp.where(first, self.time(state), state.peak_time),
-            error=jnp.where(first, state.spread.angle, state.error),
+            error=jnp.where(first, jax.lax.stop_gradient(state.spread.angle), state.error),
             closeness=closeness,
             closeness_beyond=beyond,
-            spread=state.spread.plus(0.0, graze),
-            status=status,
+            spread=jax.lax.stop_gradient(state.spread.plus(0.0, graze)),
+            status=Status.where(undecided, Status.undecided, state.status),
         )
 
     def impact(self, state: State, hit: Flag, speed: Scalar, forcing: Scalar, steepest: Scalar, reach: Scalar) -> State:
@@ -222,7 +241,7 @@ class AbstractStepper(eqx.Module):
         side = -state.side
         push = side * forcing * table.arm_at_rest
         here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
-        spread = state.spread.after_impact(speed, -there, -here, e)
+        spread = jax.lax.stop_gradient(state.spread.after_impact(speed, -there, -here, e))
         weaker = jnp.minimum(here, there)
         held = (weaker > 0) & (e < 1)
         here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)

@@ -84,9 +84,14 @@ def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Sca
 
 
 def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
-    """Step at which the last two coefficients drop below `size`, at most `cap`."""
+    """Step at which the last coefficients drop below `size`, at most `cap`.
+
+    Where the large coefficients are every second or third (a resonance, a steep ramp), the last two may both be
+    small: those before count, too, with a weight that does not matter for others.
+    """
     order = len(coefficients) - 1
     last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
+    last = jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
     tiny = jnp.finfo(last.dtype).tiny
     ratio = size / jnp.maximum(last, tiny)
     if order & (order - 1) == 0:  # a power of two: repeated square roots vectorise
@@ -133,27 +138,28 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
     When the strides do not come to an end (a zero that is nearly double), the march stops where it
     is, with no hit: everything before that point is certain. Where not `needed` it does not start (lanes
-    march together under vmap, as long as the slowest).
+    march together under vmap, as long as the slowest). The march is not differentiated: x is, as a root.
     """
     highest = max(w.derivative for w in watches) + 1
-    falls = [_falls(coefficients, w.sign, w.derivative + 2) for w in watches]
+    fixed, start = jax.lax.stop_gradient((coefficients, start))
+    quiet = [w._replace(offset=jax.lax.stop_gradient(w.offset)) for w in watches]
+    falls = [_falls(fixed, w.sign, w.derivative + 2) for w in quiet]
     eps = jnp.finfo(start.dtype).eps
 
     def clear(x, radius):
-        """The polynomial's jet at x, and for every quantity the length after x on which it has no zero."""
-        values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
+        """For every quantity the length after x on which it has no zero."""
+        values, end = jet(fixed, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
             _clear_length(
                 w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end)
             )
-            for w, fall in zip(watches, falls)
+            for w, fall in zip(quiet, falls)
         ]
-        return values, [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
+        return [jnp.where(w.active, length, jnp.inf) for w, length in zip(quiet, lengths)]
 
     def march(carry):
         x, radius, _, count = carry
-        _, lengths = clear(x, radius)
-        stride = keep(jnp.clip(functools.reduce(jnp.minimum, lengths), 0.0, radius), x)
+        stride = keep(jnp.clip(functools.reduce(jnp.minimum, clear(x, radius)), 0.0, radius), x)
         reached = jnp.minimum(x + stride, 1.0)
         going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
         # The lower parabola only has to hold as far as the next stride may go: near is tight.
@@ -162,5 +168,22 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     x, radius, _, _ = jax.lax.while_loop(
         lambda carry: carry[2], march, (start, jnp.ones_like(start), needed, jnp.zeros_like(start, jnp.int32))
     )
-    values, lengths = clear(x, radius)
-    return Landing(x, values, [length <= 32 * eps * x for length in lengths])
+    hits = [length <= 32 * eps * x for length in clear(x, radius)]
+    values, newton = jet(coefficients, x, highest), jnp.zeros_like(x)
+    for w, hit in zip(watches[::-1], hits[::-1]):
+        slope = jax.lax.stop_gradient(values[w.derivative + 1])
+        simple = hit & (slope != 0)
+        newton = jnp.where(simple, (w.offset - values[w.derivative]) / jnp.where(simple, slope, 1.0), newton)
+    x = _moving_with(x, newton)
+    return Landing(x, jet(coefficients, x, highest), hits)
+
+
+@jax.custom_jvp
+def _moving_with(x: Scalar, step: Scalar) -> Scalar:
+    """x, with the derivatives of x + step: a root, and the Newton step that vanishes there."""
+    return x
+
+
+@_moving_with.defjvp
+def _(primals, tangents):
+    return primals[0], tangents[0] + tangents[1]

@@ -36,7 +36,6 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
 _OUTCOME_STEPS = 100_000
-_SURE = 8.0  # standard errors beyond which a verdict is not in doubt
 
 
 class Series(AbstractEngine):
@@ -92,7 +91,8 @@ class TaylorStepper(AbstractStepper):
     stop: Scalar  # time at which to stop [s]; infinite: at the end of the motion
     order: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
-    history: bool = eqx.field(static=True)  # follow an overturning block down to the ground
+    history: bool = eqx.field(static=True)
+    doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
 
     def forcing(self, state: State) -> tuple[list[Scalar], Scalar]:
         """Taylor coefficients of the ground acceleration [g] about a state, in time/unit, and the unit [s]."""
@@ -103,7 +103,7 @@ class TaylorStepper(AbstractStepper):
         """One step of a lane: waiting at rest, or rocking."""
         forcing, unit = self.forcing(state)
         resting = state.side == 0
-        waited = self.wait(state, forcing, unit, self.order, self.tolerance)
+        waited = self.wait(state, forcing, unit, self.order, self.tolerance, when)
         rocked = self._rock(state, forcing, unit, ~resting)
         return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
 
@@ -118,7 +118,7 @@ class TaylorStepper(AbstractStepper):
         # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
         slope = -2 * table.restoring(Angle.of(state.opening))
         off = state.spread.along(slope, -2 * state.velocity) * stage.share
-        toss_up = moving & (jnp.abs(stage.deficit) <= _SURE * off) & (state.status == Status.successful)
+        toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off) & (state.status == Status.successful)
         steepness = 2 * jnp.abs(table.restoring(Angle.of(stage.peak)))
         return replace(
             state,
@@ -127,7 +127,7 @@ class TaylorStepper(AbstractStepper):
             closeness_beyond=beyond,
             peak=jnp.maximum(state.peak, stage.peak),
             peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
-            error=jnp.where(higher, off / jnp.where(steepness > 0, steepness, 1.0), state.error),
+            error=jax.lax.stop_gradient(jnp.where(higher, off / jnp.where(steepness > 0, steepness, 1.0), state.error)),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
@@ -157,7 +157,7 @@ class TaylorStepper(AbstractStepper):
     def _rock(self, state: State, forcing, unit, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
         scene = self.scene
-        table, saddle = scene.table, scene.table.saddle
+        saddle = scene.table.saddle
         room = self.room(state) / unit
         angle = self.angle(state)
         coefficients = self.expand(state, angle, forcing, unit)
@@ -183,11 +183,7 @@ class TaylorStepper(AbstractStepper):
         if self.history:
             eventful = eventful | (rocking & (opening >= jnp.pi / 2))
 
-        # No forcing that is still to come can bring it back: restoring + ceiling arm < 0 from here on.
-        ceiling = scene.ceilings[state.piece]
-        escaped = (state.velocity >= 0) & state.beyond
-        escaped = escaped & (table.restoring(angle) + ceiling * table.arm(angle) <= 0)
-
+        escaped = self.escaped(state, angle)
         piece, local, over = self.move_on(state, length * unit, full)
         moved = (length > 0) & rocking
 

@@ -1,9 +1,13 @@
 """Where rocking solvers go wrong: small hops, grazing, tangential uplift, accumulation, the boundary, odd records."""
 
+import itertools
+
+import hard_cases
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hard_cases import KINDS, MODELS as NAMES
 
 import jaxrock as rk
 
@@ -299,3 +303,72 @@ def test_not_finite_is_a_status():
     broken = jax.tree.map(lambda x: x * jnp.nan, rk.SinePulse(0.5, 1.0))
     result = rk.outcome(rk.Block(0.2, 1.0), broken)
     assert result.status != rk.Status.successful
+
+
+# ---- The table, through both engines ----
+
+BOUNDS = {"series": 1e-11, "diffrax": 1e-7, "tight": 1e-10, "single": 1e-4}
+slow = pytest.mark.slow
+
+
+def tables():
+    """Engine, model, kind: the slow ones are those that only compile more of the same."""
+    quick = {("series", model, kind) for model in NAMES for kind in KINDS}
+    quick |= {("diffrax", "nonlinear", kind) for kind in KINDS} | {("diffrax", "linear", "sum")}
+    quick |= {("tight", "nonlinear", "sine"), ("single", "nonlinear", "sine")}
+    every = itertools.product(BOUNDS, NAMES, KINDS)
+    return [pytest.param(*parts, id="-".join(parts), marks=() if parts in quick else slow) for parts in every]
+
+
+@pytest.mark.parametrize("engine, model, kind", tables())
+def test_table(engine, model, kind):
+    """Every case is answered within its bound, with an honest error; refused, or answered with an error that tells
+    enough, only where the table allows it."""
+    cases = [case for case in hard_cases.CASES if case.kind == kind and model in case.models]
+    cases = [case for case in cases if case.single or engine != "single"]
+    known = [hard_cases.answers()[hard_cases.key(case, model)] for case in cases]
+    scenes = [(row["scene"][0], row["scene"][2], row["scene"][3]["initial"]) for row in known]
+    dtype = np.float32 if engine == "single" else np.float64
+    found = hard_cases.outcomes(kind, model, hard_cases.engines()[engine], scenes, dtype)
+    wrong = []
+    for i, (case, row) in enumerate(zip(cases, known)):
+        lane, may_refuse = {name: values[i] for name, values in found.items()}, engine in case.refused
+        if lane["successful"]:
+            bound = np.inf if may_refuse else BOUNDS[engine]
+            fault = hard_cases.judge(row, lane, bound, counted=not may_refuse)
+        else:
+            fault = "" if may_refuse else "refused"
+        wrong += [f"{case.name}: {fault}"] if fault else []
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_table_has_answers():
+    """Names are unique, the answers are those of the scenes in the table, and none is left over."""
+    scenes = {hard_cases.key(c, model): hard_cases.scene(c, model) for c in hard_cases.CASES for model in c.models}
+    assert len(scenes) == sum(len(case.models) for case in hard_cases.CASES) > 300
+    assert set(scenes) == set(hard_cases.answers())
+    for name, (block, kind, numbers, options) in scenes.items():
+        its_block, its_kind, its_numbers, its_options = hard_cases.answers()[name]["scene"]
+        assert its_kind == kind and its_options["model"] == options["model"]
+        stored = its_block + its_numbers + its_options["initial"]
+        np.testing.assert_allclose(stored, block + numbers + options["initial"], rtol=1e-15)
+
+
+def test_the_judge_sees_errors():
+    """What is wrong by more than the bound is found, in each number."""
+    known = hard_cases.answers()["several excursions (nonlinear)"]
+    good = {"max_rotation": np.float64(known["peak"]), "impact_count": known["impacts"], "overturned": False}
+    good |= {"margin": 0.5, "error": 1e-15}
+    bound = 1e-11
+    assert hard_cases.judge(known, good, bound) == ""
+    off = bound * known["condition"] * 0.2
+    spoilt = {
+        "verdict": {"overturned": True},
+        "margin": {"margin": -0.5},
+        "impacts": {"impact_count": known["impacts"] + 1},
+        "peak": {"max_rotation": good["max_rotation"] + 1.1 * off, "error": 1.0},
+        "error": {"max_rotation": good["max_rotation"] + 0.9 * off},
+    }
+    for name, change in spoilt.items():
+        assert hard_cases.judge(known, good | change, bound).startswith(name)
+    assert hard_cases.judge(known, good | {"max_rotation": np.float64("nan")}, bound).startswith("peak")
