@@ -9,17 +9,16 @@ needs a turning point. Knots end arcs, so that the right-hand side of every solv
 """
 
 from dataclasses import replace
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engine import AbstractEngine, AbstractStepper, either
+from jaxrock.guards import LONGEST, ORDER, Arc, Forcing, Illinois, field, first_guard, first_step, usual_step
 from jaxrock.models import Angle
 from jaxrock.scene import Scene
 from jaxrock.state import State
@@ -29,8 +28,6 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
-_ORDER = 12  # of the motion's series, for waiting and for coming to rest
-_LONGEST = 0.5  # step of the default controller, in 1/p
 _SHARE = 4  # usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace
 _MOST_STEPS = 4096  # of one solve
 
@@ -51,7 +48,7 @@ class Diffrax(AbstractEngine):
     - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits.
     - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is
       only what it is trusted to keep.
-    - `adjoint`: `diffrax.RecursiveCheckpointAdjoint()` (the default: reverse mode), `diffrax.ForwardMode()`, or
+    - `adjoint`: `diffrax.ForwardMode()` (the default), `diffrax.RecursiveCheckpointAdjoint()` for reverse mode, or
       `diffrax.DirectAdjoint()` (both, slower).
     - `max_solves`: budget of solves, each of one arc or a part of it; None takes 4,096 and four per piece of
       the motion.
@@ -63,7 +60,7 @@ class Diffrax(AbstractEngine):
     rtol: float = eqx.field(static=True, default=1e-8)
     atol: float | None = eqx.field(static=True, default=None)
     controller: diffrax.AbstractStepSizeController | None = eqx.field(static=True, default=None)
-    adjoint: diffrax.AbstractAdjoint = eqx.field(static=True, default=diffrax.RecursiveCheckpointAdjoint())
+    adjoint: diffrax.AbstractAdjoint = eqx.field(static=True, default=diffrax.ForwardMode())
     max_solves: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -95,159 +92,8 @@ class Diffrax(AbstractEngine):
             return self.controller
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        longest = jax.lax.stop_gradient(jnp.minimum(_LONGEST, scene.p * scene.scales[piece]))
+        longest = jax.lax.stop_gradient(jnp.minimum(LONGEST, scene.p * scene.scales[piece]))
         return diffrax.PIDController(rtol=self.rtol, atol=jax.lax.stop_gradient(atol), dtmax=longest)
-
-
-class _Bracket(eqx.Module):
-    lower: Scalar
-    upper: Scalar
-    at_lower: Scalar
-    at_upper: Scalar
-    count: Int[Array, ""]
-
-
-class Illinois(optx.AbstractRootFinder):
-    """Root of a function that is positive at `lower` and not at `upper`: false position with Illinois's weights,
-    and bisection whenever that has not at least quartered the bracket in three steps."""
-
-    rtol: float
-    atol: float
-    norm: Any = eqx.field(static=True, default=jnp.abs)
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """The bracket of the last step."""
-        lower, upper = (jnp.asarray(options[name], f_struct.dtype) for name in ("lower", "upper"))
-        return _Bracket(lower, upper, fn(lower, args)[0], fn(upper, args)[0], jnp.array(0))
-
-    def step(self, fn, y, args, options, state, tags):
-        """One evaluation."""
-        bisect = state.count % 3 == 2
-        share = state.at_lower / (state.at_lower - state.at_upper)
-        share = jnp.where(bisect | ~(share > 0) | ~(share < 1), 0.5, share)
-        x = state.lower + share * (state.upper - state.lower)
-        value, aux = fn(x, args)
-        above = value > 0
-        # The end that stays is weighted down, so that it moves next time.
-        state = _Bracket(
-            lower=jnp.where(above, x, state.lower),
-            upper=jnp.where(above, state.upper, x),
-            at_lower=jnp.where(above, value, jnp.where(bisect, 1.0, 0.5) * state.at_lower),
-            at_upper=jnp.where(above, jnp.where(bisect, 1.0, 0.5) * state.at_upper, value),
-            count=state.count + 1,
-        )
-        return x, state, aux
-
-    def terminate(self, fn, y, args, options, state, tags):
-        """Whether the bracket is as small as rounding allows, or the root is met."""
-        small = state.upper - state.lower <= self.atol + self.rtol * jnp.abs(state.upper)
-        # A quantity that is only noise may have no root but the start.
-        return small | (state.at_upper == 0) | (state.at_lower <= 0) | (state.count >= 200), optx.RESULTS.successful
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """The last point."""
-        return y, aux, {}
-
-
-class _Arc(eqx.Module):
-    """The smooth problem of one arc, and its guards; time is p t since its start."""
-
-    scene: Scene
-    start: State
-    bend: Scalar  # acceleration at the start
-    jerk: Scalar  # its derivative
-    noise: Scalar  # what rounding may make of an acceleration that is zero
-    hop: Flag  # too small for its turning point to matter, and certain to come back
-    history: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, scene: Scene, start: State, history: bool) -> "_Arc":
-        zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
-        arc = cls(scene, start, zero, zero, zero, no, history)
-        y = jnp.stack([start.opening, start.velocity])
-        bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
-        # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
-        pull = scene.table.restoring_at_rest + jnp.abs(arc.push(zero)) * scene.table.arm_at_rest
-        noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
-        noise = jax.lax.stop_gradient(noise)
-        leaving = (start.opening == 0) & (start.velocity == 0)
-        bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
-        return cls(scene, start, bend, jerk, noise, no, history)
-
-    def push(self, time: Scalar) -> Scalar:
-        """Side times ground acceleration [g]."""
-        scene, start = self.scene, self.start
-        inner = jnp.minimum(start.piece, scene.pieces - 1)
-        value = scene.motion.series(inner, start.local + time / scene.p, 1 / scene.p, 0)[0]
-        return start.side * jnp.where(start.piece < scene.pieces, value, 0.0)
-
-    def acceleration(self, time: Scalar, y: Pair) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2."""
-        return self.scene.table.acceleration(Angle.of(y[0]), y[1], self.push(time))
-
-    def gap(self, opening: Scalar) -> Scalar:
-        """Opening angle beyond the saddle; zero where that is only rounding."""
-        gap = opening - self.scene.table.saddle
-        return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.scene.table.saddle, 0.0, gap)
-
-    @property
-    def horizon(self) -> Scalar:
-        """Time (p t) for which the acceleration of a block that leaves rest is only noise."""
-        return self.noise / jnp.maximum(self.jerk, self.noise)
-
-    def is_void(self, time: Scalar, y: Pair, event: Flag) -> Flag:
-        """Whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
-        leaving = (self.start.opening == 0) & (self.start.velocity == 0) & (self.bend == 0)
-        return leaving & ((self.jerk <= 0) | (event & (jnp.abs(y[1]) <= self.noise * time)))
-
-    def flow(self, time: Scalar, y: Pair) -> Pair:
-        """The right-hand side."""
-        return jnp.stack([y[1], self.acceleration(time, y)])
-
-    def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
-        """Ground, turning point, velocity extremum, saddle, certain loss, fallen flat: the first to reach zero ends
-        the arc. All start above zero."""
-        start, table = self.start, self.scene.table
-        ground = _guard(time, y[0], [start.opening, start.velocity, self.bend / 2, self.jerk / 6], True)
-        turn = _guard(time, y[1], [start.velocity, self.bend, self.jerk / 2], ~self.hop)
-        # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
-        rises = jnp.where(self.bend == 0, self.jerk >= 0, self.bend > 0)
-        along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
-        extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
-        saddle = _guard(time, y[0] - table.saddle, [self.gap(start.opening), start.velocity], True)
-        ceiling = self.scene.ceilings[start.piece]
-
-        def hold(x):
-            angle = Angle.of(x)
-            return table.restoring(angle) + ceiling * table.arm(angle)
-
-        held = hold(start.opening)
-        escape = _guard(time, hold(y[0]), [held], (ceiling > 0) & (held > 0))
-        flat = jnp.pi / 2 - y[0]
-        low = start.opening < jnp.pi / 2
-        flat = _guard(time, flat, [jnp.pi / 2 - start.opening], low & (self.history or self.scene.falls_flat))
-        return jnp.stack([ground, turn, extremum, saddle, escape, flat])
-
-
-def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag) -> Scalar:
-    """`value` over its leading term c t^m at the start, `jet` = its Taylor coefficients there; one at time 0."""
-    lead, power = jnp.ones_like(time), jnp.ones_like(time)
-    found = jnp.zeros_like(time, bool)
-    for m, c in enumerate(jet):
-        here = ~found & (c != 0)
-        lead = jnp.where(here, c, lead)
-        power = jnp.where(here, time**m, power)
-        found = found | here
-    later = found & (time > 0) & active
-    return jnp.where(later, value / jnp.where(later, lead * power, 1.0), 1.0)
-
-
-def _field(t, y, args: _Arc):
-    return args.flow(t, y)
-
-
-def _first_guard(t, y, args: _Arc, **kwargs):
-    return jnp.min(args.guards(t, y))
 
 
 class ArcStepper(AbstractStepper):
@@ -262,11 +108,11 @@ class ArcStepper(AbstractStepper):
     def advance(self, state: State) -> State:
         """One arc of a lane, or a wait at rest."""
         scene = self.scene
-        forcing, unit = scene.forcing(state.piece, state.local, _ORDER)
+        forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = self.wait(state, forcing, unit, _ORDER, eps, either)
-        rocked = self._rock(state, _steepest(forcing, unit), unit, ~resting)
+        waited = self.wait(state, forcing.terms, forcing.unit, ORDER, eps, either)
+        rocked = self._rock(state, forcing, ~resting)
         after = self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
             return after
@@ -288,31 +134,36 @@ class ArcStepper(AbstractStepper):
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
-        solution = self._solve(_Arc.of(self.scene, node, self.history), self.scene.p * elapsed, None)
+        solution = self._solve(
+            Arc.of(self.scene, node, Forcing.of(self.scene, node), self.history),
+            node.piece,
+            self.scene.p * elapsed,
+            None,
+        )
         opening, velocity = solution.ys[-1]
         return opening, velocity * self.scene.p
 
-    def _solve(self, arc: _Arc, length: Scalar, event: diffrax.Event | None):
+    def _solve(self, arc: Arc, piece: Int[Array, ""], length: Scalar, event: diffrax.Event | None):
         """The arc, for `length` (p t) at most."""
-        start, engine = arc.start, self.engine
-        length = jnp.where(start.side != 0, length, 0.0)
-        first = jnp.minimum(_first_step(arc, engine.rtol), length)
+        engine = self.engine
+        length = jnp.where(arc.side != 0, length, 0.0)
+        first = jnp.minimum(first_step(arc, engine.rtol), length)
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(_field),
+            diffrax.ODETerm(field),
             engine.solver,
             t0=jnp.zeros_like(length),
             t1=length,
             dt0=jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0)),
-            y0=jnp.stack([start.opening, start.velocity]),
+            y0=jnp.stack([arc.opening, arc.velocity]),
             args=arc,
-            stepsize_controller=engine.controller_for(self.scene, start.piece),
+            stepsize_controller=engine.controller_for(self.scene, piece),
             event=event,
             adjoint=engine.adjoint,
             max_steps=_MOST_STEPS,
             throw=False,
         )
 
-    def _is_hop(self, state: State, bend: Scalar, steepest: Scalar, unit: Scalar) -> Flag:
+    def _is_hop(self, state: State, bend: Scalar, forcing: Forcing) -> Flag:
         """Whether the block comes back to the ground at once, without a peak or a speed that matters.
 
         From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
@@ -322,26 +173,26 @@ class ArcStepper(AbstractStepper):
         table, v = self.scene.table, state.velocity
         back = jnp.where(bend < 0, -bend, 1.0)
         flight, height = 4 * v / (back * self.scene.p), v * v / back
-        change = steepest * flight * table.arm_at_rest + 2 * height * (1 + table.restoring_at_rest + back)
-        certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), 0.25 * unit))
+        change = forcing.steepest * flight * table.arm_at_rest + 2 * height * (1 + table.restoring_at_rest + back)
+        certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
         least = (table.restoring(Angle.of(jnp.minimum(height, table.saddle))) / table.restoring_at_rest) ** 2
         small = (height <= state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
         starts = (state.opening == 0) & (v > 0) & (bend < 0)
         return starts & certain & small & (not self.history)
 
-    def _rock(self, state: State, steepest: Scalar, unit: Scalar, rocking: Flag) -> State:
+    def _rock(self, state: State, forcing: Forcing, rocking: Flag) -> State:
         """Rocking: an arc up to its event, the knot, or the stop."""
         scene, engine = self.scene, self.engine
         lost = self.escaped(state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
-        share = _SHARE * jnp.minimum(_usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
+        share = _SHARE * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
-        arc = _Arc.of(scene, state, self.history)
-        arc = replace(arc, hop=self._is_hop(state, arc.bend, steepest, unit))
+        arc = Arc.of(scene, state, forcing, self.history)
+        arc = replace(arc, hop=self._is_hop(state, arc.bend, forcing))
         eps = float(jnp.finfo(scene.p.dtype).eps)
-        event = diffrax.Event(_first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
-        solution = self._solve(arc, length, event)
+        event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
+        solution = self._solve(arc, state.piece, length, event)
         time, y = solution.ts[-1], solution.ys[-1]
         void = rocking & arc.is_void(time, y, solution.event_mask)
         time = jnp.where(void, jnp.maximum(time, jnp.minimum(arc.horizon, length)), time)
@@ -360,7 +211,9 @@ class ArcStepper(AbstractStepper):
         piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
         steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
         off = engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
-        spread = self.spread_after(state, Angle.of(state.opening), arc.push(0.0), elapsed, (off[0], off[1]))
+        spread = self.spread_after(
+            state, Angle.of(state.opening), state.side * forcing.terms[0], elapsed, (off[0], off[1])
+        )
         moved = time > 0
         after = replace(
             state,
@@ -377,7 +230,7 @@ class ArcStepper(AbstractStepper):
         after = replace(after, side=jnp.where(void, 0.0, after.side))
         return self._happen(state, after, arc, (ground & ~void, turning, crossing), y, lost, solution.result)
 
-    def _happen(self, before: State, after: State, arc: _Arc, events, y: Pair, lost: Flag, result) -> State:
+    def _happen(self, before: State, after: State, arc: Arc, events, y: Pair, lost: Flag, result) -> State:
         """Let the event of an arc happen: peaks, margin, impact, verdict."""
         ground, turning, crossing = events
         scene = self.scene
@@ -385,12 +238,12 @@ class ArcStepper(AbstractStepper):
         bend = arc.acceleration((after.local - before.local) * scene.p, y)
         after = self.note(after, outward, turning, crossing, y[0], y[1], bend)
         quiet = before.piece >= scene.pieces
-        forcing, unit = scene.forcing(after.piece, after.local, _ORDER)
-        reach = jnp.minimum(self.room(after), 0.25 * unit)
-        after = self.impact(after, ground, y[1], forcing[0], _steepest(forcing, unit), reach)
+        forcing = Forcing.of(scene, after)
+        reach = jnp.minimum(self.room(after), forcing.reach)
+        after = self.impact(after, ground, y[1], forcing.terms[0], forcing.steepest, reach)
         down = after.opening >= jnp.pi / 2
-        overturned = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
-        overturned = overturned | down if scene.falls_flat else overturned
+        escaped = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
+        overturned = escaped | down if scene.falls_flat else escaped
         if not self.history:
             # The impact after the motion counts if the block is lost after it.
             decisive = (after.impact_time > scene.motion.end) & overturned
@@ -398,32 +251,11 @@ class ArcStepper(AbstractStepper):
         exhausted = result == diffrax.RESULTS.max_steps_reached
         failed = ~exhausted & ~diffrax.is_okay(result)
         balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.bend) <= arc.noise) & (before.side != 0)
-        status = Status.where(balanced, Status.undecided, after.status)
+        # Fallen flat at next to no speed: it may have turned back just before.
+        barely = scene.falls_flat & down & ~escaped
+        barely = barely & (y[1] ** 2 <= 2 * self.doubt * jnp.abs(bend) * after.spread.angle)
+        status = Status.where(balanced | barely, Status.undecided, after.status)
         status = Status.where(exhausted, Status.step_budget_exhausted, status)
         status = Status.where(failed, Status.solver_failed, status)
         ends = overturned & down if self.history else overturned
         return replace(after, overturned=overturned, status=status, done=after.done | ends | exhausted | failed)
-
-
-def _steepest(forcing: list[Scalar], unit: Scalar) -> Scalar:
-    """Bound of how fast the forcing changes within a quarter of the unit [g/s]."""
-    return sum((k * jnp.abs(c) * 0.25 ** (k - 1) for k, c in enumerate(forcing) if k > 0), start=0.0) / unit
-
-
-def _usual_step(rtol: float) -> float:
-    """Step (p t) that methods of order five take at this tolerance."""
-    return min(0.1 * (rtol / 1e-8) ** 0.2, _LONGEST)
-
-
-def _first_step(arc: _Arc, rtol: float) -> Scalar:
-    """A step (p t) that does not jump over a small hop: half the way back to the ground; a certain hop at once."""
-    start, bend = arc.start, arc.bend
-    x, v = start.opening, start.velocity
-    tiny = jnp.finfo(x.dtype).tiny
-    back = jnp.maximum(-bend, tiny)
-    root = jnp.sqrt(v * v + 2 * back * x)
-    to_ground = jnp.where(v > 0, (v + root) / back, 2 * x / jnp.maximum(root - v, tiny))
-    # Where the deceleration is only just beginning, it is its growth that turns the block back.
-    to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.jerk, tiny))
-    usual = jnp.minimum(_usual_step(rtol), jnp.where(to_turn > 0, 4 * to_turn, jnp.inf))
-    return jnp.where(to_ground > 0, jnp.minimum(jnp.where(arc.hop, 1.1, 0.5) * to_ground, usual), usual)

@@ -207,8 +207,9 @@ class AbstractStepper(eqx.Module):
         higher = turning & outward
         first = higher & surpasses(opening, state.peak)
         # Turning back just above the ground, within the error of the angle: there may have been an impact.
-        grazing = turning & ~outward & (opening <= 4 * state.spread.angle)
-        graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(bend) * state.spread.angle), 0.0)
+        off = jnp.abs(opening) + state.spread.angle
+        grazing = turning & ~outward & (off <= 32 * state.spread.angle)
+        graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(bend) * off), 0.0)
         # Standing still in balance, within the error of the state along which it leaves.
         balanced = (turning | crossing) & (jnp.hypot(speed, pull) <= self.doubt * state.spread.along(1.0, 1.0))
         if self.scene.falls_flat:

@@ -12,11 +12,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxrock._checks import Values, as_real, positive
 from jaxrock._progress import Progress
 from jaxrock.block import Block
+from jaxrock.engine import AbstractEngine
 from jaxrock.models import Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.pulses import SinePulse
 from jaxrock.response import Outcome, outcome
-from jaxrock.series import Series
 from jaxrock.status import Status
 
 _LANES = 64  # neighbours that step together; more would not fit the first cache
@@ -78,7 +78,7 @@ def rocking_spectrum(
     restitution: ArrayLike | None = None,
     model: Model = Housner(),
     *,
-    engine: Series | None = None,
+    engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
     """Peak response of blocks of one slenderness and every size under one motion.
@@ -114,7 +114,7 @@ def self_similar_spectrum(
     restitution: ArrayLike | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: Model = Housner(),
-    engine: Series | None = None,
+    engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
     """Peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
@@ -150,7 +150,7 @@ def overturning_map(
     restitution: ArrayLike | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: Model = Housner(),
-    engine: Series | None = None,
+    engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> OverturningMap:
     """Who overturns under a pulse, over its frequency and intensity.
@@ -214,7 +214,7 @@ def _spectrum(abscissa, found: Outcome, scale) -> Spectrum:
 
 
 @functools.lru_cache(maxsize=32)
-def _under_motion(model: Model, engine: Series | None) -> Callable:
+def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
     def one(period, scene):
         alpha, motion, restitution = scene
         return outcome(Block(alpha, 2 * jnp.pi / period, restitution), motion, model, engine=engine)
@@ -223,7 +223,7 @@ def _under_motion(model: Model, engine: Series | None) -> Callable:
 
 
 @functools.lru_cache(maxsize=32)
-def _under_pulse(pulse: Callable, model: Model, engine: Series | None) -> Callable:
+def _under_pulse(pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
     def one(intensity, ratio, scene):
         alpha, restitution = scene
         block = Block(alpha, jnp.ones_like(alpha), restitution)
