@@ -359,6 +359,7 @@ def picture(results):
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     figure, panels = plt.subplots(2, 2, figsize=(11, 9), sharex=True, layout="constrained")
     for panel, (name, title) in zip(panels.ravel(), PROBLEMS.items()):
@@ -372,7 +373,14 @@ def picture(results):
         silent = [f"{x['label'].split()[-1]} {x['setting']}" for x in results[name] if x["error"] is None]
         if silent:
             panel.text(0.02, 0.02, "refused altogether:\n" + "\n".join(silent), transform=panel.transAxes, fontsize=8)
-        panel.set(xscale="log", yscale="log", title=title)
+        for point in results[name]:
+            if point["label"] == "series" and point["error"] is not None:
+                order = int(point["setting"].split()[1].rstrip(","))
+                at, where = (max(point["error"], FLOOR), point["time"]), {12: (-8, 6), 20: (8, 6)}.get(order, (0, -14))
+                panel.annotate(str(order), at, where, textcoords="offset points", ha="center", fontsize=8)
+        times = [point["time"] for point in results[name] if point["error"] is not None]
+        panel.set(xscale="log", yscale="log", title=title, ylim=(min(times) / 2.0, max(times) * 1.5))
+        panel.yaxis.set_minor_formatter(NullFormatter())
         panel.grid(True, which="major", color="0.85")
         panel.set_axisbelow(True)
     for panel in panels[1]:
@@ -416,8 +424,9 @@ Written by `python benchmarks/work_precision.py`.
 
 Errors are the largest over the scenes of a problem, against 40-digit Taylor series; times are the mean over the scenes
 of the least of several runs of one compiled response, float64. What an engine refuses (a status other than successful)
-counts neither as an error nor as an answer; hollow marks in the picture are points with refusals. The SciPy loop never
-refuses; its record is cut at the samples, its absolute tolerance is a hundredth of the relative one.
+counts neither as an error nor as an answer; hollow marks in the picture are points with refusals, the small numbers are
+orders of the series. The SciPy loop never refuses; its record is cut at the samples, its absolute tolerance is a
+hundredth of the relative one.
 
 ## Sine pulses in a batch
 

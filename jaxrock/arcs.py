@@ -103,7 +103,7 @@ class ArcStepper(AbstractStepper):
     stop: Scalar
     history: bool = eqx.field(static=True)
     engine: Diffrax
-    doubt: float = eqx.field(static=True, default=2.0)  # a tolerance is more than the error that it leaves
+    doubt: float = eqx.field(static=True, default=1.0)  # the estimate is generous
 
     def advance(self, state: State) -> State:
         """One arc of a lane, or a wait at rest."""
@@ -210,7 +210,7 @@ class ArcStepper(AbstractStepper):
         full = ~happened & whole
         piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
         steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
-        off = engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
+        off = 2.5 * engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
         spread = self.spread_after(
             state, Angle.of(state.opening), state.side * forcing.terms[0], elapsed, (off[0], off[1])
         )

@@ -83,15 +83,19 @@ def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Sca
     return horner(_falls(coefficients, sign, order), length)
 
 
-def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
-    """Step at which the last coefficients drop below `size`, at most `cap`.
+def last_size(coefficients: list[Scalar]) -> Scalar:
+    """Size of the last coefficients.
 
-    Where the large coefficients are every second or third (a resonance, a steep ramp), the last two may both be
-    small: those before count, too, with a weight that does not matter for others.
+    Where the large ones are every second or third (a resonance, a steep ramp), the last two may both be small: those
+    before count, too, with a weight that does not matter for others.
     """
-    order = len(coefficients) - 1
     last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
-    last = jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
+    return jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
+
+
+def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
+    """Step at which the last coefficients drop below `size`, at most `cap`."""
+    order, last = len(coefficients) - 1, last_size(coefficients)
     tiny = jnp.finfo(last.dtype).tiny
     ratio = size / jnp.maximum(last, tiny)
     if order & (order - 1) == 0:  # a power of two: repeated square roots vectorise

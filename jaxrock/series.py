@@ -25,6 +25,7 @@ from jaxrock.polynomial import (
     first_event,
     jet,
     keeps_sign,
+    last_size,
     rescaled,
     step_length,
 )
@@ -187,9 +188,12 @@ class TaylorStepper(AbstractStepper):
         piece, local, over = self.move_on(state, length * unit, full)
         moved = (length > 0) & rocking
 
+        rounded, missed = self.tolerance * size, last_size(coefficients) * length**self.order
+        time = jnp.where(length > 0, length * stretch, jnp.inf)
+        step = rounded + missed, rounded + missed * jnp.maximum(self.order / time, 1.0)
+
         def spread_at(elapsed):
-            step = self.tolerance * size
-            return self.spread_after(state, angle, state.side * forcing[0], elapsed, (step, step))
+            return self.spread_after(state, angle, state.side * forcing[0], elapsed, step)
 
         passed = replace(
             state,

@@ -17,11 +17,14 @@ MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
 model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 
 
+@pytest.mark.parametrize("engine", [rk.Series(), rk.Diffrax(rtol=1e-8)], ids=["series", "diffrax"])
 @pytest.mark.parametrize("start", [1e-8, 1e-6, 1e-4, 1e-2, 0.5, 0.999, 1 - 1e-9])
-def test_free_rocking_in_closed_form(start):
+def test_free_rocking_in_closed_form(start, engine):
     """Impact times and velocities of a freely rocking linear block from hops of 1e-8 to the brink (Housner 1963)."""
     alpha, p, e = 0.2, 1.7, 0.9
-    response = rk.simulate(rk.Block(alpha, p, e), STILL, rk.Linear(), initial=(start * alpha, 0.0), duration=60.0)
+    loose = isinstance(engine, rk.Diffrax)
+    initial = (start * alpha, 0.0)
+    response = rk.simulate(rk.Block(alpha, p, e), STILL, rk.Linear(), initial=initial, duration=60.0, engine=engine)
     energy = start * (2 - start)  # over that of the saddle
     times, speeds = (
         [np.arccosh(1 / (1 - start)) / p if start > 0.5 else np.arctanh(np.sqrt(energy)) / p],
@@ -36,9 +39,11 @@ def test_free_rocking_in_closed_form(start):
     assert found == 30 or start < 1e-4  # hops lower than the tolerance are rest
     assert found > 3
     # Near the brink the first time is as uncertain as the distance to it.
-    tolerance = 1e-11 + 1e-15 / (1 - start)
+    tolerance = (1e-7 if loose else 1e-11) + (1e-8 if loose else 1e-15) / (1 - start)
     np.testing.assert_allclose(response.impact_times[:found], np.array(times)[:found], rtol=tolerance)
-    np.testing.assert_allclose(response.impact_velocities[:found], (sign * speeds)[:found], rtol=1e-10)
+    np.testing.assert_allclose(
+        response.impact_velocities[:found], (sign * speeds)[:found], rtol=1e-7 if loose else 1e-10
+    )
 
 
 @model
