@@ -490,9 +490,9 @@ def page_report():
         header += [name, "ms"]
     counts = ", ".join(f"{name} refuses {count}" for name, count in refused.items())
     return f"""{len(rows)} scenes: {wrong} wrong; {counts}. An entry is the error of peak/alpha; "diffrax"
-is `Diffrax(rtol=1e-8)`, "tight" is `Diffrax(rtol=1e-12)`. Times are of one response, compiled, float64. The judge is that
-of `tests/hard_cases.py`: verdict, margin, impacts, peak, and the estimate of its error; cases that an engine may refuse
-are on the edge for it, and then only verdict and estimate count.
+is `Diffrax(rtol=1e-8)`, "tight" is `Diffrax(rtol=1e-12)`. Times are of one response, compiled, float64.
+The judge is that of `tests/hard_cases.py`: verdict, margin, impacts, peak, and the estimate of its error;
+cases that an engine may refuse are on the edge for it, and then only verdict and estimate count.
 
 {table(header, rows)}
 """
