@@ -1,5 +1,6 @@
 """All tests run in double precision."""
 
+import gc
 import json
 from pathlib import Path
 
@@ -9,6 +10,16 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True)
+def few_compiled_programs():
+    """Forget compiled programs before they are too many: each maps pages, and past 65,530 maps XLA crashes on Linux."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
