@@ -18,7 +18,7 @@ from jaxrock._keep import keep
 from jaxrock.models import Angle
 from jaxrock.polynomial import Watch, first_event, rescaled, step_length
 from jaxrock.scene import Scene
-from jaxrock.spread import Spread
+from jaxrock.spread import GRAZING, Spread
 from jaxrock.state import State, surpasses
 from jaxrock.status import Status
 
@@ -208,7 +208,7 @@ class AbstractStepper(eqx.Module):
         first = higher & surpasses(opening, state.peak)
         # Turning back just above the ground, within the error of the angle: there may have been an impact.
         off = jnp.abs(opening) + state.spread.angle
-        grazing = turning & ~outward & (off <= 32 * state.spread.angle)
+        grazing = turning & ~outward & (off <= GRAZING * state.spread.angle)
         graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(bend) * off), 0.0)
         # Standing still in balance, within the error of the state along which it leaves.
         balanced = (turning | crossing) & (jnp.hypot(speed, pull) <= self.doubt * state.spread.along(1.0, 1.0))

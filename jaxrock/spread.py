@@ -11,6 +11,9 @@ from jaxtyping import ArrayLike, Bool, Inexact
 
 Scalar = Inexact[ArrayLike, ""]
 
+# Standard errors of the angle within which a touch of the ground may be a miss, and a miss a touch.
+GRAZING = 32.0
+
 
 class Spread(eqx.Module):
     """Variances and covariance of the errors of opening angle and velocity (per p t) [rad^2]."""
@@ -72,9 +75,12 @@ class Spread(eqx.Module):
         """Errors after an impact at `speed` < 0, with the opening's accelerations before and after it.
 
         The saltation matrix [[e, 0], [-(after + e before)/speed, e]]. An impact so gentle that it may not happen
-        at all is as uncertain as a fall through the error of the angle.
+        at all is as uncertain as a fall through the error of the angle; one that an outward acceleration may have
+        prevented is as uncertain as its own change of velocity.
         """
         kick = -(after + restitution * before)
         gentle = jnp.sqrt(jnp.abs(kick) * self.angle)
-        speed = jnp.minimum(jnp.minimum(speed, -gentle), -1e-18)
-        return self._through(restitution, 0.0, kick / speed, restitution)
+        bounded = jnp.minimum(jnp.minimum(speed, -gentle), -1e-18)
+        missed = speed**2 <= 2 * GRAZING * jnp.maximum(before, 0.0) * self.angle
+        spread = self._through(restitution, 0.0, kick / bounded, restitution)
+        return spread.plus(0.0, jnp.where(missed, (1 + restitution) * jnp.abs(speed), 0.0))

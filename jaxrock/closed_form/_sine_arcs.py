@@ -1,0 +1,146 @@
+"""The linear block under one cycle of a sine, arc by arc: each arc in closed form, each impact a root in a bracket.
+
+On one side the opening y (rotation over alpha, positive) obeys y'' = y - 1 - s a sin(angle). Where the right-hand
+side without y has one sign, y has at most two zeros, because the operator y'' - y is disconjugate: none inside a
+restoring stretch that starts and ends above ground, and at most one dip, found at the zero of the velocity, in a
+stretch that drives the block outward. So no impact is missed, whatever its size.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxrock._roots import search_root
+
+Real = Float[Array, "..."]
+
+_MOST_PIECES = 4000
+
+
+class Lane(eqx.Module):
+    """Where the block is; speeds are outward and per p t."""
+
+    angle: Real  # of the sine
+    side: Real  # of the rotation
+    opening: Real
+    speed: Real
+    impacts: Int[Array, "..."]
+    done: Bool[Array, "..."]
+
+
+def arc(time: Real, lane: Lane, intensity: Real, ratio: Real) -> tuple[Real, Real]:
+    """Opening and speed a time after `lane`; D&D 3.4 with the cancellations written out."""
+    push = lane.side * intensity / (1 + ratio**2)
+    sine, cosine = push * jnp.sin(lane.angle), push * jnp.cos(lane.angle)
+    phase = ratio * time
+    sinh, cosh, rise = jnp.sinh(time), jnp.cosh(time), 2 * jnp.sinh(time / 2) ** 2
+    turn = 2 * jnp.sin(phase / 2) ** 2
+    opening = lane.opening * cosh + lane.speed * sinh - rise - sine * (rise + turn)
+    opening -= cosine * (ratio * sinh - jnp.sin(phase))
+    speed = lane.opening * sinh + lane.speed * cosh - sinh - sine * (sinh + ratio * jnp.sin(phase))
+    speed -= cosine * ratio * (rise + turn)
+    return opening, speed
+
+
+def start(intensity: Real) -> Lane:
+    """Uplift: the sine is first at the threshold."""
+    zero = jnp.zeros_like(intensity)
+    count = jnp.zeros(intensity.shape, jnp.int32)
+    return Lane(uplift_phase(intensity), zero - 1, zero, zero, count, zero > 0)
+
+
+def uplift_phase(intensity: Real) -> Real:
+    """psi; D&D 3.3."""
+    return jnp.arctan2(1.0, jnp.sqrt((intensity - 1) * (intensity + 1)))
+
+
+def follow(intensity: Real, ratio: Real, restitution: Real) -> Lane:
+    """The state at the end of the pulse; not `done` where the impacts were too many to follow."""
+
+    def going(carry):
+        lane, count = carry
+        return jnp.any(~lane.done) & (count < _MOST_PIECES)
+
+    def step(carry):
+        lane, count = carry
+        new = _next(lane, intensity, ratio, restitution)
+        return jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane), count + 1
+
+    return jax.lax.while_loop(going, step, (start(intensity), 0))[0]
+
+
+def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
+    """To the next impact, or to the next change of sign of the driving."""
+    psi = uplift_phase(intensity)
+    on, off = (jnp.where(lane.side < 0, angle, jnp.pi + angle) for angle in (psi, jnp.pi - psi))
+    end = 2 * jnp.pi + 0 * psi
+    edge = jnp.where(lane.angle < on, on, jnp.where(lane.angle < off, off, end))
+    driven = (lane.angle >= on) & (lane.angle < off)
+    span = (edge - lane.angle) / ratio
+    opening, speed = arc(span, lane, intensity, ratio)
+
+    # A dip of a driven block: its speed is zero at the lowest point.
+    dips = driven & (lane.speed < 0) & (speed > 0)
+    lowest = jax.lax.cond(
+        jnp.any(dips),
+        lambda: search_root(lambda t: arc(t, lane, intensity, ratio)[1], 0 * span, jnp.where(dips, span, 0.0)),
+        lambda: span,
+    )
+    lowest = jnp.where(dips, lowest, span)
+    down = arc(lowest, lane, intensity, ratio)[0] <= 0
+    hit = down & jnp.where(driven, lane.speed < 0, True)
+
+    # From an impact on, opening over time has no zero at the start.
+    grounded = lane.opening == 0
+
+    def height(time):
+        value = arc(time, lane, intensity, ratio)[0]
+        late = grounded & (time > 0)
+        return jnp.where(late, value / jnp.where(late, time, 1.0), jnp.where(grounded, lane.speed, value))
+
+    time = search_root(height, 0 * span, jnp.where(hit, lowest, 0.0))
+    arrival = -arc(time, lane, intensity, ratio)[1]
+    landed = Lane(
+        angle=lane.angle + ratio * time,
+        side=-lane.side,
+        opening=0 * opening,
+        speed=jnp.maximum(restitution * arrival, 0.0),
+        impacts=lane.impacts + 1,
+        done=lane.done,
+    )
+    passed = Lane(edge, lane.side, jnp.maximum(opening, 0.0), speed, lane.impacts, edge >= end)
+    new = jax.tree.map(lambda a, b: jnp.where(hit, a, b), landed, passed)
+    return _rested(new, hit, intensity, ratio, restitution, psi)
+
+
+def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, psi: Real) -> Lane:
+    """Put a block that has come to rest, or will before the ground can help, to where it uplifts next."""
+    sine = intensity * jnp.sin(lane.angle)
+    # Between the two driving stretches, at least this restoring; hops end after 2 speed/(restoring (1 - e)).
+    first = lane.angle < jnp.pi
+    until = jnp.where(first, 2 * jnp.pi - lane.angle, (lane.angle + jnp.pi + psi) / 2)
+    restoring = 1 - intensity * jnp.abs(jnp.sin(jnp.where(first, lane.angle, until)))
+    room = (until - lane.angle) / ratio
+    between = (lane.angle >= jnp.pi - psi) & (lane.angle < jnp.pi + psi)
+    settles = between & (restoring > 0) & (4 * lane.speed < room * restoring * (1 - restitution))
+    settles &= lane.speed < 0.1 * restoring
+    at_rest = hit & (settles | (lane.speed == 0))
+    again = jnp.where(jnp.abs(sine) > 1, lane.angle, jnp.pi + psi)
+    # After the last driving stretch the ground only calms down: a slow block is safe.
+    over = hit & (lane.angle >= 2 * jnp.pi - psi) & (lane.speed <= 0.5 * (1 + jnp.minimum(sine, 0.0)))
+    return Lane(
+        angle=jnp.where(at_rest, again, lane.angle),
+        side=jnp.where(at_rest, jnp.where(sine > 1, -1.0, 1.0), lane.side),
+        opening=lane.opening,
+        speed=jnp.where(at_rest, 0.0, lane.speed),
+        impacts=lane.impacts,
+        done=lane.done | over,
+    )
+
+
+def growth(lane: Lane, restitution: Real) -> Real:
+    """Positive where the block overturns after the pulse: at once, or after one more impact."""
+    directly = lane.opening + lane.speed - 1
+    arrival = jnp.sqrt(jnp.maximum(lane.speed**2 + lane.opening * (2 - lane.opening), 0.0))
+    return jnp.maximum(directly, restitution * arrival - 1)

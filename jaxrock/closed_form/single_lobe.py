@@ -1,0 +1,389 @@
+"""The single-lobe pulse in closed form: the linear block under one hump of any shape, from rectangle to spike.
+
+Everything is dimensionless. `uplift_strength` is g alpha/A_g (1/intensity): below 1 the block uplifts.
+`pulse_duration` is p t_d. `shape` runs from -inf (rectangle) through 0 (triangle) to +inf (spike, under which
+nothing moves). Times are in t_d, rotations in alpha, velocities in p alpha. As in the paper, and other than in the
+rest of jaxrock, a positive pulse drives positive rotation. Arguments broadcast; all is smooth in all of them.
+
+The motion is written with divided differences of the exponential in place of the paper's sums, so that it has no
+singularities at shape 0 and duration 2 |shape|, and nothing cancels.
+
+**Source:** Voyagaki, Psycharis & Mylonakis (2012), "V" below.
+"""
+
+import enum
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Inexact, Int
+
+from jaxrock._checks import elementwise, not_nan, positive
+from jaxrock._exponential import exponential_difference, growth_ratio, logarithm_ratio
+from jaxrock._roots import bracketed_root
+
+Real = Inexact[ArrayLike, "..."]
+Result = Float[Array, "..."]
+
+_MOST_SHAPE = 1e17  # from here on the pulse is its limit to rounding
+_STEEP = 30.0  # from here on exponentials of -shape are added in other places
+
+
+class Region(enum.IntEnum):
+    """What becomes of a block, as in V figures 3.1 to 3.3."""
+
+    overturns_while_rising = 1  # O1: past alpha before the pulse has its peak
+    overturns_while_falling = 2  # O2: past alpha before the pulse ends
+    overturns_after = 3  # O3
+    peaks_after = 4  # S2: safe, largest rotation after the pulse
+    peaks_during = 5  # S1: safe, largest rotation while the pulse falls
+    at_rest = 6  # never uplifts
+
+
+_elementwise = elementwise(uplift_strength=positive, pulse_duration=positive, shape=not_nan, time=not_nan)
+
+
+@_elementwise
+def pulse(time: Real, shape: Real) -> Result:
+    """Ground acceleration over its peak.
+
+    **Arguments:**
+
+    - `time`: in t_d; outside [0, 1] the ground is quiet.
+    - `shape`: from -inf to +inf.
+
+    **Source:** V 2.1.
+    """
+    shape = _clipped(shape)
+    foot = jnp.clip(jnp.minimum(time, 1 - time), 0.0, 0.5)  # distance from the nearer foot
+    up, down = _parts(shape)
+    falling = 2 * foot * growth_ratio(2 * down * foot) / growth_ratio(down)
+    rising = 2 * foot * jnp.exp(-up * (1 - 2 * foot)) * growth_ratio(-2 * up * foot) / growth_ratio(-up)
+    inside = (time > 0) & (time < 1)
+    # At -inf the hump has vertical sides, at +inf it has no width.
+    return jnp.where(inside, jnp.where(shape > 0, rising, falling), 0.0)
+
+
+@_elementwise
+def uplift_time(uplift_strength: Real, shape: Real) -> Result:
+    """When the block uplifts [t_d]; inf where it does not.
+
+    **Source:** V 2.4.
+    """
+    time, _ = _uplift(uplift_strength, _clipped(shape))
+    return jnp.where(uplift_strength < 1, time, jnp.inf)
+
+
+@_elementwise
+def safety_wall(pulse_duration: Real, shape: Real) -> Result:
+    """The uplift strength below which a block overturns, whatever its restitution.
+
+    **Arguments:**
+
+    - `pulse_duration`: p t_d, positive.
+    - `shape`: from -inf to +inf.
+
+    **Source:** V 3.12, 3.13, 3.14, in one form that holds for every shape.
+    """
+    return _safety_wall(pulse_duration, _clipped(shape))
+
+
+@_elementwise
+def rising_wall(pulse_duration: Real, shape: Real) -> Result:
+    """The uplift strength below which a block is past alpha before the pulse has its peak: between O1 and O2.
+
+    **Source:** V 3.8b, 3.9b, 3.10b.
+    """
+    shape = _clipped(shape)
+    return _strength_where(_at_middle, pulse_duration, shape)
+
+
+@_elementwise
+def falling_wall(pulse_duration: Real, shape: Real) -> Result:
+    """The uplift strength below which a block is past alpha before the pulse ends: between O2 and O3.
+
+    **Source:** V 3.8a (without the term -f^2 that is printed on its right), 3.9a, 3.10a corrected.
+    """
+    shape = _clipped(shape)
+    return _strength_where(_at_end, pulse_duration, shape)
+
+
+@_elementwise
+def peak_border(pulse_duration: Real, shape: Real) -> Result:
+    """The uplift strength with which a block has its largest rotation just as the pulse ends: between S2 and S1.
+
+    **Source:** V 3.15a at time 1.
+    """
+    shape = _clipped(shape)
+
+    def velocity(strength, duration, shape):
+        return _at_end(strength, duration, shape)[1]
+
+    wall = _safety_wall(pulse_duration, shape)
+    return bracketed_root(velocity, wall, jnp.ones_like(wall), pulse_duration, shape)
+
+
+@_elementwise
+def rotation(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+    """Rotation over alpha, from the start of the pulse to the block's first return to the ground.
+
+    **Arguments:**
+
+    - `time`: in t_d.
+    - `uplift_strength`: g alpha/A_g, positive.
+    - `pulse_duration`: p t_d, positive.
+    - `shape`: from -inf to +inf.
+
+    **Returns:** theta/alpha; not a number after the first return, from where it depends on the restitution:
+    ask an engine.
+
+    **Source:** V 3.2, 3.4, 3.6.
+    """
+    angle, _ = _history(time, uplift_strength, pulse_duration, _clipped(shape))
+    return angle
+
+
+@_elementwise
+def velocity(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+    """Angular velocity over p alpha, with the arguments of `rotation`.
+
+    **Source:** V 3.3, 3.5, 3.7.
+    """
+    _, speed = _history(time, uplift_strength, pulse_duration, _clipped(shape))
+    return speed
+
+
+@_elementwise
+def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+    """When the rotation is largest [t_d]: inf for a block that overturns, 1/2 (the limit) for one that stays at rest.
+
+    **Source:** V 3.15a, 3.15b, 3.16, 3.17a and b corrected.
+    """
+    time, _ = _peak(uplift_strength, pulse_duration, _clipped(shape))
+    return time
+
+
+@_elementwise
+def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Result:
+    """The largest rotation over alpha, whatever the restitution: inf for a block that overturns.
+
+    **Arguments:** as in `rotation`.
+
+    The first peak is the largest: a pulse of one sign that has passed its peak gives back less at each
+    excursion than the impact before it has taken.
+
+    **Source:** V 3.2 at the time of 3.15; 3.18.
+    """
+    _, angle = _peak(uplift_strength, pulse_duration, _clipped(shape))
+    return angle
+
+
+@_elementwise
+def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Array, "..."]:
+    """What becomes of the block: one of the numbers in `Region`.
+
+    **Source:** V figures 3.1 to 3.3.
+    """
+    shape = _clipped(shape)
+    rising = _strength_where(_at_middle, pulse_duration, shape)
+    falling = _strength_where(_at_end, pulse_duration, shape)
+    wall = _safety_wall(pulse_duration, shape)
+    speed = _at_end(jnp.minimum(uplift_strength, 1.0), pulse_duration, shape)[1]
+    choices = [
+        (uplift_strength < rising, Region.overturns_while_rising),
+        (uplift_strength < falling, Region.overturns_while_falling),
+        (uplift_strength < wall, Region.overturns_after),
+        (uplift_strength >= 1, Region.at_rest),
+        (speed > 0, Region.peaks_after),
+    ]
+    return jnp.select([c for c, _ in choices], [jnp.full(wall.shape, int(r)) for _, r in choices], Region.peaks_during)
+
+
+@_elementwise
+def critical_duration(uplift_strength: Real, shape: Real) -> Result:
+    """The pulse duration p t_d from which on a block overturns; inf for one that does not uplift.
+
+    **Source:** the inverse of V 3.12; -log(1 - strength) for a rectangle.
+    """
+    shape = _clipped(shape)
+    strength = jnp.where(uplift_strength < 1, uplift_strength, 0.5)
+
+    def excess(logarithm, strength, shape):
+        return _safety_wall(jnp.exp(logarithm), shape) / strength - 1
+
+    # The rectangle's duration is the shortest of all.
+    shortest = jnp.log(-jnp.log1p(-strength))
+    longest = jnp.maximum(jnp.log(1e3 * (1 + jnp.abs(shape))), shortest + 1)
+    found = jnp.exp(bracketed_root(excess, shortest - 1e-9, longest, strength, shape))
+    return jnp.where(uplift_strength < 1, found, jnp.inf)
+
+
+@_elementwise
+def critical_shape(uplift_strength: Real, pulse_duration: Real) -> Result:
+    """The shape below which a block overturns; -inf where not even a rectangle is enough.
+
+    **Source:** the inverse of V 3.12.
+    """
+
+    def excess(position, strength, duration):
+        return _safety_wall(duration, _clipped(_unfolded(position))) / strength - 1
+
+    end = jnp.ones_like(pulse_duration) * (1 - 1e-9)
+    within = uplift_strength < -jnp.expm1(-pulse_duration)
+    strength = jnp.where(within, uplift_strength, _safety_wall(pulse_duration, jnp.zeros_like(pulse_duration)))
+    return jnp.where(
+        within, _unfolded(bracketed_root(excess, -end, end, strength, pulse_duration)), -jnp.inf
+    )
+
+
+# ---- The mathematics: arrays of one shape, shapes clipped ----
+
+
+def _clipped(shape: Array) -> Array:
+    return jnp.clip(shape, -_MOST_SHAPE, _MOST_SHAPE)
+
+
+def _parts(value: Array) -> tuple[Array, Array]:
+    """Positive and negative part, with the derivatives of a positive number at 0."""
+    return jnp.where(value >= 0, value, 0.0), jnp.where(value < 0, value, 0.0)
+
+
+def _unfolded(position: Array) -> Array:
+    """(-1, 1) to all shapes."""
+    return 10 * position / ((1 - position) * (1 + position))
+
+
+def _uplift(strength: Array, shape: Array) -> tuple[Array, Array]:
+    """Time of uplift, and what is left of the rising branch then [t_d]; V 2.4."""
+    strength = jnp.where(strength < 1, strength, 1.0)
+    lack = 1 - strength
+    # log(1 + strength (e^shape - 1))/shape, and the same seen from the peak
+    low, high = jnp.where(shape >= -_STEEP, shape, -_STEEP), jnp.where(shape <= _STEEP, shape, _STEEP)
+    left = lack * growth_ratio(-low) * logarithm_ratio(lack * low * growth_ratio(-low))
+    time = strength * growth_ratio(high) * logarithm_ratio(-strength * high * growth_ratio(high))
+    steep = jnp.where(shape < -_STEEP, shape, -_STEEP)
+    box = jnp.log(jnp.where(lack > 0, lack, 1.0) + strength * jnp.exp(steep)) / steep
+    time = jnp.where(shape < -_STEEP, jnp.where(lack > 0, box, 1.0), jnp.where(shape > _STEEP, 1 - left, time))
+    left = jnp.where(shape < -_STEEP, 1 - time, left)
+    return time / 2, left / 2
+
+
+def _safety_wall(duration: Array, shape: Array) -> Array:
+    """V 3.12. With x = 1/2 - shape/duration it is where twice the uplift time is -log(1 - x M)/(x f)."""
+    mild = jnp.where(shape <= _STEEP, shape, _STEEP)
+    x = 0.5 - mild / duration
+    spread = exponential_difference(0.0, mild - duration / 2, -duration) * duration  # M/f
+    small = x * duration * spread
+    near = spread * logarithm_ratio(jnp.where(small < 0.5, small, 0.0))
+    # 1 - x M is e^-f (1 + f (e^s - 1)/s), s = f/2 + shape: so where it is small
+    up, down = _parts(duration / 2 + mild)
+    logarithm = duration - up - jnp.log(jnp.exp(-up) + duration * growth_ratio(down - up))
+    twice = jnp.where(small < 0.5, near, logarithm / jnp.where(small < 0.5, 1.0, x * duration))
+    wall = twice * growth_ratio(mild * twice) / growth_ratio(mild)
+    # A spike: the same, seen from the peak of the pulse.
+    steep = jnp.where(shape > _STEEP, shape, _STEEP)
+    rest = growth_ratio(-duration / 2 - steep)
+    left = rest * logarithm_ratio((steep - duration / 2) * rest)
+    spiked = jnp.exp(-steep * left) * jnp.expm1(-steep * (1 - left)) / jnp.expm1(-steep)
+    return jnp.where(shape > _STEEP, spiked, wall)
+
+
+def _rising(since: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Rotation and velocity times strength at a time `since` uplift, while the pulse rises; V 3.2, H = 0."""
+    uplift, _ = _uplift(strength, shape)
+    up, down = _parts(shape)
+    # Of an increasing exponential, its value at the end is taken out, so that spikes do not overflow.
+    rate, grown = duration * since, 2 * up * since
+    nodes = (rate - grown, -rate - grown, 2 * down * since)
+    lift = jnp.where(shape < 0, 1 - strength + strength * jnp.exp(down), jnp.exp(-up * (1 - 2 * uplift) + grown))
+    push = 2 * lift / growth_ratio(down - up)
+    speed = push * duration * since**2 * exponential_difference(*nodes)
+    angle = push * duration**2 * since**3 * exponential_difference(*nodes, -grown)
+    return angle, speed
+
+
+def _at_middle(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Rotation and velocity times strength at the peak of the pulse."""
+    _, left = _uplift(strength, shape)
+    return _rising(left, strength, duration, shape)
+
+
+def _falling(since: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Rotation and velocity times strength at a time `since` the pulse's peak, while it falls; V 3.2, H(tau - 1/2)."""
+    angle, speed = _at_middle(strength, duration, shape)
+    up, down = _parts(shape)
+    rate, grown = duration * since, -2 * down * since
+    nodes = (rate - grown, -rate - grown, -2 * up * since)
+    push = 2 * jnp.exp(down * (1 - 2 * since)) / growth_ratio(down - up)
+    sinh, cosh, rise = jnp.sinh(rate), jnp.cosh(rate), 2 * jnp.sinh(rate / 2) ** 2
+    lack = 1 - strength
+    less_speed = push * duration * since**2 * exponential_difference(*nodes)
+    less_angle = push * duration**2 * since**3 * exponential_difference(*nodes, -grown)
+    return (
+        angle * cosh + speed * sinh + lack * rise - less_angle,
+        angle * sinh + speed * cosh + lack * sinh - less_speed,
+    )
+
+
+def _at_end(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Rotation and velocity times strength at the end of the pulse, as if there were no ground below."""
+    return _falling(jnp.full_like(duration, 0.5), strength, duration, shape)
+
+
+def _strength_where(part, duration: Array, shape: Array) -> Array:
+    """The strength, below the safety wall, with which the block is at alpha at a time of the pulse."""
+
+    def missing(strength, duration, shape):
+        return part(strength, duration, shape)[0] - strength
+
+    return bracketed_root(missing, jnp.zeros_like(duration), _safety_wall(duration, shape), duration, shape)
+
+
+def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Rotation and velocity, not a number after the first return."""
+    rocks = strength < 1
+    strength = jnp.where(rocks, strength, 0.5)
+    uplift, _ = _uplift(strength, shape)
+    rising = _rising(jnp.clip(time, uplift, 0.5) - uplift, strength, duration, shape)
+    falling = _falling(jnp.clip(time - 0.5, 0.0, 0.5), strength, duration, shape)
+    after = duration * jnp.maximum(time - 1, 0.0)
+    sinh, cosh, rise = jnp.sinh(after), jnp.cosh(after), 2 * jnp.sinh(after / 2) ** 2
+    free = (
+        falling[0] * cosh + falling[1] * sinh - strength * rise,
+        falling[0] * sinh + falling[1] * cosh - strength * sinh,
+    )
+    returned = (falling[0] < 0) | (free[0] < 0)
+    values = []
+    for early, middle, late in zip(rising, falling, free):
+        value = jnp.where(time <= 0.5, early, jnp.where(time <= 1, middle, late)) / strength
+        value = jnp.where((time > 0.5) & returned, jnp.nan, value)
+        values.append(jnp.where(rocks & (time > uplift), value, 0.0))
+    return values[0], values[1]
+
+
+def _peak(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
+    """Time and size of the largest rotation."""
+    rocks, wall = strength < 1, _safety_wall(duration, shape)
+    lost = strength < wall
+    inside = jnp.where(rocks & ~lost, strength, (1 + wall) / 2)
+    angle, speed = (value / inside for value in _at_end(inside, duration, shape))
+    late = speed > 0
+    # S2: free flight from the end of the pulse, z w = (1 - angle)^2 - speed^2
+    gap = jnp.where(late, 1 - angle, 1.0)
+    fast = jnp.where(late, speed, 0.0)
+    bend = jnp.maximum((gap - fast) * (gap + fast), 0.0)
+    bend = jnp.where(bend > 0, bend, 1.0)
+    free_time = 1 + jnp.arctanh(jnp.minimum(fast / gap, 1 - 1e-16)) / duration  # V 3.15b
+    free_angle = (2 * angle - angle**2 + fast**2) / (1 + jnp.sqrt(bend))
+    # S1: the velocity's zero while the pulse falls
+
+    def excess(since, strength, duration, shape):
+        return _falling(since, strength, duration, shape)[1]
+
+    start = jnp.zeros_like(duration)
+    since = bracketed_root(excess, start, start + 0.5, inside, duration, shape)  # V 3.15a
+    early_angle = _falling(since, inside, duration, shape)[0] / inside
+    time = jnp.where(late, free_time, 0.5 + since)
+    size = jnp.where(late, free_angle, early_angle)
+    return (
+        jnp.where(lost, jnp.inf, jnp.where(rocks, time, 0.5)),
+        jnp.where(lost, jnp.inf, jnp.where(rocks, size, 0.0)),
+    )
