@@ -8,6 +8,7 @@ velocity after an impact over that before it.
 import importlib
 from typing import TYPE_CHECKING
 
+from jaxrock import closed_form as closed_form, similarity as similarity
 from jaxrock.arcs import Diffrax as Diffrax
 from jaxrock.block import Block as Block
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear

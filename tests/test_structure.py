@@ -12,7 +12,11 @@ import pytest
 import jaxrock
 
 PACKAGE = Path(jaxrock.__file__).parent
-TREES = {path.stem: ast.parse(path.read_text()) for path in sorted(PACKAGE.glob("*.py"))}
+FILES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 MODULES = [name for name in TREES if name != "__init__"]
 
 # At the bottom: `status`, and helpers (one underscore). They import nothing, and all others may import them.
@@ -36,8 +40,15 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "arcs": {"engine", "guards"},
     "response": {"series", "arcs"},
     "spectra": {"response", "pulses"},
-    "plot": {"spectra"},
-    "__init__": {"plot", "records"},
+    "closed_form.single_lobe": set(),
+    "closed_form._sine_arcs": set(),
+    "closed_form.sine_pulse": {"closed_form._sine_arcs"},
+    "closed_form.restitution": set(),
+    "closed_form.pushover": {"closed_form.restitution"},
+    "closed_form": {"closed_form.single_lobe", "closed_form.sine_pulse", "closed_form.pushover"},
+    "similarity": {"block"},
+    "plot": {"spectra", "closed_form"},
+    "__init__": {"plot", "records", "similarity"},
     "__main__": {"__init__"},
 }
 
@@ -54,12 +65,12 @@ def imported(tree: ast.Module) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"relative import in line {node.lineno}"
             # `from jaxrock import x`: a module x, or something that the package exports.
-            names = [f"{node.module}.{a.name}" if a.name in TREES else node.module for a in node.names]
-            names = names if node.module == "jaxrock" else [node.module]
+            names = [f"{node.module}.{a.name}" for a in node.names]
+            names = [n if n.removeprefix("jaxrock.") in TREES else node.module for n in names]
         else:
             continue
-        parts = [name.split(".") for name in names]
-        found |= {"__init__" if len(part) == 1 else part[1] for part in parts if part[0] == "jaxrock"}
+        found |= {name.removeprefix("jaxrock.") for name in names if name.startswith("jaxrock.")}
+        found |= {"__init__" for name in names if name == "jaxrock"}
     return found
 
 
@@ -87,7 +98,7 @@ def code_lines(function: ast.FunctionDef, lines: list[str]) -> int:
 
 def functions():
     for name, tree in TREES.items():
-        lines = (PACKAGE / f"{name}.py").read_text().splitlines()
+        lines = FILES[name].read_text().splitlines()
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):
                 yield f"{name}.{node.name}", code_lines(node, lines)
@@ -130,9 +141,21 @@ def test_the_physics_imports_no_engine(name):
     assert not reached(IMPORTS, name) & {"engine", "series", "arcs", "response"}
 
 
+def test_closed_forms_import_no_engine():
+    """They judge the engines: nothing of the package but helpers and each other."""
+    assert all(name in BOTTOM or name.startswith("closed_form") for name in reached(IMPORTS, "closed_form"))
+
+
+@pytest.mark.parametrize("name", [name for name in TREES if name.startswith("closed_form.")])
+def test_closed_forms_are_documented(name):
+    nodes = [node for node in TREES[name].body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+    assert ast.get_docstring(TREES[name])
+    assert not [node.name for node in nodes if not node.name.startswith("_") and not ast.get_docstring(node)]
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_modules_are_short(name):
-    lines = len((PACKAGE / f"{name}.py").read_text().splitlines())
+    lines = len(FILES[name].read_text().splitlines())
     assert lines <= MOST_LINES_OF_A_MODULE
 
 

@@ -1,3 +1,8 @@
 """Solutions that need no integration. They import no engine, so they can judge them."""
 
-from jaxrock.closed_form import sine_pulse as sine_pulse, single_lobe as single_lobe
+from jaxrock.closed_form import (
+    pushover as pushover,
+    restitution as restitution,
+    sine_pulse as sine_pulse,
+    single_lobe as single_lobe,
+)

@@ -1,0 +1,82 @@
+"""What holds a rigid block without any motion: force, energy, and the blow and the free swing that they allow."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Inexact
+
+from jaxrock._checks import checked, elementwise, finite
+from jaxrock.closed_form.restitution import _acute
+
+Real = Inexact[ArrayLike, "..."]
+Result = Float[Array, "..."]
+
+_fraction = lambda name, value: checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))  # noqa: E731
+_restitution = lambda name, value: checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))  # noqa: E731
+_elementwise = elementwise(
+    alpha=_acute, rotation=finite, amplitude=_fraction, restitution=_restitution, impacts=finite
+)
+
+
+@_elementwise
+def force(rotation: Real, alpha: Real) -> Result:
+    """Horizontal force at the centre of mass, over the weight, that holds the block at a rotation.
+
+    At rotation 0 it is the acceleration in g at which the block uplifts; it is zero at alpha, where the block
+    stands in balance on its corner.
+
+    **Arguments:**
+
+    - `rotation`: [rad], positive. `alpha`: slenderness angle [rad], in (0, pi/2).
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), equation 16: tan(alpha - rotation).
+    """
+    return jnp.tan(alpha - rotation)
+
+
+@_elementwise
+def energy(rotation: Real, alpha: Real) -> Result:
+    """Work over m g R that brings the block from rest to a rotation [rad].
+
+    **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 4.12 corrected:
+    cos(alpha - rotation) - cos(alpha).
+    """
+    # The difference as a product: small rotations of slender blocks do not cancel.
+    return 2 * jnp.sin(rotation / 2) * jnp.sin(alpha - rotation / 2)
+
+
+@_elementwise
+def toppling_velocity(alpha: Real) -> Result:
+    """Angular velocity over p with which a block must leave the ground to reach its balance: 2 sin(alpha/2).
+
+    **Source:** Housner (1963), the energy that overturns.
+    """
+    return 2 * jnp.sin(alpha / 2)
+
+
+@_elementwise
+def period(amplitude: Real) -> Result:
+    """Period of the free rocking of a slender block, times p.
+
+    **Arguments:**
+
+    - `amplitude`: largest rotation over alpha, in [0, 1).
+
+    **Returns:** 4 arccosh(1/(1 - amplitude)): it goes to 0 with the amplitude and to infinity towards alpha.
+
+    **Source:** Housner (1963), equation 7.
+    """
+    return 4 * jnp.log1p((amplitude + jnp.sqrt(amplitude * (2 - amplitude))) / (1 - amplitude))
+
+
+@_elementwise
+def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result:
+    """Largest rotation over alpha of a slender block after a number of impacts in free rocking.
+
+    **Arguments:**
+
+    - `impacts`: how many. `amplitude`: largest rotation over alpha before, in [0, 1).
+    - `restitution`: angular velocity after over before an impact, in [0, 1].
+
+    **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.
+    """
+    left = restitution ** (2 * impacts) * amplitude * (2 - amplitude)
+    return left / (1 + jnp.sqrt(1 - left))

@@ -1,0 +1,398 @@
+"""Closed forms against the papers' (corrected) formulas in 220 digits, and the linear engine against the closed forms."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock._exponential import exponential_difference, logarithm_ratio
+from jaxrock._roots import bracketed_root
+from jaxrock.closed_form import pushover, restitution, sine_pulse, single_lobe
+
+ALPHA = 0.1  # plays no part in the linear model, whose results are over alpha
+
+
+# ---- Building blocks ----
+
+
+@pytest.mark.parametrize("nodes", [(1.0, 1.0), (0.3, -0.3, 0.3, 0.0), (5.0, -5.0, 5.0 + 1e-7, 0.0), (-700.0, 3.0, 2.0),
+                                   (1e-9, 0.0, -1e-9), (2.0,) * 5, (-1e17, 0.0, 1.0)])  # fmt: skip
+def test_exponential_difference(nodes):
+    with mp.workdps(120):
+        exact = [mp.mpf(node) + mp.mpf(10) ** -40 * i for i, node in enumerate(nodes)]
+        row = [mp.exp(node) for node in exact]
+        for width in range(1, len(exact)):
+            row = [(row[i + 1] - row[i]) / (exact[i + width] - exact[i]) for i in range(len(row) - 1)]
+        assert float(exponential_difference(*nodes)) == pytest.approx(float(row[0]), rel=5e-15)
+
+
+def test_exponential_difference_has_all_derivatives():
+    """At equal nodes the k-th derivative of [x, 0] is 1/(k + 1)."""
+    f = lambda x: exponential_difference(x, 0.0)
+    for k in range(1, 5):
+        f = jax.grad(f)
+        assert float(f(0.0)) == pytest.approx(1 / (k + 1), rel=1e-14)
+
+
+@pytest.mark.parametrize("y", [-1e6, -3.0, -0.05, -1e-9, 0.0, 1e-9, 0.0499999, 0.05, 0.9, 1 - 1e-12])
+def test_logarithm_ratio(y):
+    with mp.workdps(50):
+        exact = 1 if y == 0 else -mp.log(1 - mp.mpf(y)) / mp.mpf(y)
+        slope = 0.5 if y == 0 else (1 / (1 - mp.mpf(y)) - exact) / mp.mpf(y)
+        assert float(logarithm_ratio(y)) == pytest.approx(float(exact), rel=1e-14)
+        assert float(jax.grad(logarithm_ratio)(y)) == pytest.approx(float(slope), rel=1e-13)
+
+
+def test_bracketed_root_has_two_derivatives():
+    root = lambda a: bracketed_root(lambda x, a: x**3 - a, jnp.array(0.0), jnp.array(10.0), a)
+    a = jnp.array(2.0)
+    assert float(root(a)) == pytest.approx(2 ** (1 / 3), rel=1e-15)
+    assert float(jax.grad(root)(a)) == pytest.approx(2 ** (-2 / 3) / 3, rel=1e-14)
+    assert float(jax.grad(jax.grad(root))(a)) == pytest.approx(-2 * 2 ** (-5 / 3) / 9, rel=1e-13)
+
+
+# ---- Single-lobe pulse: every shape and duration ----
+
+
+def printed(what, strength, duration, shape, time=None):
+    """Voyagaki et al. (2012) as printed or corrected: equations 3.2, 3.12, 3.15. Cancels; hence the digits."""
+    strength, f, b = (mp.mpf(x) for x in (strength, duration, shape))
+    tiny = mp.mpf(10) ** -60
+    b = tiny if b == 0 else b
+    f = f + tiny if f == 2 * abs(b) else f
+    if what == "wall":
+        power = 2 * b / (f - 2 * b)
+        return (1 - (mp.exp(f) * (f + 2 * b) / (2 * f * mp.exp(f / 2 + b) - (f - 2 * b))) ** power) / (1 - mp.exp(b))
+    u, k = 1 - strength * (1 - mp.exp(b)), f / (2 * b)
+    grows, decays = (f + 2 * b) * u ** (1 - k), (f - 2 * b) * u ** (1 + k)
+
+    def rotation(t):
+        total = b * (grows * mp.exp(f * t) - decays * mp.exp(-f * t)) + f**2 - 4 * b**2 - f**2 * mp.exp(2 * b * t)
+        if t >= 0.5:
+            total += f**2 * (mp.exp(2 * b * t) - mp.exp(2 * b * (1 - t)))
+            total -= 4 * b * f * mp.exp(b) * mp.sinh(f * (t - 0.5))
+        if t >= 1:
+            total += f**2 * mp.exp(2 * b * (1 - t)) - (f**2 - 4 * b**2)
+            total += b * ((f - 2 * b) * mp.exp(f * (t - 1)) - (f + 2 * b) * mp.exp(-f * (t - 1)))
+        return 1 - total / (strength * (1 - mp.exp(b)) * (f**2 - 4 * b**2))
+
+    def slope(t):  # 3.15a
+        return (
+            grows * mp.exp(f * t) + decays * mp.exp(-f * t)
+            + 2 * f * mp.exp(2 * b * (1 - t)) - 4 * f * mp.exp(b) * mp.cosh(f * (t - 0.5))
+        )  # fmt: skip
+
+    if what == "rotation":
+        return rotation(mp.mpf(time))
+    if mp.sign(slope(mp.mpf(1))) != mp.sign(slope(mp.mpf(1) / 2)):
+        peak = mp.findroot(slope, (mp.mpf(1) / 2, mp.mpf(1)), solver="anderson", tol=mp.mpf(10) ** -120, maxsteps=400)
+    else:
+        up = (f + 2 * b) * mp.exp(f) - 2 * f * mp.exp(f / 2 + b) + (f - 2 * b) * u ** (1 + k)
+        down = 2 * f * mp.exp(b - f / 2) - (f - 2 * b) * mp.exp(-f) - (f + 2 * b) * u ** (1 - k)
+        peak = mp.log(up / down) / (2 * f)
+    return peak if what == "peak_time" else rotation(peak)
+
+
+def lobes():
+    """Random durations 0.05 to 20; shapes 0, duration = +-2 shape, any up to 100; a part of the way from wall to 1."""
+    rng = np.random.default_rng(3)
+    for i in range(24):
+        duration = 10 ** rng.uniform(-1.3, 1.3)
+        shape = [0.0, duration / 2, -duration / 2, rng.uniform(-100, 100)][i % 4]
+        yield pytest.param(rng.uniform(0.02, 0.98), duration, shape, id=f"{duration:.3g}, {shape:.3g}")
+
+
+def above_wall(part, duration, shape):
+    wall = float(single_lobe.safety_wall(duration, shape))
+    return wall + (1 - wall) * part
+
+
+@pytest.mark.parametrize("part, duration, shape", list(lobes()))
+def test_single_lobe_in_220_digits(part, duration, shape):
+    strength = above_wall(part, duration, shape)
+    with mp.workdps(220):
+        assert float(single_lobe.safety_wall(duration, shape)) == pytest.approx(
+            float(printed("wall", 0.5, duration, shape)), rel=1e-13
+        )
+        for name in ("peak_time", "peak_rotation"):
+            found = getattr(single_lobe, name)(strength, duration, shape)
+            assert float(found) == pytest.approx(float(printed(name, strength, duration, shape)), rel=1e-13)
+        for time in (0.5, 0.75, 1.0, 1.2):
+            exact = float(printed("rotation", strength, duration, shape, time))
+            found = float(single_lobe.rotation(time, strength, duration, shape))
+            assert np.isnan(found) if exact < 0 else found == pytest.approx(exact, rel=1e-12, abs=1e-300)
+
+
+@pytest.mark.parametrize("part, duration, shape", list(lobes()))
+def test_single_lobe_gradients(part, duration, shape):
+    strength = above_wall(part, duration, shape)
+    step = mp.mpf(10) ** -20
+    with mp.workdps(220):
+        for name in ("wall", "peak_time", "peak_rotation"):
+            function = single_lobe.safety_wall if name == "wall" else getattr(single_lobe, name)
+            values = (duration, shape) if name == "wall" else (strength, duration, shape)
+            found = jax.grad(lambda *v: function(*v), argnums=tuple(range(len(values))))(*values)
+            exact = []
+            for i in range(len(values)):
+                ends = []
+                for side in (1, -1):
+                    moved = [mp.mpf(v) for v in values]
+                    moved[i] += side * step
+                    ends.append(printed(name, *([0.5] if name == "wall" else []), *moved))
+                exact.append(float((ends[0] - ends[1]) / (2 * step)))
+            np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-11 * np.max(np.abs(exact)))
+
+
+@pytest.mark.parametrize("duration", [0.05, 1.0, 2.0, 7.0, 20.0, 300.0])
+def test_single_lobe_limits(duration):
+    """Rectangle, triangle, spike; V 3.9, 3.10 corrected, 3.13, 3.14, and the border between S1 and S2."""
+    approx = functools.partial(pytest.approx, rel=1e-12)
+    f, half = duration, duration / 2
+    assert float(single_lobe.safety_wall(f, -np.inf)) == approx(-np.expm1(-f))
+    assert float(single_lobe.safety_wall(f, 0.0)) == approx(2 - 2 / f * (half + np.log(2 - np.exp(-half))))
+    assert float(single_lobe.safety_wall(f, np.inf)) < 1e-14 * f
+    if f <= 20:
+        assert float(single_lobe.falling_wall(f, -np.inf)) == approx(1 - 1 / np.cosh(f))
+        assert float(single_lobe.rising_wall(f, -np.inf)) == approx(1 - 1 / np.cosh(half))
+        assert float(single_lobe.falling_wall(f, 0.0)) == pytest.approx(2 - 2 / f * np.arcsinh(2 * np.sinh(half)), rel=1e-11)
+        assert float(single_lobe.rising_wall(f, 0.0)) == pytest.approx(1 - 2 / f * np.arcsinh(half) * 1, rel=1e-11)
+        border = 2 - 2 / f * np.arccosh(2 * np.cosh(half) - 1)
+        assert float(single_lobe.peak_border(f, 0.0)) == pytest.approx(border, rel=1e-11)
+    for limit, large in ((-np.inf, -1e15), (np.inf, 1e15)):
+        assert float(single_lobe.peak_rotation(0.9999, 0.3, limit)) == pytest.approx(
+            float(single_lobe.peak_rotation(0.9999, 0.3, large)), abs=1e-13
+        )
+
+
+def test_single_lobe_against_the_papers_numbers(references):
+    for case in references["linear_exponential"]:
+        shape, duration = float(case["shape"]), float(case["pulse_duration"])
+        assert float(single_lobe.safety_wall(duration, shape)) == pytest.approx(float(case["wall"]), rel=1e-14)
+        for point in case["points"]:
+            strength = float(point["uplift_strength"])
+            # Decimal strengths near 1 lose digits of 1 - strength; near the wall the peak time runs away.
+            rel = 1e-12 * (1 + 1e-3 / (1 - strength) + 1e-3 / (strength / float(case["wall"]) - 1))
+            found = single_lobe.peak_rotation(strength, duration, shape)
+            assert float(found) == pytest.approx(float(point["peak"]), rel=rel)
+            assert float(single_lobe.peak_time(strength, duration, shape)) == pytest.approx(float(point["peak_time"]), rel=rel)
+
+
+def test_single_lobe_inverses():
+    strength, shape = np.meshgrid(np.linspace(0.02, 0.98, 13), np.array([-np.inf, -30, -1, 0.0, 2, 40]))
+    duration = single_lobe.critical_duration(strength, shape)
+    np.testing.assert_allclose(single_lobe.safety_wall(duration, shape), strength, rtol=1e-12)
+    found = single_lobe.critical_shape(strength[1:], duration[1:])
+    np.testing.assert_allclose(single_lobe.safety_wall(duration[1:], found), strength[1:], rtol=1e-12)
+    assert float(single_lobe.critical_shape(0.9, 1.0)) == -np.inf  # not even a rectangle
+    assert float(single_lobe.critical_duration(1.2, 0.0)) == np.inf
+
+
+def test_single_lobe_safe_arguments():
+    assert float(single_lobe.peak_rotation(1.0, 2.0, 0.0)) == 0.0
+    assert float(single_lobe.peak_rotation(0.1, 2.0, 0.0)) == np.inf
+    assert float(single_lobe.uplift_time(1.5, 1.0)) == np.inf
+    with pytest.raises(ValueError, match="Argument `pulse_duration` must be positive"):
+        single_lobe.safety_wall(-1.0, 0.0)
+    with pytest.raises(ValueError, match="Argument `shape` must be a number"):
+        single_lobe.safety_wall(1.0, np.nan)
+    for function in (single_lobe.peak_rotation, single_lobe.peak_time):
+        gradients = jax.vmap(jax.grad(function))(
+            np.array([0.1, 0.5, 0.9, 1.0, 1.5]), np.full(5, 2.0), np.array([0.0, 1.0, -np.inf, 5.0, np.inf])
+        )
+        assert np.all(np.isfinite(gradients))
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
+def engine_lobe(strength, duration, shape, e):
+    pulse = rk.ExponentialPulse(-ALPHA / strength, duration, shape)  # Voyagaki's sign of the motion
+    return rk.outcome(rk.Block(ALPHA, 1.0, e), pulse, rk.Linear())
+
+
+def test_engine_agrees_with_the_single_lobe():
+    """10,000 random points in each region of safety, and verdicts in each region of overturning."""
+    rng = np.random.default_rng(0)
+    n, compared = 40_000, {}
+    duration, shape = 10 ** rng.uniform(np.log10(0.05), np.log10(20), n), rng.uniform(-1, 1, n) * 10 ** rng.uniform(-3, 2, n)
+    wall = np.asarray(single_lobe.safety_wall(duration, shape))
+    strength = np.where(np.arange(n) % 4, wall + (1 - wall) * rng.uniform(0, 1, n) ** 2, wall * rng.uniform(0, 1, n))
+    region = np.asarray(single_lobe.region(strength, duration, shape))
+    found = engine_lobe(strength, duration, shape, 0.9)
+    decided = np.asarray(found.status == rk.Status.successful)
+    assert np.mean(decided) > 0.999
+    np.testing.assert_array_equal(np.asarray(found.overturned)[decided], (strength < wall)[decided])
+    for kind in (single_lobe.Region.peaks_after, single_lobe.Region.peaks_during):
+        here = decided & (region == kind)
+        exact = np.asarray(single_lobe.peak_rotation(strength, duration, shape))[here]
+        off = np.abs(np.asarray(found.max_rotation)[here] / ALPHA - exact)
+        # What a rounded strength does, by the closed form's own derivative.
+        slope = np.asarray(jax.vmap(jax.grad(single_lobe.peak_rotation))(strength[here], duration[here], shape[here]))
+        compared[kind] = here.sum(), np.max(off / (exact + 1e-3 * np.abs(slope) * strength[here]))
+    assert all(count > 8000 for count, _ in compared.values())
+    assert all(worst < 1e-12 for _, worst in compared.values()), compared
+
+
+def test_histories_agree_with_the_single_lobe():
+    for strength, duration, shape in [(0.5, 2.0, 3.0), (0.8, 1.0, -2.0), (0.7, 0.5, 0.0), (0.9, 3.0, -np.inf)]:
+        pulse = rk.ExponentialPulse(-ALPHA / strength, duration, shape)
+        response = rk.simulate(rk.Block(ALPHA, 1.0, 0.9), pulse, rk.Linear(), duration=3 * duration)
+        time = np.linspace(0, 3, 61)
+        angle, speed = response(time * duration)
+        exact = np.asarray(single_lobe.rotation(time, strength, duration, shape))
+        returned = np.isnan(exact)
+        first = float(response.impact_times[0]) / duration if len(response.impact_times) else np.inf
+        np.testing.assert_array_equal(returned, time > first)
+        np.testing.assert_allclose(angle[~returned] / ALPHA, exact[~returned], atol=1e-13)
+        exact = np.asarray(single_lobe.velocity(time, strength, duration, shape))
+        np.testing.assert_allclose(speed[~returned] / ALPHA, exact[~returned], atol=1e-13)
+
+
+# ---- Sine pulse ----
+
+
+def test_sine_intervals_against_the_papers_numbers(references):
+    for case in references["linear_sine_intervals"]:
+        ratio, e = float(case["frequency_ratio"]), float(case["restitution"])
+        found = sine_pulse.overturning_intervals(ratio, e)
+        lower, upper = np.array([[float(x) if x else np.inf for x in ends] for ends in case["ends"]]).T
+        np.testing.assert_allclose(found.lower, lower, rtol=1e-13)
+        np.testing.assert_allclose(found.upper, upper, rtol=1e-13)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, 0))
+def engine_sine(intensity, ratio, e):
+    return rk.outcome(rk.Block(ALPHA, 1.0, e), rk.SinePulse(ALPHA * intensity, 2 * jnp.pi / ratio), rk.Linear())
+
+
+@pytest.mark.parametrize("e", [0.8, 0.9, 0.95, 1.0])
+@pytest.mark.parametrize("ratio", [0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.05, 1.5, 2.5, 4.2, 5.3, 8.0])
+def test_engine_finds_every_interval(ratio, e):
+    """Both sides of every end at 1e-10, and no other verdict in between."""
+    found = sine_pulse.overturning_intervals(ratio, e)
+    ends = np.concatenate([found.lower, found.upper[:-1]])
+    lost = np.concatenate([np.ones_like(found.lower), np.zeros_like(found.upper[:-1])]).astype(bool)
+    between = np.linspace(found.searched_from, 1.05 * found.lower[-1], 2048 - 2 * len(ends))
+    inside = ((between[:, None] >= found.lower) & (between[:, None] <= found.upper)).any(axis=1)
+    intensity = np.concatenate([ends * (1 - 1e-10), ends * (1 + 1e-10), between])
+    expected = np.concatenate([~lost, lost, inside])
+    engine = engine_sine(intensity, np.full(2048, ratio), np.full(2048, e))
+    decided = np.asarray(engine.status == rk.Status.successful)
+    assert np.mean(decided) > 0.99
+    np.testing.assert_array_equal(np.asarray(engine.overturned)[decided], expected[decided])
+
+
+def test_islands():
+    """What the paper's four curves miss: overturning after 3, 5, 7... impacts at low frequency."""
+    found = sine_pulse.overturning_intervals(0.5, 0.8)
+    np.testing.assert_array_equal(found.impacts, [5, 3, 1, 0])
+    assert len(sine_pulse.overturning_intervals(0.25, 0.95).lower) >= 20
+    np.testing.assert_array_equal(sine_pulse.overturning_intervals(3.0, 0.9).impacts, [1, 0])
+
+
+def test_engine_agrees_with_the_sine_pulse():
+    """Peaks of 10,000 random blocks whose first impact comes after the pulse; verdicts of all."""
+    rng = np.random.default_rng(1)
+    n = 16_000
+    ratio, e = rng.uniform(1.0, 10, n), rng.uniform(0.5, 1, n)
+    first, last = np.asarray(sine_pulse.impact_time_limit(ratio)), np.asarray(sine_pulse.no_impact_limit(ratio))
+    intensity = first + (last * 1.05 - first) * rng.uniform(0, 1, n)
+    found = engine_sine(intensity, ratio, e)
+    assert np.all(found.status == rk.Status.successful)
+    peak = np.maximum(sine_pulse.first_peak(intensity, ratio), sine_pulse.peak_after_pulse(intensity, ratio, e))
+    lower, upper = (np.asarray(x) for x in sine_pulse.after_pulse_limits(ratio, e))
+    lost = ((intensity > lower) & (intensity < upper)) | (intensity > last)
+    np.testing.assert_array_equal(found.overturned, lost)
+    safe = ~lost
+    assert safe.sum() > 10_000
+    off = np.abs(np.asarray(found.max_rotation) / ALPHA - peak)[safe]
+    _, slope = jax.jvp(
+        lambda a: jnp.maximum(sine_pulse.first_peak(a, ratio), sine_pulse.peak_after_pulse(a, ratio, e)),
+        (intensity,), (np.ones(n),),
+    )  # fmt: skip
+    assert np.max(off / (peak[safe] + 1e-3 * np.abs(np.asarray(slope)[safe]) * intensity[safe])) < 1e-12
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.5, 3.0, 50.0])
+def test_sine_limits_in_50_digits(ratio):
+    with mp.workdps(60):
+        w = mp.mpf(ratio)
+        end = lambda a: (2 * mp.pi - mp.asin(1 / a)) / w
+        lost = lambda a: mp.sqrt(a**2 - 1) - a * mp.exp(-end(a)) - w
+        limit = lambda a: (
+            (w**2 - w * mp.sqrt(a**2 - 1)) * mp.exp(end(a)) - 1 - w**2 - mp.sqrt(1 + (a**2 + 1) * w**2)
+        )
+        for function, residual in ((sine_pulse.no_impact_limit, lost), (sine_pulse.impact_time_limit, limit)):
+            found = mp.mpf(float(function(ratio)))
+            sides = [residual(found * (1 + s * mp.mpf(10) ** -14)) for s in (-1, 1)]
+            assert sides[0] * sides[1] < 0
+
+
+def test_sine_constants_and_approximations():
+    """D0* by both of its forms (the second corrected); the scale law where it holds; D&D's range of equation 3.30."""
+    a, w = np.meshgrid(np.linspace(1.05, 6, 9), np.array([0.5, 2.0, 7.0, 20.0]))
+    c = sine_pulse.constants(a, w)
+    root = np.sqrt(a**2 - 1)
+    second = w**2 - 2 * a**2 + 1 + (root + w) * a * np.exp(-c.end) + (root - w) * a * np.exp(c.end)
+    size = np.abs((root - w) * a * np.exp(c.end)) + w**2 + 2 * a**2 + 1
+    np.testing.assert_allclose(c.D0 * ((w**2 + 1) / w) ** 2 / size, second / size, atol=1e-13)
+    exact, law = (f(3.0, 100.0, 0.9) for f in (sine_pulse.peak_after_pulse, sine_pulse.restitution_scale_law))
+    assert float(law / exact) == pytest.approx(0.99924, abs=1e-5)
+    ratio, e = np.meshgrid(np.linspace(2.55, 3.95, 8), np.array([0.8, 0.9, 0.96]))
+    off = sine_pulse.approximate_during_pulse_limit(ratio, e) / sine_pulse.during_pulse_limit(ratio, e) - 1
+    assert np.max(np.abs(off)) < 0.01
+    assert float(sine_pulse.during_pulse_limit(5.1, 0.95)) < float(sine_pulse.impact_time_limit(5.1))  # printed: none
+    assert float(sine_pulse.during_pulse_limit(5.1, 0.8)) == np.inf
+
+
+def test_sine_impact_times():
+    for a, w in [(1.05, 0.5), (1.5, 3.0), (2.5, 3.0), (3.6, 3.0)]:
+        response = rk.simulate(rk.Block(ALPHA, 1.0, 0.7), rk.SinePulse(ALPHA * a, 2 * np.pi / w), rk.Linear(), duration=25.0)
+        uplift = np.arcsin(1 / a) / w
+        assert float(sine_pulse.impact_time(a, w)) == pytest.approx(float(response.impact_times[0]) - uplift, rel=1e-12)
+    assert float(sine_pulse.impact_time(10.0, 3.0)) == np.inf
+
+
+@pytest.mark.parametrize("function, values", [
+    (sine_pulse.no_impact_limit, (2.0,)), (sine_pulse.impact_time_limit, (0.4,)),
+    (sine_pulse.during_pulse_limit, (2.0, 0.9)), (sine_pulse.impact_time, (1.5, 2.0)),
+    (sine_pulse.impact_time, (2.2, 2.0)), (sine_pulse.first_peak, (1.5, 2.0)), (sine_pulse.peak_after_pulse, (2.0, 2.0, 0.5)),
+    (lambda w, e: sine_pulse.after_pulse_limits(w, e)[1], (3.0, 0.9)),
+])  # fmt: skip
+def test_sine_gradients(function, values):
+    found = jax.grad(function, argnums=tuple(range(len(values))))(*values)
+    for i, slope in enumerate(found):
+        step = np.eye(len(values))[i] * 1e-3
+        at = lambda k: float(function(*(np.array(values) + k * step)))
+        # Fourth-order differences with Richardson's extrapolation: 1e-9.
+        coarse, fine = ((8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h * 1e-3) for h in (1.0, 0.5))
+        assert float(slope) == pytest.approx((16 * fine - coarse) / 15, rel=1e-8)
+
+
+# ---- Without motion ----
+
+
+def test_pushover_and_restitution():
+    alpha, block = 0.3, rk.Block(0.3, 2.0)
+    assert float(restitution.housner(alpha)) == pytest.approx(float(block.restitution), rel=1e-15)
+    assert float(restitution.housner(alpha, 1.5)) == pytest.approx(1 - 2 * np.sin(0.3) ** 2 / 1.5)
+    assert float(pushover.force(0.0, alpha)) == pytest.approx(float(rk.Housner().table(block).threshold))
+    assert float(pushover.energy(1e-9, alpha)) == pytest.approx(1e-9 * np.sin(0.3), rel=1e-8)
+    quiet = rk.Record(np.zeros(2), 1.0)
+    blow = lambda velocity: rk.outcome(block, quiet, initial=(0.0, velocity)).overturned
+    velocity = float(2.0 * pushover.toppling_velocity(alpha))
+    assert bool(blow(velocity * (1 + 1e-12))) and not bool(blow(velocity * (1 - 1e-12)))
+
+
+def test_free_rocking():
+    """Housner's period and decay against a history."""
+    block, quiet = rk.Block(ALPHA, 2.0, 0.9), rk.Record(np.zeros(2), 1.0)
+    response = rk.simulate(block, quiet, rk.Linear(), initial=(0.5 * ALPHA, 0.0), duration=4.0)
+    impacts = np.asarray(response.impact_times)
+    assert impacts[0] == pytest.approx(float(pushover.period(0.5)) / 8, rel=1e-12)
+    amplitudes = pushover.amplitude_after(np.arange(1, len(impacts)), 0.5, 0.9)
+    np.testing.assert_allclose(np.diff(impacts) * 2.0, 0.5 * pushover.period(amplitudes), rtol=1e-9)
