@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike, Inexact
 Real = Inexact[ArrayLike, "..."]
 
 # Nodes closer together than this are summed as a power series; others are divided.
-_CLOSE = 2.0
-_TERMS = 22
+_CLOSE = 1.0
+_TERMS = 14
 
 
 def exponential_difference(*nodes: Real) -> Inexact[Array, "..."]:
@@ -37,7 +37,7 @@ def _difference(*nodes: Array) -> Array:
     row = [jnp.exp(node) for node in nodes]
     for width in range(1, len(nodes)):
         row = [
-            _merged(row[i], row[i + 1], nodes[i : i + width + 1]) if width > 1 else _mean(nodes[i], nodes[i + 1], row[i])
+            _mean(nodes[i], nodes[i + 1], row[i]) if width == 1 else _merged(row[i : i + 2], nodes[i : i + width + 1])
             for i in range(len(row) - 1)
         ]
     return row[0]
@@ -69,17 +69,17 @@ def _mean(upper: Array, lower: Array, value: Array) -> Array:
     return value * jnp.where(gap == 0, 1.0, -jnp.expm1(-gap) / jnp.where(gap == 0, 1.0, gap))
 
 
-def _merged(upper: Array, lower: Array, nodes: list[Array]) -> Array:
+def _merged(row: list[Array], nodes: list[Array]) -> Array:
     """Difference at sorted nodes, from those without the last and without the first."""
     gap = nodes[0] - nodes[-1]
     close = gap < _CLOSE
-    quotient = (upper - lower) / jnp.where(close, 1.0, gap)
+    quotient = (row[0] - row[1]) / jnp.where(close, 1.0, gap)
     centre = (nodes[0] + nodes[-1]) / 2
     return jnp.where(close, _power_series([jnp.where(close, n - centre, 0.0) for n in nodes], centre), quotient)
 
 
 def _power_series(offsets: list[Array], centre: Array) -> Array:
-    """Difference at centre + offsets, each at most `_CLOSE`/2: sum of complete symmetric polynomials over factorials."""
+    """Difference at centre + offsets, at most `_CLOSE`/2: a sum of complete symmetric polynomials over factorials."""
     order = len(offsets) - 1
     polynomials = [jnp.ones_like(centre)] * len(offsets)  # of degree k in the first, first two, ... offsets
     total = polynomials[-1] / math.factorial(order)

@@ -1,5 +1,6 @@
 """Roots of increasing or decreasing functions inside brackets, elementwise, with derivatives."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -11,31 +12,34 @@ Real = Inexact[Array, "..."]
 _MOST_STEPS = 100
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Real) -> Real:
     """Where `function(x, *parameters)`, elementwise, changes its sign between `lower` and `upper`.
 
-    Where it does not, the end with the smaller value is returned. The search is not differentiated: two Newton
-    steps from its result carry first and second derivatives with respect to the parameters.
-
-    **Source:** Chandrupatla (1997), inverse quadratic interpolation where it is safe, else bisection.
+    Where it does not, the end with the smaller value is returned. Derivatives of every order with respect to the
+    parameters (none to the bracket) come from the implicit function; `function` must not close over traced values.
     """
-    known = jax.lax.stop_gradient(parameters)
     shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in (lower, upper, *parameters)))
-    ends = (jnp.broadcast_to(jax.lax.stop_gradient(end), shape) for end in (lower, upper))
-    root = search_root(lambda x: function(x, *known), *ends)
-    for _ in range(2):
-        value, slope = jax.jvp(lambda x: function(x, *parameters), (root,), (jnp.ones_like(root),))
-        # Without a root there is nothing to improve; a double root has no derivative.
-        step = jnp.where(slope == 0, 0.0, value / jnp.where(slope == 0, 1.0, slope))
-        small = jnp.abs(step) <= 1e-6 * (jnp.abs(root) + jnp.finfo(root.dtype).tiny)
-        root = root - jnp.where(small | (slope == 0), step, jax.lax.stop_gradient(jnp.zeros_like(step)))
-    return root
+    return search_root(lambda x: function(x, *parameters), *(jnp.broadcast_to(end, shape) for end in (lower, upper)))
+
+
+@bracketed_root.defjvp
+def _bracketed_root_jvp(function, primals, tangents):
+    (lower, upper, *parameters), (_, _, *changes) = primals, tangents
+    root = bracketed_root(function, lower, upper, *parameters)
+    _, slope = jax.jvp(lambda x: function(x, *parameters), (root,), (jnp.ones_like(root),))
+    _, change = jax.jvp(lambda *p: function(root, *p), tuple(parameters), tuple(changes))
+    flat = slope == 0  # no root, or a double one
+    return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
 
 
 def search_root(function: Callable, a: Real, b: Real) -> Real:
-    """The root of `function(x)`, elementwise, between arrays `a` and `b` of one shape, to rounding; no derivatives."""
+    """The root of `function(x)`, elementwise, between arrays `a` and `b` of one shape, to rounding; no derivatives.
+
+    **Source:** Chandrupatla (1997), inverse quadratic interpolation where it is safe, else bisection.
+    """
     fa, fb = function(a), function(b)
-    tight = 2 * jnp.finfo(a.dtype).eps
+    tight = 4 * jnp.finfo(a.dtype).eps
 
     def unfinished(carry):
         a, b, _, fa, fb, _, _, count = carry

@@ -9,13 +9,15 @@ stretch that drives the block outward. So no impact is missed, whatever its size
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxrock._roots import search_root
 
 Real = Float[Array, "..."]
 
-_MOST_PIECES = 4000
+_MOST_PIECES = 4096
+_PIECES = 16
 
 
 class Lane(eqx.Module):
@@ -55,19 +57,37 @@ def uplift_phase(intensity: Real) -> Real:
     return jnp.arctan2(1.0, jnp.sqrt((intensity - 1) * (intensity + 1)))
 
 
-def follow(intensity: Real, ratio: Real, restitution: Real) -> Lane:
-    """The state at the end of the pulse; not `done` where the impacts were too many to follow."""
+def follow(intensity: np.ndarray, ratio: float, restitution: float) -> Lane:
+    """The state at the end of the pulse; not `done` where the impacts were too many to follow.
 
-    def going(carry):
-        lane, count = carry
-        return jnp.any(~lane.done) & (count < _MOST_PIECES)
+    Some blocks take thousands of arcs, most only a few: those that have arrived are put aside as one goes along.
+    """
+    lane = start(jnp.asarray(intensity))
+    found = jax.tree.map(np.array, lane)
+    waiting = np.arange(intensity.size)
+    for _ in range(_MOST_PIECES // _PIECES):
+        # Repeated to a power of 2: few lengths are compiled.
+        size = max(64, 1 << (waiting.size - 1).bit_length())
+        index = np.resize(waiting, size)
+        part = jax.tree.map(lambda x, index=index: x[index], found)
+        part = _advance(part, intensity[index], jnp.full(size, ratio), jnp.full(size, restitution))
+        for whole, new in zip(jax.tree.leaves(found), jax.tree.leaves(part)):
+            whole[waiting] = np.asarray(new)[: waiting.size]
+        waiting = waiting[~found.done[waiting]]
+        if not waiting.size:
+            break
+    return found
 
-    def step(carry):
-        lane, count = carry
+
+@jax.jit
+def _advance(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
+    """Some pieces of an arc further."""
+
+    def step(_, lane):
         new = _next(lane, intensity, ratio, restitution)
-        return jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane), count + 1
+        return jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane)
 
-    return jax.lax.while_loop(going, step, (start(intensity), 0))[0]
+    return jax.lax.fori_loop(0, _PIECES, step, lane)
 
 
 def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
@@ -99,7 +119,13 @@ def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
         late = grounded & (time > 0)
         return jnp.where(late, value / jnp.where(late, time, 1.0), jnp.where(grounded, lane.speed, value))
 
-    time = search_root(height, 0 * span, jnp.where(hit, lowest, 0.0))
+    # A small hop lasts about 2 speed/restoring.
+    hop = 2 * lane.speed / jnp.maximum(1 + lane.side * intensity * jnp.sin(lane.angle), 1e-30)
+    after = jnp.where(hit, lowest, 0.0)
+    early, late = jnp.where(grounded, 0.7 * hop, 0.0), jnp.where(grounded, 1.5 * hop, after)
+    before = jnp.where((early < after) & (height(jnp.minimum(early, span)) > 0), early, 0.0)
+    after = jnp.where((late < after) & (height(jnp.minimum(late, span)) <= 0), late, after)
+    time = search_root(height, jnp.where(hit, before, 0.0), after)
     arrival = -arc(time, lane, intensity, ratio)[1]
     landed = Lane(
         angle=lane.angle + ratio * time,
@@ -139,8 +165,8 @@ def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, ps
     )
 
 
-def growth(lane: Lane, restitution: Real) -> Real:
-    """Positive where the block overturns after the pulse: at once, or after one more impact."""
+def growth(lane: Lane, restitution: float) -> np.ndarray:
+    """Positive where the block overturns after the pulse: at once, or after one more impact; -1 if not followed."""
     directly = lane.opening + lane.speed - 1
-    arrival = jnp.sqrt(jnp.maximum(lane.speed**2 + lane.opening * (2 - lane.opening), 0.0))
-    return jnp.maximum(directly, restitution * arrival - 1)
+    arrival = np.sqrt(np.maximum(lane.speed**2 + lane.opening * (2 - lane.opening), 0.0))
+    return np.where(lane.done, np.maximum(directly, restitution * arrival - 1), -1.0)

@@ -11,9 +11,7 @@ Result = Float[Array, "..."]
 
 _fraction = lambda name, value: checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))  # noqa: E731
 _restitution = lambda name, value: checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))  # noqa: E731
-_elementwise = elementwise(
-    alpha=_acute, rotation=finite, amplitude=_fraction, restitution=_restitution, impacts=finite
-)
+_elementwise = elementwise(alpha=_acute, rotation=finite, amplitude=_fraction, restitution=_restitution, impacts=finite)
 
 
 @_elementwise

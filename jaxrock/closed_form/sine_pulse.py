@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int
 
 from jaxrock._checks import checked, elementwise, positive
-from jaxrock._roots import bracketed_root, search_root
+from jaxrock._roots import bracketed_root
 from jaxrock.closed_form import _sine_arcs as arcs
 
 Real = Inexact[ArrayLike, "..."]
@@ -32,7 +32,8 @@ def _between(name, value):
     return checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
 
 
-_GRID = 256  # samples that bracket a root of cases 1.1
+_GRID = 256  # samples that bracket a root of case 1.1
+_MOST_DROP = 8  # impacts lost from one sample to the next, where turns are sought one by one
 
 _elementwise = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=_between, time=positive)
 
@@ -180,7 +181,7 @@ def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) 
     """The largest rotation over alpha after the first impact, where that comes after the pulse.
 
     Exact between `impact_time_limit` and `no_impact_limit`, and no result below (there D&D draw it dashed). The first
-    excursion, before the impact, may be larger: see `first_peak`. **Returns:** inf where that impact overturns the block.
+    excursion, before the impact, may be larger: see `first_peak`. **Returns:** inf where that impact overturns.
 
     **Source:** D&D 4.13, with D0* by its definition.
     """
@@ -238,29 +239,33 @@ def overturning_intervals(
 
     - `frequency_ratio`: omega_g/p, positive. `restitution`: in [0, 1].
     - `searched_from`: lowest intensity searched, above 1.
-    - `points`: samples of the search below `impact_time_limit`; islands much narrower than its range over `points`
-      may be missed.
+    - `points`: samples of the search below `impact_time_limit`. Narrower islands and gaps are found where the number
+      of impacts changes with them, as it did wherever this was checked.
 
     **Returns:** `OverturningIntervals`; the ends are roots to rounding.
 
     **Source:** D&D 3.10, 3.18, 3.20 and, for more impacts, the same condition after each arc in closed form; what
     the paper calls complete covers frequency ratios above 1.05 only.
     """
-    ratio = positive("frequency_ratio", frequency_ratio)
-    restitution = _between("restitution", restitution)
-    limit, last = float(_impact_time_limit(ratio)), float(_no_impact_limit(ratio))
+    ratio = float(positive("frequency_ratio", frequency_ratio))
+    restitution = float(_between("restitution", restitution))
+    limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
     samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
-    values = np.asarray(_growth(samples, ratio, restitution)[0])
-    for width in (1, 1 / 64):  # narrow islands and gaps, near the extremes of the samples
-        extreme = _near_zero(values)
-        step = (limit - searched_from) / points * width
-        more = np.unique((samples[extreme, None] + step * np.linspace(-1, 1, 129)[None]).ravel())
-        more = more[(more > searched_from) & (more < limit)]
-        samples, order = np.unique(np.concatenate([samples, more]), return_index=True)
-        values = np.concatenate([values, np.asarray(_growth(more, ratio, restitution)[0])])[order]
+    values, impacts = _at(samples, ratio, restitution)
+    # Where the number of impacts changes there is an island or a gap, however narrow; else it is near an extreme.
+    turns = _impact_turns(samples, impacts, ratio, restitution)
+    step = (limit - searched_from) / points * np.linspace(-1, 1, 129)
+    more = [turns, _inside(turns, samples[1] - samples[0]), (samples[_near_zero(values), None] + step).ravel()]
+    more = np.clip(np.concatenate(more), searched_from, samples[-1])
+    samples, order = np.unique(np.concatenate([samples, more]), return_index=True)
+    values = np.concatenate([values, _at(more, ratio, restitution)[0]])[order]
     lost = values > 0
     change = np.flatnonzero(lost[1:] != lost[:-1])
-    ends = np.asarray(_ends(samples[change], samples[change + 1], ratio, restitution)) if len(change) else np.zeros(0)
+
+    def unchanged(points):
+        return (_at(points, ratio, restitution)[0] > 0) == lost[change][:, None]
+
+    ends = sum(_narrowed(samples[change], samples[change + 1], unchanged, 17)) / 2
     lower, upper = list(ends[~lost[change]]), list(ends[lost[change]])
     if lost[0]:
         lower.insert(0, searched_from)
@@ -271,7 +276,7 @@ def overturning_intervals(
         lower.append(begins)
         upper.append(stops)
     middle = np.minimum((np.array(lower) + np.array(upper)) / 2, np.nextafter(last, 0))
-    impacts = np.asarray(_growth(middle, ratio, restitution)[1]) if len(middle) else np.zeros(0, int)
+    impacts = _at(middle, ratio, restitution)[1]
     return OverturningIntervals(
         np.array([*lower, last]), np.array([*upper, np.inf]), np.array([*impacts, 0]), float(searched_from)
     )
@@ -373,25 +378,49 @@ def _topmost_root(excess, last: Array, w: Array, e: Array) -> Array:
     return jnp.where(index[0] >= 0, bracketed_root(excess, lower, upper, w, e), jnp.inf)
 
 
-@jax.jit
-def _growth(intensity, ratio, restitution):
-    """`growth` at the end of the pulse, -1 where it could not be followed, and the impacts before overturning."""
-    intensity = jnp.asarray(intensity)
-    ratio, restitution = (jnp.broadcast_to(x, intensity.shape) for x in (ratio, restitution))
-    end = arcs.follow(intensity, ratio, restitution)
+def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) -> np.ndarray:
+    """Both sides of the intensities at which the number of impacts falls, each to rounding."""
+    drop = impacts[:-1] - impacts[1:]
+    pairs = np.flatnonzero((drop > 0) & (drop <= _MOST_DROP))
+    levels = [(i, level) for i in pairs for level in range(impacts[i + 1], impacts[i])]
+    if not levels:
+        return np.zeros(0)
+    index, level = np.array(levels).T
+
+    def more(points):
+        return _at(points, ratio, restitution)[1] > level[:, None]
+
+    return np.unique(np.concatenate(_narrowed(samples[index], samples[index + 1], more, 9)))
+
+
+def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarray, np.ndarray]:
+    """`growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
+    if not points.size:
+        return np.zeros(points.shape), np.zeros(points.shape, int)
+    end = arcs.follow(points.ravel(), ratio, restitution)
     directly = end.opening + end.speed > 1
-    return jnp.where(end.done, arcs.growth(end, restitution), -1.0), end.impacts + ~directly
+    return arcs.growth(end, restitution).reshape(points.shape), (end.impacts + ~directly).reshape(points.shape)
 
 
-@jax.jit
-def _ends(lower, upper, ratio, restitution):
-    return search_root(lambda a: _growth(a, ratio, restitution)[0], jnp.asarray(lower), jnp.asarray(upper))
+def _narrowed(below, above, like_below, levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Brackets of a change, each cut into 9 at every level."""
+    rows = np.arange(below.size)
+    for _ in range(levels):
+        grid = below[:, None] + (above - below)[:, None] * np.linspace(0, 1, 10)
+        first = np.cumprod(like_below(grid[:, 1:-1]), axis=1).sum(axis=1)
+        below, above = grid[rows, first], grid[rows, first + 1]
+    return below, above
+
+
+def _inside(turns: np.ndarray, widest: float) -> np.ndarray:
+    """Samples between neighbouring turns that lie within one step of the search."""
+    gaps = np.diff(turns)
+    narrow = gaps < widest
+    return (turns[:-1, None] + gaps[:, None] * np.linspace(0, 1, 33)[1:-1])[narrow].ravel()
 
 
 def _near_zero(values: np.ndarray) -> np.ndarray:
     """Samples that are local extremes towards zero."""
-    size = np.abs(values)
-    return 1 + np.flatnonzero(
-        (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (np.sign(values[1:-1]) == np.sign(values[:-2]))
-        & (np.sign(values[1:-1]) == np.sign(values[2:])) & (size[1:-1] < 0.3)
-    )  # fmt: skip
+    size, sign = np.abs(values), np.sign(values)
+    lowest = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < 0.3)
+    return 1 + np.flatnonzero(lowest & (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:]))

@@ -93,7 +93,8 @@ def rising_wall(pulse_duration: Real, shape: Real) -> Result:
     **Source:** V 3.8b, 3.9b, 3.10b.
     """
     shape = _clipped(shape)
-    return _strength_where(_at_middle, pulse_duration, shape)
+    wall = _safety_wall(pulse_duration, shape)
+    return bracketed_root(_missing_at_middle, 0 * wall, wall, pulse_duration, shape)
 
 
 @_elementwise
@@ -103,7 +104,8 @@ def falling_wall(pulse_duration: Real, shape: Real) -> Result:
     **Source:** V 3.8a (without the term -f^2 that is printed on its right), 3.9a, 3.10a corrected.
     """
     shape = _clipped(shape)
-    return _strength_where(_at_end, pulse_duration, shape)
+    wall = _safety_wall(pulse_duration, shape)
+    return bracketed_root(_missing_at_end, 0 * wall, wall, pulse_duration, shape)
 
 
 @_elementwise
@@ -113,12 +115,8 @@ def peak_border(pulse_duration: Real, shape: Real) -> Result:
     **Source:** V 3.15a at time 1.
     """
     shape = _clipped(shape)
-
-    def velocity(strength, duration, shape):
-        return _at_end(strength, duration, shape)[1]
-
     wall = _safety_wall(pulse_duration, shape)
-    return bracketed_root(velocity, wall, jnp.ones_like(wall), pulse_duration, shape)
+    return bracketed_root(_speed_at_end, wall, jnp.ones_like(wall), pulse_duration, shape)
 
 
 @_elementwise
@@ -183,18 +181,13 @@ def region(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Int[Arra
     **Source:** V figures 3.1 to 3.3.
     """
     shape = _clipped(shape)
-    rising = _strength_where(_at_middle, pulse_duration, shape)
-    falling = _strength_where(_at_end, pulse_duration, shape)
-    wall = _safety_wall(pulse_duration, shape)
-    speed = _at_end(jnp.minimum(uplift_strength, 1.0), pulse_duration, shape)[1]
-    choices = [
-        (uplift_strength < rising, Region.overturns_while_rising),
-        (uplift_strength < falling, Region.overturns_while_falling),
-        (uplift_strength < wall, Region.overturns_after),
-        (uplift_strength >= 1, Region.at_rest),
-        (speed > 0, Region.peaks_after),
-    ]
-    return jnp.select([c for c, _ in choices], [jnp.full(wall.shape, int(r)) for _, r in choices], Region.peaks_during)
+    wall, strength = _safety_wall(pulse_duration, shape), jnp.minimum(uplift_strength, 1.0)
+    middle, end = _at_middle(strength, pulse_duration, shape), _at_end(strength, pulse_duration, shape)
+    found = jnp.where(end[1] > 0, Region.peaks_after, Region.peaks_during)
+    found = jnp.where(uplift_strength >= 1, Region.at_rest, found)
+    found = jnp.where(uplift_strength < wall, Region.overturns_after, found)
+    found = jnp.where((uplift_strength < wall) & (end[0] > strength), Region.overturns_while_falling, found)
+    return jnp.where((uplift_strength < wall) & (middle[0] > strength), Region.overturns_while_rising, found)
 
 
 @_elementwise
@@ -229,9 +222,7 @@ def critical_shape(uplift_strength: Real, pulse_duration: Real) -> Result:
     end = jnp.ones_like(pulse_duration) * (1 - 1e-9)
     within = uplift_strength < -jnp.expm1(-pulse_duration)
     strength = jnp.where(within, uplift_strength, _safety_wall(pulse_duration, jnp.zeros_like(pulse_duration)))
-    return jnp.where(
-        within, _unfolded(bracketed_root(excess, -end, end, strength, pulse_duration)), -jnp.inf
-    )
+    return jnp.where(within, _unfolded(bracketed_root(excess, -end, end, strength, pulse_duration)), -jnp.inf)
 
 
 # ---- The mathematics: arrays of one shape, shapes clipped ----
@@ -280,8 +271,11 @@ def _safety_wall(duration: Array, shape: Array) -> Array:
     wall = twice * growth_ratio(mild * twice) / growth_ratio(mild)
     # A spike: the same, seen from the peak of the pulse.
     steep = jnp.where(shape > _STEEP, shape, _STEEP)
-    rest = growth_ratio(-duration / 2 - steep)
-    left = rest * logarithm_ratio((steep - duration / 2) * rest)
+    s, x = steep + duration / 2, steep - duration / 2
+    rest = growth_ratio(-s)
+    small = x * rest
+    far = -jnp.log((duration + x * jnp.exp(-s)) / s) / jnp.where(small < 0.5, 1.0, x)
+    left = jnp.where(small < 0.5, rest * logarithm_ratio(jnp.where(small < 0.5, small, 0.0)), far)
     spiked = jnp.exp(-steep * left) * jnp.expm1(-steep * (1 - left)) / jnp.expm1(-steep)
     return jnp.where(shape > _STEEP, spiked, wall)
 
@@ -306,9 +300,9 @@ def _at_middle(strength: Array, duration: Array, shape: Array) -> tuple[Array, A
     return _rising(left, strength, duration, shape)
 
 
-def _falling(since: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
-    """Rotation and velocity times strength at a time `since` the pulse's peak, while it falls; V 3.2, H(tau - 1/2)."""
-    angle, speed = _at_middle(strength, duration, shape)
+def _falling(since, middle, strength, duration, shape) -> tuple[Array, Array]:
+    """Rotation and velocity times strength at a time `since` the pulse's peak, from those at the peak; V 3.2."""
+    angle, speed = middle
     up, down = _parts(shape)
     rate, grown = duration * since, -2 * down * since
     nodes = (rate - grown, -rate - grown, -2 * up * since)
@@ -325,16 +319,19 @@ def _falling(since: Array, strength: Array, duration: Array, shape: Array) -> tu
 
 def _at_end(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
     """Rotation and velocity times strength at the end of the pulse, as if there were no ground below."""
-    return _falling(jnp.full_like(duration, 0.5), strength, duration, shape)
+    return _falling(jnp.full_like(duration, 0.5), _at_middle(strength, duration, shape), strength, duration, shape)
 
 
-def _strength_where(part, duration: Array, shape: Array) -> Array:
-    """The strength, below the safety wall, with which the block is at alpha at a time of the pulse."""
+def _missing_at_middle(strength, duration, shape):
+    return _at_middle(strength, duration, shape)[0] - strength
 
-    def missing(strength, duration, shape):
-        return part(strength, duration, shape)[0] - strength
 
-    return bracketed_root(missing, jnp.zeros_like(duration), _safety_wall(duration, shape), duration, shape)
+def _missing_at_end(strength, duration, shape):
+    return _at_end(strength, duration, shape)[0] - strength
+
+
+def _speed_at_end(strength, duration, shape):
+    return _at_end(strength, duration, shape)[1]
 
 
 def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
@@ -343,7 +340,8 @@ def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tup
     strength = jnp.where(rocks, strength, 0.5)
     uplift, _ = _uplift(strength, shape)
     rising = _rising(jnp.clip(time, uplift, 0.5) - uplift, strength, duration, shape)
-    falling = _falling(jnp.clip(time - 0.5, 0.0, 0.5), strength, duration, shape)
+    middle = _at_middle(strength, duration, shape)
+    falling = _falling(jnp.clip(time - 0.5, 0.0, 0.5), middle, strength, duration, shape)
     after = duration * jnp.maximum(time - 1, 0.0)
     sinh, cosh, rise = jnp.sinh(after), jnp.cosh(after), 2 * jnp.sinh(after / 2) ** 2
     free = (
@@ -359,12 +357,17 @@ def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tup
     return values[0], values[1]
 
 
+def _falling_speed(since, angle, speed, strength, duration, shape):
+    return _falling(since, (angle, speed), strength, duration, shape)[1]
+
+
 def _peak(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
     """Time and size of the largest rotation."""
     rocks, wall = strength < 1, _safety_wall(duration, shape)
     lost = strength < wall
     inside = jnp.where(rocks & ~lost, strength, (1 + wall) / 2)
-    angle, speed = (value / inside for value in _at_end(inside, duration, shape))
+    middle, half = _at_middle(inside, duration, shape), jnp.full_like(duration, 0.5)
+    angle, speed = (value / inside for value in _falling(half, middle, inside, duration, shape))
     late = speed > 0
     # S2: free flight from the end of the pulse, z w = (1 - angle)^2 - speed^2
     gap = jnp.where(late, 1 - angle, 1.0)
@@ -374,13 +377,8 @@ def _peak(strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]
     free_time = 1 + jnp.arctanh(jnp.minimum(fast / gap, 1 - 1e-16)) / duration  # V 3.15b
     free_angle = (2 * angle - angle**2 + fast**2) / (1 + jnp.sqrt(bend))
     # S1: the velocity's zero while the pulse falls
-
-    def excess(since, strength, duration, shape):
-        return _falling(since, strength, duration, shape)[1]
-
-    start = jnp.zeros_like(duration)
-    since = bracketed_root(excess, start, start + 0.5, inside, duration, shape)  # V 3.15a
-    early_angle = _falling(since, inside, duration, shape)[0] / inside
+    since = bracketed_root(_falling_speed, 0 * half, half, *middle, inside, duration, shape)  # V 3.15a
+    early_angle = _falling(since, middle, inside, duration, shape)[0] / inside
     time = jnp.where(late, free_time, 0.5 + since)
     size = jnp.where(late, free_angle, early_angle)
     return (
