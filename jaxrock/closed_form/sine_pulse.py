@@ -221,6 +221,7 @@ class OverturningIntervals(eqx.Module):
     """The intensities that overturn a block, from the lowest: everything between `lower` and `upper`.
 
     - `impacts`: before overturning, in the middle of the interval.
+    Without loss (restitution 1) the safe gap below the last interval closes, and it touches the one before.
     - `searched_from`: below this intensity nothing was searched.
     """
 
