@@ -59,6 +59,16 @@ def not_nan(name: str, value: Values) -> Inexact[Array, "..."]:
     return checked(name, value, "be a number", lambda x: x == x)
 
 
+def acute(name: str, value: Values) -> Inexact[Array, "..."]:
+    """Return `value` as an array of angles between 0 and a right one."""
+    return checked(name, value, "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
+
+
+def share(name: str, value: Values) -> Inexact[Array, "..."]:
+    """Return `value` as an array of numbers from 0 to 1."""
+    return checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+
+
 def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
     """Return `array` if it is one number."""
     if array.ndim:

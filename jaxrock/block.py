@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, positive
+from jaxrock._checks import acute, checked, positive, share
 
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
 
@@ -33,7 +33,7 @@ class Block(eqx.Module):
     given_restitution: Inexact[Array, "..."] | None
 
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None = None):
-        self.alpha = checked("alpha", alpha, "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
+        self.alpha = acute("alpha", alpha)
         self.p = positive("p", p)
         if restitution is None:
             self.alpha = checked(
@@ -44,7 +44,7 @@ class Block(eqx.Module):
             )
             self.given_restitution = None
         else:
-            self.given_restitution = checked("restitution", restitution, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+            self.given_restitution = share("restitution", restitution)
 
     @classmethod
     def from_dimensions(

@@ -259,7 +259,7 @@ def test_histories_agree_with_the_single_lobe():
 
 
 def test_sine_intervals_against_the_papers_numbers(references):
-    for case in references["linear_sine_intervals"][::2]:  # the others: the test of the engine's intervals
+    for case in references["linear_sine_intervals"][::4]:  # the others: the test of the engine's intervals
         ratio, e = float(case["frequency_ratio"]), float(case["restitution"])
         found = sine_pulse.overturning_intervals(ratio, e)
         lower, upper = np.array([[float(x) if x else np.inf for x in ends] for ends in case["ends"]]).T
@@ -273,7 +273,7 @@ def engine_sine(intensity, ratio, e):
     return rk.outcome(rk.Block(ALPHA, 1.0, e), rk.SinePulse(ALPHA * intensity, 2 * jnp.pi / ratio), rk.Linear())
 
 
-QUICK = {(0.25, 0.8), (0.5, 0.9), (1.05, 0.95), (4.2, 0.9), (5.3, 1.0), (8.0, 0.8)}
+QUICK = {(0.5, 0.9), (1.05, 0.95), (4.2, 0.9), (5.3, 1.0)}
 
 
 @pytest.mark.parametrize("ratio, e", [
@@ -300,8 +300,12 @@ def test_islands():
     """What the paper's four curves miss: overturning after 3, 5, 7... impacts at low frequency."""
     found = sine_pulse.overturning_intervals(0.5, 0.8)
     np.testing.assert_array_equal(found.impacts, [5, 3, 1, 0])
-    np.testing.assert_array_equal(sine_pulse.overturning_intervals(0.25, 0.95).impacts, [*range(35, 0, -2), 0])
     np.testing.assert_array_equal(sine_pulse.overturning_intervals(3.0, 0.9).impacts, [1, 0])
+
+
+@pytest.mark.slow
+def test_many_islands():
+    np.testing.assert_array_equal(sine_pulse.overturning_intervals(0.25, 0.95).impacts, [*range(35, 0, -2), 0])
 
 
 def test_engine_agrees_with_the_sine_pulse():

@@ -3,15 +3,17 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import checked, elementwise, finite
-from jaxrock.closed_form.restitution import _acute
+from jaxrock._checks import acute, checked, elementwise, finite, share
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
-_fraction = lambda name, value: checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))  # noqa: E731
-_restitution = lambda name, value: checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))  # noqa: E731
-_elementwise = elementwise(alpha=_acute, rotation=finite, amplitude=_fraction, restitution=_restitution, impacts=finite)
+
+def _below_one(name, value):
+    return checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+
+
+_elementwise = elementwise(alpha=acute, rotation=finite, amplitude=_below_one, restitution=share, impacts=finite)
 
 
 @_elementwise

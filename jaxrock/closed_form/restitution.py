@@ -3,14 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import checked, elementwise, positive
+from jaxrock._checks import acute, elementwise, positive
 
 
-def _acute(name, value):
-    return checked(name, value, "be in (0, pi/2)", lambda x: (x > 0) & (x < jnp.pi / 2))
-
-
-@elementwise(alpha=_acute, inertia=positive)
+@elementwise(alpha=acute, inertia=positive)
 def housner(alpha: Inexact[ArrayLike, "..."], inertia: Inexact[ArrayLike, "..."] = 4 / 3) -> Float[Array, "..."]:
     """Angular velocity after an impact over that before it, if the block neither bounces nor slides.
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int
 
-from jaxrock._checks import checked, elementwise, positive
+from jaxrock._checks import checked, elementwise, positive, share
 from jaxrock._roots import bracketed_root
 from jaxrock.closed_form import _sine_arcs as arcs
 
@@ -28,14 +28,10 @@ def _above_one(name, value):
     return checked(name, value, "be greater than 1 (the block uplifts)", lambda x: (x > 1) & (x < np.inf))
 
 
-def _between(name, value):
-    return checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
-
-
 _GRID = 256  # samples that bracket a root of case 1.1
 _MOST_DROP = 8  # impacts lost from one sample to the next, where turns are sought one by one
 
-_elementwise = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=_between, time=positive)
+_elementwise = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=share)
 
 
 class Constants(eqx.Module):
@@ -249,7 +245,7 @@ def overturning_intervals(
     the paper calls complete covers frequency ratios above 1.05 only.
     """
     ratio = float(positive("frequency_ratio", frequency_ratio))
-    restitution = float(_between("restitution", restitution))
+    restitution = float(share("restitution", restitution))
     limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
     samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
     values, impacts = _at(samples, ratio, restitution)

@@ -336,7 +336,7 @@ def _speed_at_end(strength, duration, shape):
 
 def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
     """Rotation and velocity, not a number after the first return."""
-    rocks = strength < 1
+    rocks = (strength < 1) & (shape < _MOST_SHAPE)  # a perfect spike moves nothing
     strength = jnp.where(rocks, strength, 0.5)
     uplift, _ = _uplift(strength, shape)
     rising = _rising(jnp.clip(time, uplift, 0.5) - uplift, strength, duration, shape)
