@@ -259,7 +259,7 @@ def test_histories_agree_with_the_single_lobe():
 
 
 def test_sine_intervals_against_the_papers_numbers(references):
-    for case in references["linear_sine_intervals"][::4]:  # the others: the test of the engine's intervals
+    for case in references["linear_sine_intervals"][::7]:  # the others: the test of the engine's intervals
         ratio, e = float(case["frequency_ratio"]), float(case["restitution"])
         found = sine_pulse.overturning_intervals(ratio, e)
         lower, upper = np.array([[float(x) if x else np.inf for x in ends] for ends in case["ends"]]).T
@@ -285,6 +285,7 @@ def test_engine_finds_every_interval(ratio, e):
     # Without loss near intensity 1 there are endless hops.
     found = sine_pulse.overturning_intervals(ratio, e, searched_from=1.0001 if e < 1 else 1.02)
     ends = np.concatenate([found.lower, found.upper[:-1]])
+    ends = ends[ends > found.searched_from]  # the search may start inside an island
     between = np.linspace(found.searched_from, 1.05 * found.lower[-1], 2048 - 2 * len(ends))
     intensity = np.concatenate([ends * (1 - 1e-10), ends * (1 + 1e-10), between])
     # Without loss the safe gap below the last interval closes: there two intervals touch.
