@@ -149,12 +149,14 @@ def test_forward_derivatives(exact_slopes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.DirectAdjoint()], ids=["checkpointed", "direct"]
+    "adjoint, tolerance",
+    [(diffrax.RecursiveCheckpointAdjoint(), 2e-7), (diffrax.DirectAdjoint(), 1e-6)],
+    ids=["checkpointed", "direct"],
 )
-def test_reverse_derivatives(adjoint, exact_slopes):
+def test_reverse_derivatives(adjoint, tolerance, exact_slopes):
     engine = rk.Diffrax(rtol=1e-10, adjoint=adjoint, max_solves=64)
     slopes = jax.jit(jax.grad(lambda q: peak(q, engine)))(PARAMETERS)
-    np.testing.assert_allclose(slopes, exact_slopes, rtol=2e-7)
+    np.testing.assert_allclose(slopes, exact_slopes, rtol=tolerance)
 
 
 @pytest.mark.slow
