@@ -74,8 +74,18 @@ class Diffrax(AbstractEngine):
             names = ", ".join(kind.__name__ for kind in _ADJOINTS)
             raise ValueError(f"Argument `adjoint` must be one of {names}, but is {type(self.adjoint).__name__}.")
 
-    def stepper(self, scene: Scene, stop: Scalar, history: bool) -> "ArcStepper":
+    @property
+    def reverse(self) -> bool:
+        """Whether reverse mode goes through this engine's own loops: as the adjoint tells."""
+        return not isinstance(self.adjoint, diffrax.ForwardMode)
+
+    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "ArcStepper":
         """This engine at work on a scene."""
+        if taped:
+            raise ValueError(
+                "Derivatives by so many numbers need reverse mode: use Series(), or "
+                "Diffrax(adjoint=diffrax.RecursiveCheckpointAdjoint())."
+            )
         return ArcStepper(scene=scene, stop=stop, history=history, engine=self)
 
     def budget(self, scene: Scene, history: bool) -> int:
@@ -121,6 +131,10 @@ class ArcStepper(AbstractStepper):
         turned = quiet & (state.velocity >= 0) & (after.velocity == 0) & ~after.beyond & (after.opening > 0)
         turned = turned & (after.impact_time > scene.motion.end)
         return replace(after, done=after.done | turned | (after.status != Status.successful))
+
+    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
+        """Not with arcs: they have adjoints of their own."""
+        raise NotImplementedError
 
     def finish(self, state: State) -> State:
         """Follow the free stage by the same arcs."""

@@ -21,6 +21,7 @@ from jaxrock.scene import Scene
 from jaxrock.spread import GRAZING, Spread
 from jaxrock.state import State, surpasses
 from jaxrock.status import Status
+from jaxrock.taylor import meet
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
@@ -28,7 +29,7 @@ Flag = Bool[ArrayLike, ""]
 _LOST = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
 
 
-def when(needed: Flag, function: Callable, value: State) -> State:
+def when(needed: Flag, function: Callable, value: PyTree) -> PyTree:
     """`function(value, needed, inside)` where needed; under vmap the function runs only if some lane needs it.
 
     What the function makes from values outside must pass through `inside` first: otherwise XLA moves it
@@ -43,7 +44,7 @@ def when(needed: Flag, function: Callable, value: State) -> State:
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
 
 
-def either(needed: Flag, function: Callable, value: State) -> State:
+def either(needed: Flag, function: Callable, value: PyTree) -> PyTree:
     """As `when`, but always computed, so that reverse mode goes through."""
     return jax.tree.map(lambda a, b: jnp.where(needed, a, b), function(value, needed, lambda x: x), value)
 
@@ -51,9 +52,15 @@ def either(needed: Flag, function: Callable, value: State) -> State:
 class AbstractEngine(eqx.Module):
     """Settings of a way to solve scenes."""
 
+    @property
+    def reverse(self) -> bool:
+        """Whether reverse mode goes through this engine's own loops."""
+        return False
+
     @abc.abstractmethod
-    def stepper(self, scene: Scene, stop: Scalar, history: bool) -> "AbstractStepper":
-        """This engine at work on a scene, up to the time `stop` [s] (infinite: the end of the motion)."""
+    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "AbstractStepper":
+        """This engine at work on a scene, up to the time `stop` [s] (infinite: the end of the motion); `taped`: so that
+        reverse mode goes through its steps."""
 
     @abc.abstractmethod
     def budget(self, scene: Scene, history: bool) -> int:
@@ -75,6 +82,10 @@ class AbstractStepper(eqx.Module):
     @abc.abstractmethod
     def advance(self, state: State) -> State:
         """The state at the next event or step."""
+
+    @abc.abstractmethod
+    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
+        """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
 
     @abc.abstractmethod
     def finish(self, state: State) -> State:
@@ -127,37 +138,33 @@ class AbstractStepper(eqx.Module):
         # How far a step goes changes nothing: it has no derivative.
         room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
         scaled = rescaled(forcing, length)
-        slope = scaled[1] if len(scaled) > 1 else jnp.zeros_like(length)
-        gap = threshold - jnp.abs(scaled[0])
-        slack = 8 * jnp.finfo(gap.dtype).eps * threshold
+        fixed, level = jax.lax.stop_gradient((scaled, threshold))
+        slope = fixed[1] if len(fixed) > 1 else jnp.zeros_like(length)
+        gap = level - jnp.abs(fixed[0])
+        slack = 8 * jnp.finfo(gap.dtype).eps * level
         touching = jnp.abs(gap) <= slack
-        lifts = (gap < -slack) | (touching & (jnp.sign(scaled[0]) * slope > 0))
-        full = length >= room
-        piece, local, over = self.move_on(state, length * unit, full)
-        piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
-        waited = replace(state, piece=piece, local=local, done=over | never)
+        lifts = (gap < -slack) | (touching & (jnp.sign(fixed[0]) * slope > 0))
 
-        def search(waited, needed, inside):
-            series = rescaled(forcing, inside(length)) + [jnp.zeros_like(length)] * (2 - len(forcing))
+        def search(found, needed, inside):
+            series = [inside(c) for c in fixed] + [jnp.zeros_like(length)] * (2 - len(fixed))
             # A threshold that is touched already counts as passed when it is left behind by more than rounding.
-            one, level = jnp.ones_like(gap), threshold + jnp.where(touching, 2 * slack, 0.0)
-            watches = [Watch(0, -one, level, True), Watch(0, one, -level, True)]
-            landing = first_event([inside(c) for c in series], watches, jnp.zeros_like(gap), needed)
-            value, rate = landing.jet
+            one, least = jnp.ones_like(gap), level + jnp.where(touching, 2 * slack, 0.0)
+            watches = [Watch(0, -one, least, True), Watch(0, one, -least, True)]
+            landing = first_event(series, watches, jnp.zeros_like(gap), needed)
+            value, rate = landing.jet[:2]
             met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
-            early = landing.x < 1
-            cut = replace(
-                waited,
-                piece=jnp.where(early, state.piece, waited.piece),
-                local=jnp.where(early, state.local + landing.x * length * unit, waited.local),
-                done=waited.done & ~early,
-            )
-            return self._lift(cut, value, met, jnp.ones_like(met))
+            return landing.x, jnp.where(met, value, 0.0)
 
         reachable = ~lifts & ~never & (state.side == 0)
-        reachable = reachable & (sum(jnp.abs(c) for c in scaled) >= threshold)
-        waited = branch(reachable, search, waited)
-        lifted = self._lift(state, scaled[0], lifts, touching)
+        reachable = reachable & (sum(jnp.abs(c) for c in fixed) >= level)
+        x, passed = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(length)))
+        met, early = passed != 0, x < 1
+        x = jnp.where(met, meet(x, scaled, jnp.sign(passed) * threshold), x)
+        full = (length >= room) & ~early
+        piece, local, over = self.move_on(state, x * length * unit, full)
+        piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
+        waited = self._lift(replace(state, piece=piece, local=local, done=over | (never & ~early)), passed, met, met)
+        lifted = self._lift(state, fixed[0], lifts, touching)
         return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
 
     def _lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
@@ -181,16 +188,16 @@ class AbstractStepper(eqx.Module):
     def spread_after(self, state: State, angle: Angle, push: Scalar, elapsed: Scalar, step: tuple) -> Spread:
         """Errors after `elapsed` seconds of rocking; `push`: side times acceleration [g]; `step`: what the engine's
         own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
-        table, p = self.scene.table, self.scene.p
+        stepper, state, angle, push, elapsed, step = jax.lax.stop_gradient((self, state, angle, push, elapsed, step))
+        table, p = stepper.scene.table, stepper.scene.p  # an error has no derivative
         eps, time, speed = 2 * jnp.finfo(p.dtype).eps, p * elapsed, jnp.abs(state.velocity)
         clock = eps * p * state.local  # the time of a state is rounded, too
         pull = eps * (table.restoring_at_rest + jnp.abs(push) * table.arm_at_rest)  # of what acceleration is left
         spread = state.spread.after_flow(table.repulsion(angle, push), time)
-        spread = spread.plus(
+        return spread.plus(
             step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
             step[1] + eps * speed + pull * (time + p * state.local),
         )
-        return jax.lax.stop_gradient(spread)  # an error has no derivative
 
     def note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
         """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
@@ -260,7 +267,7 @@ class AbstractStepper(eqx.Module):
         rests = hit & (dies | (rebound == 0))
         more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-        wait = jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
+        wait = jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
         return replace(
             state,
             impacts=state.impacts + (hit & (speed < 0)) + more,

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
-from jaxrock._keep import keep
 from jaxrock._trigonometry import sine_cosine
 from jaxrock.block import Block
 
@@ -112,49 +111,12 @@ class Table(eqx.Module):
         return jnp.sqrt(self.stiffness) * distance
 
 
-def opening_series(
-    table: Table, stretch: Scalar, side, angle: Angle, speed, uplifting, forcing: list, order: int
-) -> list[Scalar]:
-    """Taylor coefficients of the opening angle from x'' = -stretch^2 [restoring(x) + side u arm(x)].
-
-    `stretch` is p times the unit of time, `speed` the velocity per unit. The sine and cosine of the angle
-    follow their own recurrences (Jorba & Zou 2005).
-    """
-    x = [angle.value, speed]
-    slopes = [speed]  # (k + 1) x_{k+1}
-    sine, cosine, arms = [angle.sine], [angle.cosine], []
-    scale = -(stretch**2)
-    for k in range(order - 1):
-        if table.trigonometric and k > 0:
-            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
-            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
-
-        def combine(constant, line, of_sine, of_cosine, k):
-            terms = [] if constant is None or k > 0 else [constant]
-            terms += [] if line is None else [line * x[k]]
-            terms += [] if of_sine is None else [of_sine * sine[k]]
-            terms += [] if of_cosine is None else [of_cosine * cosine[k]]
-            return sum(terms) if terms else None
-
-        arms.append(combine(table.m0, None, table.ms, table.mc, k))
-        products = [forcing[j] * arms[k - j] for j in range(min(k, len(forcing) - 1) + 1) if arms[k - j] is not None]
-        moment = sum(products) * side if products else 0.0
-        restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
-        moment = moment if restoring is None else moment + restoring
-        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))), stretch)
-        if k == 0:
-            term = jnp.where(uplifting, 0.0, term)  # by continuity, exactly
-        x.append(term)
-        slopes.append((k + 2) * term)
-    return x
-
-
 class Housner(eqx.Module):
     """The rigid rectangular block with its exact nonlinear equation (Housner 1963; D&D 2012, 2.1-2.2)."""
 
     def table(self, block: Block) -> Table:
         """sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x; its arm is cos(alpha - x)."""
-        sine, cosine = jnp.sin(block.alpha), jnp.cos(block.alpha)
+        sine, cosine = sine_cosine(block.alpha)  # a quotient of XLA's own becomes a tangent, which LLVM may lack
         return Table(rs=-cosine, rc=sine, ms=sine, mc=cosine)
 
     @property

@@ -40,6 +40,15 @@ def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]
     return values
 
 
+def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
+    """Coefficients about a point `by` further on (synthetic division)."""
+    terms = list(coefficients)
+    for start in range(len(terms) - 1):
+        for j in range(len(terms) - 2, start - 1, -1):
+            terms[j] = terms[j] + by * terms[j + 1]
+    return terms
+
+
 def derivative(coefficients: list[Scalar]) -> list[Scalar]:
     """Coefficients of the derivative."""
     return [k * c for k, c in enumerate(coefficients)][1:]
@@ -142,24 +151,22 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
     When the strides do not come to an end (a zero that is nearly double), the march stops where it
     is, with no hit: everything before that point is certain. Where not `needed` it does not start (lanes
-    march together under vmap, as long as the slowest). The march is not differentiated: x is, as a root.
+    march together under vmap, as long as the slowest). It has no derivatives.
     """
     highest = max(w.derivative for w in watches) + 1
-    fixed, start = jax.lax.stop_gradient((coefficients, start))
-    quiet = [w._replace(offset=jax.lax.stop_gradient(w.offset)) for w in watches]
-    falls = [_falls(fixed, w.sign, w.derivative + 2) for w in quiet]
+    falls = [_falls(coefficients, w.sign, w.derivative + 2) for w in watches]
     eps = jnp.finfo(start.dtype).eps
 
     def clear(x, radius):
         """For every quantity the length after x on which it has no zero."""
-        values, end = jet(fixed, x, highest), jnp.minimum(x + radius, 1.0)
+        values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
             _clear_length(
                 w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end)
             )
-            for w, fall in zip(quiet, falls)
+            for w, fall in zip(watches, falls)
         ]
-        return [jnp.where(w.active, length, jnp.inf) for w, length in zip(quiet, lengths)]
+        return [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
 
     def march(carry):
         x, radius, _, count = carry
@@ -173,21 +180,4 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
         lambda carry: carry[2], march, (start, jnp.ones_like(start), needed, jnp.zeros_like(start, jnp.int32))
     )
     hits = [length <= 32 * eps * x for length in clear(x, radius)]
-    values, newton = jet(coefficients, x, highest), jnp.zeros_like(x)
-    for w, hit in zip(watches[::-1], hits[::-1]):
-        slope = jax.lax.stop_gradient(values[w.derivative + 1])
-        simple = hit & (slope != 0)
-        newton = jnp.where(simple, (w.offset - values[w.derivative]) / jnp.where(simple, slope, 1.0), newton)
-    x = _moving_with(x, newton)
     return Landing(x, jet(coefficients, x, highest), hits)
-
-
-@jax.custom_jvp
-def _moving_with(x: Scalar, step: Scalar) -> Scalar:
-    """x, with the derivatives of x + step: a root, and the Newton step that vanishes there."""
-    return x
-
-
-@_moving_with.defjvp
-def _(primals, tangents):
-    return primals[0], tangents[0] + tangents[1]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import Values, as_real, checked, scalar
+from jaxrock._derivatives import differentiable
 from jaxrock.arcs import Diffrax
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine, AbstractStepper
@@ -244,11 +245,25 @@ def _start(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
 
 @jax.jit
 def _outcome(block, motion, model, initial, engine) -> Outcome:
+    def run(scene):
+        return _follow(*scene, engine, taped=False)
+
+    def on_tape(scene):
+        return _follow(*scene, engine, taped=True)
+
+    return (run if engine.reverse else differentiable(run, on_tape))((block, motion, model, initial))
+
+
+def _follow(block, motion, model, initial, engine, taped: bool) -> Outcome:
     scene = Scene.of(block, motion, model)
-    stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
+    stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    budget = engine.budget(scene, history=False)
-    state = engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+    # A tape holds all steps, as a history does.
+    budget = engine.budget(scene, history=taped)
+    if taped:
+        state, _ = stepper.on_tape(state, budget)
+    else:
+        state = engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
     return _conclude(stepper, state)
 
 

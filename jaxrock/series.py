@@ -8,21 +8,24 @@ lane needs is not taken.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import ArrayLike, Bool, Inexact, Int
 
+from jaxrock._derivatives import differentiable, with_derivatives_of
 from jaxrock._keep import keep
-from jaxrock.engine import AbstractEngine, AbstractStepper, when
+from jaxrock.engine import AbstractEngine, AbstractStepper, either, when
 from jaxrock.free import free_stage
-from jaxrock.models import Angle, Table, opening_series
+from jaxrock.models import Angle, Table
 from jaxrock.polynomial import (
     Watch,
     derivative,
     fall_bound,
     first_event,
+    horner,
     jet,
     keeps_sign,
     last_size,
@@ -32,6 +35,8 @@ from jaxrock.polynomial import (
 from jaxrock.scene import Scene
 from jaxrock.state import State, surpasses
 from jaxrock.status import Status
+from jaxrock.tape import on_tape
+from jaxrock.taylor import End, Start, arrive, expand
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
@@ -64,7 +69,7 @@ class Series(AbstractEngine):
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"Argument `max_steps` must be at least 1, but is {self.max_steps}.")
 
-    def stepper(self, scene: Scene, stop: Scalar, history: bool) -> "TaylorStepper":
+    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
         """This engine at work on a scene; short pieces of a record need few terms."""
         if not isinstance(scene.table, Table):
             raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
@@ -74,6 +79,7 @@ class Series(AbstractEngine):
             order=self.order or (8 if scene.pieces > 32 else 16),
             tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
             history=history,
+            taped=taped,
         )
 
     def budget(self, scene: Scene, history: bool) -> int:
@@ -94,25 +100,35 @@ class TaylorStepper(AbstractStepper):
     tolerance: float = eqx.field(static=True)
     history: bool = eqx.field(static=True)
     doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
+    taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through
 
-    def forcing(self, state: State) -> tuple[list[Scalar], Scalar]:
-        """Taylor coefficients of the ground acceleration [g] about a state, in time/unit, and the unit [s]."""
-        terms, unit = self.scene.forcing(state.piece, state.local, self.order)
-        return [keep(u, state.local) for u in terms], keep(unit, state.local)
+    def forcing(self, piece: Int[ArrayLike, ""], local: Scalar) -> tuple[list[Scalar], Scalar]:
+        """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
+        terms, unit = self.scene.forcing(piece, local, self.order)
+        return [keep(u, local) for u in terms], keep(unit, local)
 
     def advance(self, state: State) -> State:
+        """One step of a lane."""
+        return self.step(state, *self.forcing(state.piece, state.local))
+
+    def step(self, state: State, forcing: list[Scalar], unit: Scalar) -> State:
         """One step of a lane: waiting at rest, or rocking."""
-        forcing, unit = self.forcing(state)
         resting = state.side == 0
         waited = self.wait(state, forcing, unit, self.order, self.tolerance, when)
         rocked = self._rock(state, forcing, unit, ~resting)
         return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
 
+    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
+        """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
+        return on_tape(self.step, self.forcing, state, budget)
+
     def finish(self, state: State) -> State:
         """The free stage by energy."""
         scene, table = self.scene, self.scene.table
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        stage = free_stage(table, scene.restitution, state.opening, state.velocity, moving)
+        # In reverse mode what is not taken (roots of zero) would spoil what is.
+        follow = differentiable(lambda scene: free_stage(*scene)) if self.taped else lambda scene: free_stage(*scene)
+        stage = follow((table, scene.restitution, state.opening, state.velocity, moving))
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
         beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
@@ -136,138 +152,107 @@ class TaylorStepper(AbstractStepper):
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Expand the series again about the node."""
-        forcing, unit = self.forcing(node)
-        coefficients = self.expand(node, self.angle(node), forcing, unit)
-        opening, speed = coefficients[-1], jnp.zeros_like(unit)
-        for c in reversed(coefficients[:-1]):
-            speed = speed * (elapsed / unit) + opening
-            opening = opening * (elapsed / unit) + c
+        forcing, unit = self.forcing(node.piece, node.local)
+        coefficients = expand(self.start(node, forcing, unit), self.order).opening
+        opening, speed = jet(coefficients, elapsed / unit, 1)
         return opening, speed / unit
 
-    def angle(self, state: State) -> Angle:
-        """The opening angle of a state with its sine and cosine."""
-        angle = Angle.of(state.opening)
-        return Angle(angle.value, keep(angle.sine, state.local), keep(angle.cosine, state.local))
-
-    def expand(self, state: State, angle: Angle, forcing, unit) -> list[Scalar]:
-        """Taylor coefficients of the opening angle about a state, in time/unit."""
+    def start(self, state: State, forcing: list[Scalar], unit: Scalar) -> Start:
+        """Where a step starts, with time in `unit`."""
         stretch = keep(self.scene.p * unit, state.local)
-        speed = state.velocity * stretch
-        return opening_series(self.scene.table, stretch, state.side, angle, speed, state.uplifting, forcing, self.order)
+        return Start(
+            self.scene.table, stretch, state.side, state.uplifting, state.opening, state.velocity * stretch, forcing
+        )
 
     def _rock(self, state: State, forcing, unit, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
-        scene = self.scene
-        saddle = scene.table.saddle
-        room = self.room(state) / unit
-        angle = self.angle(state)
-        coefficients = self.expand(state, angle, forcing, unit)
-        # Relative to the motion itself while it is small: tiny rotations keep their digits too.
-        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: max(self.order // 2, 4)]))))
-        length = step_length(coefficients, self.tolerance * size, jnp.minimum(room, 16.0))
-        full = length >= room * (1 - 1e-9)
-        length = jnp.where(full, room, length)
-        length = keep(length, state.local)
-        stretch = unit * scene.p
-        opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
-        velocity = speed / stretch
-
-        signs = self._signs(state, coefficients)
-        turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
-        crossing = (opening >= saddle) != state.beyond
-        top_speed = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(
-            _bend(coefficients, length), state.local
+        # More room than a step can take is as good as endless, and finite.
+        start, room = self.start(state, forcing, unit), jnp.minimum(self.room(state), 32 * unit) / unit
+        # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
+        stepper, before, *rest = jax.lax.stop_gradient((self, state, start, room))
+        step = _Step.of(stepper, before, *rest, rocking)
+        cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
+        impact, turning, extremum, crossing, ground = cut.hits
+        early = cut.length < step.length
+        full = step.full & ~early
+        saddle = self.scene.table.saddle
+        end = End(
+            length=cut.length,
+            opening=cut.opening,
+            speed=cut.speed,
+            level=jnp.where(crossing, saddle, jnp.where(ground, jnp.pi / 2, 0.0)),
+            room=room,
+            meets=impact | crossing | ground,
+            turns=turning,
+            full=full,
         )
-        monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
-        faster = (top_speed > state.fastest * stretch) & ~monotone
-        eventful = (turning | crossing | faster | (opening <= 0)) & rocking
-        if self.history:
-            eventful = eventful | (rocking & (opening >= jnp.pi / 2))
-
-        escaped = self.escaped(state, angle)
-        piece, local, over = self.move_on(state, length * unit, full)
-        moved = (length > 0) & rocking
-
-        rounded, missed = self.tolerance * size, last_size(coefficients) * length**self.order
-        time = jnp.where(length > 0, length * stretch, jnp.inf)
-        step = rounded + missed, rounded + missed * jnp.maximum(self.order / time, 1.0)
-
-        def spread_at(elapsed):
-            return self.spread_after(state, angle, state.side * forcing[0], elapsed, step)
-
+        length, opening, speed = arrive(self.order, start, end)
+        elapsed, velocity = length * unit, speed / start.stretch
+        piece, local, over = self.move_on(state, elapsed, full)
+        escaped = self.escaped(state, start.angle)
+        moved = (step.length > 0) & rocking
+        time = jnp.where(step.length > 0, step.length * start.stretch, jnp.inf)
+        missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
         passed = replace(
             state,
-            spread=spread_at(length * unit),
+            spread=self.spread_after(state, start.angle, state.side * forcing[0], elapsed, missed),
             piece=piece,
             local=local,
-            opening=opening,
-            velocity=jnp.where(moved, velocity, state.velocity),
+            opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
+            velocity=jnp.where(turning, 0.0, jnp.where(moved, velocity, state.velocity)),
+            beyond=state.beyond ^ crossing,
             uplifting=state.uplifting & ~moved,
-            extremal=state.extremal & ~moved,
+            extremal=jnp.where(moved, extremum, state.extremal),
             fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
             done=over,
         )
 
-        def land(passed, needed, inside):
-            scaled = [inside(c) for c in rescaled(coefficients, inside(length))]
-            series = rescaled(forcing, inside(length))
-            return self._land(state, passed, scaled, series, signs, faster, spread_at, length, unit, needed)
+        def happen(passed, needed, inside):
+            return self._happen(state, passed, start, step, (length, opening, velocity), cut, inside)
 
-        stepped = when(eventful & moved, land, passed)
+        stepped = (either if self.taped else when)(step.eventful & (impact | turning | crossing), happen, passed)
         down = stepped.opening >= jnp.pi / 2
-        overturned = state.overturned | escaped | down if scene.falls_flat else state.overturned | escaped
+        overturned = state.overturned | escaped | down if self.scene.falls_flat else state.overturned | escaped
         # A history goes on to the ground; for an outcome the verdict is enough.
         ends = overturned & down if self.history else overturned
         return replace(stepped, overturned=overturned, done=stepped.done | ends)
 
-    def _signs(self, state: State, coefficients) -> tuple[Scalar, Scalar]:
-        """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
-
-        def of(value, following):
-            return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
-
-        velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
-        acceleration = jnp.where(
-            state.uplifting, 1.0, of(jnp.where(state.extremal, 0.0, coefficients[2]), coefficients[3])
-        )
-        return velocity, acceleration
-
-    def _land(self, state, passed, scaled, forcing, signs, faster, spread_at, length, unit, needed) -> State:
-        """Find the first event of a step, move the lane there, and let it happen."""
-        scene, saddle = self.scene, self.scene.table.saddle
+    def _cut(self, state: State, step: "_Step", needed: Flag, inside) -> "_Cut":
+        """The first event of a step."""
+        length, saddle = inside(step.length), self.scene.table.saddle
+        scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
         watches = [
             Watch(0, one, 0.0, True),
-            Watch(1, signs[0], 0.0, self._matters(state, scaled)),
-            Watch(2, signs[1], 0.0, faster),
+            Watch(1, step.signs[0], 0.0, self._matters(state, scaled)),
+            Watch(2, step.signs[1], 0.0, step.faster),
             Watch(0, jnp.where(state.beyond, 1.0, -1.0), saddle, True),
         ]
         if self.history:
             watches.append(Watch(0, -one, jnp.pi / 2, state.opening < jnp.pi / 2))
         landing = first_event(scaled, watches, _clear_start(state, scaled, saddle), needed)
-        per_step = length * unit * scene.p
-        opening, speed, bend = landing.jet[0], landing.jet[1] / per_step, landing.jet[2] / per_step**2
+        opening, speed, bend = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
         impact, turning, extremum, crossing = landing.hits[:4]
         ground = landing.hits[4] if self.history else jnp.zeros_like(impact)
-        impact = impact & (speed <= 0)
-        early = landing.x < 1
-        elapsed = landing.x * length * unit
-        landed = replace(
-            passed,
-            spread=spread_at(elapsed),
-            piece=jnp.where(early, state.piece, passed.piece),
-            local=jnp.where(early, state.local + elapsed, passed.local),
-            opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
-            velocity=jnp.where(turning, 0.0, speed),
-            beyond=state.beyond ^ crossing,
-            extremal=extremum,
-            fastest=jnp.maximum(state.fastest, jnp.abs(speed)),
-            done=passed.done & ~early,
-        )
-        landed = self.note(landed, signs[0] > 0, turning, crossing, opening, speed, bend)
-        reach = (1 - landing.x) * length * unit
-        steepest = sum(k * jnp.abs(c) for k, c in enumerate(forcing)) / jnp.where(length > 0, length * unit, 1.0)
-        return self.impact(landed, impact, speed, jet(forcing, landing.x, 0)[0], steepest, reach)
+        hits = impact & (speed <= 0), turning, extremum, crossing, ground
+        return _Cut(landing.x * length, opening, speed, bend, hits)
+
+    def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
+        """Let the event at the end of a step happen."""
+        length, opening, velocity = (inside(value) for value in end)
+        forcing = [inside(u) for u in start.forcing]
+        acceleration = horner(forcing, length)
+        # The value of the series, with the derivatives of the equation.
+        law = self.scene.table.acceleration(Angle.of(opening), velocity, state.side * acceleration)
+        bend = with_derivatives_of(cut.bend / start.stretch**2, law)
+        impact, turning, _, crossing, _ = cut.hits
+        noted = self.note(passed, step.signs[0] > 0, turning, crossing, opening, velocity, bend)
+        scaled = rescaled(forcing, step.length)
+        unit = start.stretch / self.scene.p
+        lasts = jnp.where(step.length > 0, step.length * unit, 1.0)
+        steepest = sum(k * jnp.abs(c) for k, c in enumerate(scaled)) / lasts
+        reach = (step.length - length) * unit
+        return self.impact(noted, impact, velocity, acceleration, *jax.lax.stop_gradient((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
         """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
@@ -282,6 +267,74 @@ class TaylorStepper(AbstractStepper):
         least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
         return inward | state.beyond | (top >= state.peak) | (least < state.closeness)
+
+
+class _Cut(NamedTuple):
+    """Where a step ends, its events included; per unit of the step's time."""
+
+    length: Scalar
+    opening: Scalar
+    speed: Scalar
+    bend: Scalar
+    hits: tuple[Flag, ...]  # impact, turning point, velocity extremum, saddle, ground
+
+
+class _Step(NamedTuple):
+    """A Taylor step as far as its series goes, and whether anything may happen within it."""
+
+    coefficients: list[Scalar]
+    length: Scalar
+    full: Flag  # goes as far as there is room
+    rounded: Scalar  # errors of its end [rad]
+    missed: Scalar
+    signs: tuple[Scalar, Scalar]  # with which velocity and acceleration start
+    faster: Flag  # the velocity may become the largest so far within it
+    eventful: Flag
+    whole: _Cut  # its end, if nothing happens
+
+    @classmethod
+    def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
+        """The step from a state on."""
+        scene, order = stepper.scene, stepper.order
+        coefficients = expand(start, order).opening
+        # Relative to the motion itself while it is small: tiny rotations keep their digits too.
+        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: max(order // 2, 4)]))))
+        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, 16.0))
+        full = length >= room * (1 - 1e-9)
+        length = keep(jnp.where(full, room, length), state.local)
+        opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
+
+        signs = _signs(state, coefficients)
+        turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
+        crossing = (opening >= scene.table.saddle) != state.beyond
+        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
+        monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
+        faster = (top > state.fastest * start.stretch) & ~monotone
+        eventful = turning | crossing | faster | (opening <= 0)
+        if stepper.history:
+            eventful = eventful | (opening >= jnp.pi / 2)
+        return cls(
+            coefficients=coefficients,
+            length=length,
+            full=full,
+            rounded=stepper.tolerance * size,
+            missed=last_size(coefficients) * length**order,
+            signs=signs,
+            faster=faster,
+            eventful=eventful & rocking & (length > 0),
+            whole=_Cut(length, opening, speed, jnp.zeros_like(speed), (jnp.zeros_like(full),) * 5),
+        )
+
+
+def _signs(state: State, coefficients) -> tuple[Scalar, Scalar]:
+    """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
+
+    def of(value, following):
+        return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+    velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
+    acceleration = of(jnp.where(state.extremal, 0.0, coefficients[2]), coefficients[3])
+    return velocity, jnp.where(state.uplifting, 1.0, acceleration)
 
 
 def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:

@@ -1,0 +1,220 @@
+"""A Taylor step of a rocking block: the series of the opening angle, and how the step's end moves with its start.
+
+The end of a step is linear in small changes of its start, of the forcing and of the model. Its weights follow from the
+recurrence of the series run backwards, once for the angle and once for the velocity, whatever the number of
+parameters: derivatives cost a few products each. The end itself moves, too, where an event or a knot sets it.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import ArrayLike, Bool, Inexact
+
+from jaxrock._keep import keep
+from jaxrock.models import Angle, Table
+from jaxrock.polynomial import derivative, horner
+
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
+
+
+class Start(NamedTuple):
+    """Where a step starts. Time is in a unit of choice."""
+
+    table: Table
+    stretch: Scalar  # p times the unit of time
+    side: Scalar
+    uplifting: Flag  # leaves rest with zero acceleration
+    opening: Scalar
+    speed: Scalar  # of the opening, per unit
+    forcing: list[Scalar]  # Taylor coefficients of the ground acceleration [g]
+
+    @property
+    def angle(self) -> Angle:
+        """The opening angle with its sine and cosine."""
+        angle = Angle.of(self.opening)
+        return Angle(angle.value, keep(angle.sine, self.stretch), keep(angle.cosine, self.stretch))
+
+
+class End(NamedTuple):
+    """Where a step ends, and what sets that."""
+
+    length: Scalar  # time from the start
+    opening: Scalar
+    speed: Scalar
+    level: Scalar  # opening angle at which it ends if it `meets` it
+    room: Scalar  # time at which it ends if it is `full`
+    meets: Flag
+    turns: Flag  # ends where the velocity vanishes
+    full: Flag
+
+
+class Expansion(NamedTuple):
+    """Taylor coefficients about a start: the opening angle, its sine and cosine, and the arm."""
+
+    opening: list[Scalar]
+    sine: list[Scalar]
+    cosine: list[Scalar]
+    arm: list[Scalar | None]
+
+
+def _product(first: list, second: list, k: int):
+    """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
+    terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
+    return sum(terms) if terms else 0.0
+
+
+def expand(start: Start, order: int) -> Expansion:
+    """Series of x'' = -stretch^2 [restoring(x) + side u arm(x)].
+
+    The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
+    """
+    table, stretch, angle = start.table, start.stretch, start.angle
+    x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
+    sine, cosine, arms = [angle.sine], [angle.cosine], []
+    scale = -(stretch**2)
+    for k in range(order - 1):
+        if table.trigonometric and k > 0:
+            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
+            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
+
+        def combine(constant, line, of_sine, of_cosine, k):
+            terms = [] if constant is None or k > 0 else [constant]
+            terms += [] if line is None else [line * x[k]]
+            terms += [] if of_sine is None else [of_sine * sine[k]]
+            terms += [] if of_cosine is None else [of_cosine * cosine[k]]
+            return sum(terms) if terms else None
+
+        arms.append(combine(table.m0, None, table.ms, table.mc, k))
+        moment = _product(start.forcing, arms, k) * start.side
+        restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
+        moment = moment if restoring is None else moment + restoring
+        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))), stretch)
+        if k == 0:
+            term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
+        x.append(term)
+        slopes.append((k + 2) * term)
+    return Expansion(x, sine, cosine, arms)
+
+
+class _Weights(NamedTuple):
+    """What the end of a step (its angle, or its velocity) gains per change of what it depends on."""
+
+    start: Start  # the weights in place of the values; zero for side and uplifting
+
+    def times(self, change: Start) -> Scalar:
+        """The change of the end."""
+        pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=_is_zero), strict=True)
+        return sum((weight * moved for weight, moved in pairs if not _is_zero(moved)), start=0.0)
+
+
+def _is_zero(tangent) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weights]:
+    """Weights of the angle and of the velocity at the end.
+
+    A change c of the coefficients obeys c_{k+2} = scale/((k + 1)(k + 2)) [sum_j pull_j c_{k-j} + source_k], linear
+    with the coefficients `pull` of the derivative of the moment. Backwards: `of_term[m]` is what the end gains from
+    a change of coefficient m, `of_source[k]` from one of source k.
+    """
+    table, side, stretch = start.table, start.side, start.stretch
+    series = expand(start, order)
+    moments = range(order - 1)
+    trigonometric = table.ms is not None or table.mc is not None
+    pushed_sine = [keep(_product(start.forcing, series.sine, k), stretch) for k in moments if trigonometric]
+    pushed_cosine = [keep(_product(start.forcing, series.cosine, k), stretch) for k in moments if trigonometric]
+
+    def pull(k):
+        terms = [] if table.r1 is None or k > 0 else [table.r1]
+        terms += [] if table.rs is None else [table.rs * series.cosine[k]]
+        terms += [] if table.rc is None else [-table.rc * series.sine[k]]
+        terms += [] if table.ms is None else [side * table.ms * pushed_cosine[k]]
+        terms += [] if table.mc is None else [-side * table.mc * pushed_sine[k]]
+        return keep(sum(terms), stretch)
+
+    pulls = [pull(k) for k in (moments if table.trigonometric else range(1))]
+    powers = [jnp.ones_like(length)]
+    for _ in range(order):
+        powers.append(keep(powers[-1] * length, stretch))
+    scale = -(stretch**2)
+
+    def of(own):
+        of_term, of_source = [None] * (order + 1), [None] * (order - 1)
+        for m in range(order, -1, -1):
+            later = [of_source[k] * pulls[k - m] for k in range(m, min(order - 1, m + len(pulls)))]
+            of_term[m] = keep(own[m] + sum(later, start=0.0), stretch)
+            if m >= 2:
+                source = of_term[m] * scale * (1 / (m * (m - 1)))
+                of_source[m - 2] = keep(jnp.where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
+
+        def along(terms):
+            return sum(w * c for w, c in zip(of_source, terms))
+
+        def of_push(j):
+            pairs = [(of_source[k], series.arm[k - j]) for k in range(j, order - 1)]
+            return side * sum((w * arm for w, arm in pairs if arm is not None), start=jnp.zeros_like(length))
+
+        def coefficient(present, terms):
+            return None if present is None else along(terms)
+
+        weights = Table(
+            r0=coefficient(table.r0, powers[:1]),
+            r1=coefficient(table.r1, series.opening),
+            rs=coefficient(table.rs, series.sine),
+            rc=coefficient(table.rc, series.cosine),
+            m0=coefficient(table.m0, [side * u for u in start.forcing]),
+            ms=coefficient(table.ms, [side * u for u in pushed_sine]),
+            mc=coefficient(table.mc, [side * u for u in pushed_cosine]),
+        )
+        zero = jnp.zeros_like(length)
+        of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
+        of_forcing = [of_push(j) for j in range(len(start.forcing))]
+        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_forcing))
+
+    return of(powers), of([jnp.zeros_like(length)] + [k * power for k, power in enumerate(powers[:-1], 1)])
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def arrive(order: int, start: Start, end: End) -> tuple[Scalar, Scalar, Scalar]:
+    """Length, opening angle and speed of a step's end, as they are given; their derivatives follow the flow.
+
+    Only these derive from `start`, and from `end.level` and `end.room`: the values in `end` need no derivatives.
+    """
+    return end.length, end.opening, end.speed
+
+
+@functools.partial(arrive.defjvp, symbolic_zeros=True)
+def _(order, primals, tangents):
+    (start, end), (d_start, d_end) = primals, tangents
+    length, opening, speed = arrive(order, start, end)  # with derivatives of their own, for those of higher order
+    d_opening, d_speed = (weights.times(d_start) for weights in _weights(order, start, length))
+    angle, push = Angle.of(opening), start.side * horner(start.forcing, length)
+    bend = -(start.stretch**2) * (start.table.restoring(angle) + push * start.table.arm(angle))
+    d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
+    # An end that is grazed has no derivative: infinite, for the status to tell.
+    d_length = jnp.where(end.full, d_room, 0.0)
+    d_length = jnp.where(end.turns, -d_speed / jnp.where(end.turns, bend, 1.0), d_length)
+    d_length = jnp.where(end.meets, (d_level - d_opening) / jnp.where(end.meets, speed, 1.0), d_length)
+    moved = d_length, d_opening + speed * d_length, d_speed + bend * d_length
+    return (length, opening, speed), tuple(jnp.broadcast_to(d, length.shape) for d in moved)
+
+
+@jax.custom_jvp
+def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
+    """x, where the series `forcing` meets `level`, as it is given; its derivatives are those of the root."""
+    return x
+
+
+@functools.partial(meet.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    (_, forcing, _), (_, d_forcing, d_level) = primals, tangents
+    x = meet(*primals)
+    moved = [jnp.zeros_like(x) if _is_zero(d) else d for d in d_forcing]
+    slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
+    lack = (0.0 if _is_zero(d_level) else d_level) - horner(moved, x)
+    return x, jnp.where(slope == 0, 0.0, lack / jnp.where(slope == 0, 1.0, slope))
