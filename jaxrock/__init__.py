@@ -11,6 +11,11 @@ from typing import TYPE_CHECKING
 from jaxrock import closed_form as closed_form, similarity as similarity
 from jaxrock.arcs import Diffrax as Diffrax
 from jaxrock.block import Block as Block
+from jaxrock.critical import (
+    Critical as Critical,
+    critical_amplitudes as critical_amplitudes,
+    critical_durations as critical_durations,
+)
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
 from jaxrock.pulses import (
@@ -25,6 +30,12 @@ from jaxrock.pulses import (
 )
 from jaxrock.records import example_record as example_record, read_record as read_record
 from jaxrock.response import Outcome as Outcome, Response as Response, outcome as outcome, simulate as simulate
+from jaxrock.sensitivity import (
+    Sensitivity as Sensitivity,
+    SensitivityMap as SensitivityMap,
+    sensitivity as sensitivity,
+    sensitivity_map as sensitivity_map,
+)
 from jaxrock.series import Series as Series
 from jaxrock.spectra import (
     OverturningMap as OverturningMap,

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._derivatives import differentiable
 from jaxrock.engine import AbstractEngine, AbstractStepper, either
 from jaxrock.guards import LONGEST, ORDER, Arc, Forcing, Illinois, field, first_guard, first_step, usual_step
 from jaxrock.models import Angle
@@ -96,14 +97,32 @@ class Diffrax(AbstractEngine):
         """A loop that goes with the adjoint."""
         return eqxi.while_loop(unfinished, step, carry, max_steps=budget, kind=_ADJOINTS[type(self.adjoint)])
 
-    def controller_for(self, scene: Scene, piece: Int[ArrayLike, ""]) -> diffrax.AbstractStepSizeController:
-        """The step-size controller within a piece of the motion."""
-        if self.controller is not None:
-            return self.controller
+    def limits(self, scene: Scene, piece: Int[ArrayLike, ""]) -> tuple[Scalar, Scalar]:
+        """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        longest = jax.lax.stop_gradient(jnp.minimum(LONGEST, scene.p * scene.scales[piece]))
-        return diffrax.PIDController(rtol=self.rtol, atol=jax.lax.stop_gradient(atol), dtmax=longest)
+        return jax.lax.stop_gradient((atol, jnp.minimum(LONGEST, scene.p * scene.scales[piece])))
+
+    def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None):
+        """The arc, for `length` (p t) at most."""
+        length = jnp.where(arc.side != 0, length, 0.0)
+        # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
+        # do so: of two equal times, derivatives go with each by one half.
+        first = first_step(arc, self.rtol)
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            self.solver,
+            t0=jnp.zeros_like(length),
+            t1=length,
+            dt0=jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0)),
+            y0=jnp.stack([arc.opening, arc.velocity]),
+            args=arc,
+            stepsize_controller=self.controller or diffrax.PIDController(self.rtol, limits[0], dtmax=limits[1]),
+            event=event,
+            adjoint=self.adjoint,
+            max_steps=_MOST_STEPS,
+            throw=False,
+        )
 
 
 class ArcStepper(AbstractStepper):
@@ -148,34 +167,14 @@ class ArcStepper(AbstractStepper):
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
-        solution = self._solve(
-            Arc.of(self.scene, node, Forcing.of(self.scene, node), self.history),
-            node.piece,
-            self.scene.p * elapsed,
-            None,
-        )
-        opening, velocity = solution.ys[-1]
-        return opening, velocity * self.scene.p
+        arc = Arc.of(self.scene, node, Forcing.of(self.scene, node), self.history)
 
-    def _solve(self, arc: Arc, piece: Int[Array, ""], length: Scalar, event: diffrax.Event | None):
-        """The arc, for `length` (p t) at most."""
-        engine = self.engine
-        length = jnp.where(arc.side != 0, length, 0.0)
-        first = jnp.minimum(first_step(arc, engine.rtol), length)
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            engine.solver,
-            t0=jnp.zeros_like(length),
-            t1=length,
-            dt0=jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0)),
-            y0=jnp.stack([arc.opening, arc.velocity]),
-            args=arc,
-            stepsize_controller=engine.controller_for(self.scene, piece),
-            event=event,
-            adjoint=engine.adjoint,
-            max_steps=_MOST_STEPS,
-            throw=False,
-        )
+        def run(scene):
+            return self.engine.solve(*scene, event=None).ys[-1]
+
+        run = run if self.engine.reverse else differentiable(run)
+        opening, velocity = run((arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
+        return opening, velocity * self.scene.p
 
     def _is_hop(self, state: State, bend: Scalar, forcing: Forcing) -> Flag:
         """Whether the block comes back to the ground at once, without a peak or a speed that matters.
@@ -190,7 +189,7 @@ class ArcStepper(AbstractStepper):
         change = forcing.steepest * flight * table.arm_at_rest + 2 * height * (1 + table.restoring_at_rest + back)
         certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
         least = (table.restoring(Angle.of(jnp.minimum(height, table.saddle))) / table.restoring_at_rest) ** 2
-        small = (height <= state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
+        small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
         starts = (state.opening == 0) & (v > 0) & (bend < 0)
         return starts & certain & small & (not self.history)
 
@@ -206,7 +205,7 @@ class ArcStepper(AbstractStepper):
         arc = replace(arc, hop=self._is_hop(state, arc.bend, forcing))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
-        solution = self._solve(arc, state.piece, length, event)
+        solution = engine.solve(arc, engine.limits(scene, state.piece), length, event)
         time, y = solution.ts[-1], solution.ys[-1]
         void = rocking & arc.is_void(time, y, solution.event_mask)
         time = jnp.where(void, jnp.maximum(time, jnp.minimum(arc.horizon, length)), time)

@@ -222,9 +222,14 @@ class AbstractStepper(eqx.Module):
         if self.scene.falls_flat:
             balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= self.doubt * state.spread.angle))
         undecided = balanced & (state.status == Status.successful)
+        highest = higher & (opening > state.peak)
+        clearance = jnp.where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
         return replace(
             state,
-            peak=jnp.where(higher, jnp.maximum(opening, state.peak), state.peak),
+            peak=jnp.where(highest, opening, state.peak),
+            second=jnp.where(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
+            clearance=clearance,
+            peak_clearance=jnp.where(highest, clearance, state.peak_clearance),
             peak_time=jnp.where(first, self.time(state), state.peak_time),
             error=jnp.where(first, jax.lax.stop_gradient(state.spread.angle), state.error),
             closeness=closeness,
@@ -250,7 +255,7 @@ class AbstractStepper(eqx.Module):
         push = side * forcing * table.arm_at_rest
         here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
         spread = jax.lax.stop_gradient(state.spread.after_impact(speed, -there, -here, e))
-        weaker = jnp.minimum(here, there)
+        here_without, weaker = here, jnp.minimum(here, there)
         held = (weaker > 0) & (e < 1)
         here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
         remaining = 2 * rebound * (1 / here + e / there) / jnp.where(held, 1 - e * e, 1.0)
@@ -267,6 +272,8 @@ class AbstractStepper(eqx.Module):
         rests = hit & (dies | (rebound == 0))
         more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
+        slowed = hit & (here_without < 0)
+        depth = speed**2 / (2 * jnp.where(slowed, -here_without, 1.0))
         wait = jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
         return replace(
             state,
@@ -274,6 +281,7 @@ class AbstractStepper(eqx.Module):
             impact_time=jnp.where(hit, self.time(state), state.impact_time),
             impact_velocity=jnp.where(hit, state.side * speed, state.impact_velocity),
             side=jnp.where(rests, 0.0, jnp.where(hit, side, state.side)),
+            clearance=jnp.where(slowed, jnp.minimum(state.clearance, depth), state.clearance),
             opening=jnp.where(hit, 0.0, state.opening),
             velocity=jnp.where(rests, 0.0, jnp.where(hit, rebound, state.velocity)),
             spread=Spread.where(rests, Spread.none(speed), Spread.where(hit, spread, state.spread)),

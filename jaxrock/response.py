@@ -33,6 +33,11 @@ class Outcome(eqx.Module):
       impacts without end of a block that comes to rest are counted down to hops of rounding height.
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
+    - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
+      peaks tie, or where before the peak an impact is grazed (both within 1e-9); nor if the block overturned.
+    - `clearance`: how far from a graze the block has been before the peak [rad]: the least height at which it turned
+      back before the ground, or the least depth to which it would have come where it hit the ground while being slowed
+      down; infinite if there was neither. Where it is zero the number of impacts changes.
     - `error`: estimated standard error of `max_rotation` from rounding and tolerance [rad]; infinite if overturned.
     - `status`: a `Status`. With any other than successful the numbers are not results.
 
@@ -53,6 +58,8 @@ class Outcome(eqx.Module):
     impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
     margin: Scalar
+    differentiable: Bool[Array, "..."]
+    clearance: Scalar
     error: Scalar
     status: Status
 
@@ -275,7 +282,11 @@ def _conclude(stepper: AbstractStepper, state: State) -> Outcome:
     def unless_overturned(value):
         return jnp.where(overturned, jnp.inf, value)
 
+    tie = final.peak - final.second <= 1e-9 * final.peak
+    graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
     return Outcome(
+        differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
+        clearance=jnp.where(overturned, final.clearance, final.peak_clearance),
         max_rotation=unless_overturned(final.peak),
         max_velocity=unless_overturned(final.fastest * stepper.scene.p),
         time_of_max=unless_overturned(final.peak_time),
@@ -289,25 +300,18 @@ def _conclude(stepper: AbstractStepper, state: State) -> Outcome:
 
 @jax.jit
 def _simulate(block, motion, model, initial, duration, engine) -> Response:
+    stop = motion.end + 10 / block.p if duration is None else jnp.asarray(duration)
+
+    def run(scene):
+        return _steps(*scene, engine, taped=False)
+
+    def on_tape(scene):
+        return _steps(*scene, engine, taped=True)
+
+    run = run if engine.reverse else differentiable(run, on_tape)
+    state, nodes, final = run((block, motion, model, initial, stop))
     scene = Scene.of(block, motion, model)
-    dtype = scene.p.dtype
-    stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration, dtype)
-    stepper, budget = engine.stepper(scene, stop, history=True), engine.budget(scene, history=True)
-    state = initial_state(scene, *(jnp.asarray(x, dtype) for x in initial))
-    nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
-
-    def store(nodes, state):
-        return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
-
-    def step(carry):
-        state, nodes = carry
-        state = stepper.advance(state)
-        return state, store(nodes, state)
-
-    state, nodes = engine.loop(
-        lambda carry: ~carry[0].done & (carry[0].steps < budget), step, (state, store(nodes, state)), budget
-    )
-    final = _conclude(stepper, state)
+    stepper, budget = engine.stepper(scene, stop, history=True), nodes.steps.size - 1
     index = jnp.arange(budget + 1)
     times = jax.vmap(stepper.time)(nodes)
     times = jnp.where(index <= state.steps, times, jnp.inf)
@@ -332,6 +336,32 @@ def _simulate(block, motion, model, initial, duration, engine) -> Response:
         node_times=times,
         impacted=impacted & (index <= state.steps),
     )
+
+
+def _steps(block, motion, model, initial, stop, engine, taped: bool) -> tuple[State, State, Outcome]:
+    """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
+    scene = Scene.of(block, motion, model)
+    stop = stop.astype(scene.p.dtype)
+    stepper, budget = engine.stepper(scene, stop, history=True, taped=taped), engine.budget(scene, history=True)
+    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+    if taped:
+        state, nodes = stepper.on_tape(state, budget)
+        nodes = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]])[: budget + 1], nodes, state)
+        return state, nodes, _conclude(stepper, state)
+    nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
+
+    def store(nodes, state):
+        return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
+
+    def step(carry):
+        state, nodes = carry
+        state = stepper.advance(state)
+        return state, store(nodes, state)
+
+    state, nodes = engine.loop(
+        lambda carry: ~carry[0].done & (carry[0].steps < budget), step, (state, store(nodes, state)), budget
+    )
+    return state, nodes, _conclude(stepper, state)
 
 
 @jax.jit

@@ -23,6 +23,11 @@ def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array,
     return values
 
 
+def peak_bound(motion: AbstractMotion) -> Scalar:
+    """A bound of the motion's acceleration [g]: its peak, for records and most pulses."""
+    return jnp.max(motion.bounds)
+
+
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion."""
 

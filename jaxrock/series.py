@@ -142,7 +142,9 @@ class TaylorStepper(AbstractStepper):
             overturned=state.overturned | stage.overturned,
             closeness=jnp.minimum(state.closeness, stage.closeness),
             closeness_beyond=beyond,
-            peak=jnp.maximum(state.peak, stage.peak),
+            peak=jnp.where(stage.peak > state.peak, stage.peak, state.peak),
+            second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
+            peak_clearance=jnp.where(stage.peak > state.peak, state.clearance, state.peak_clearance),
             peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
             error=jax.lax.stop_gradient(jnp.where(higher, off / jnp.where(steepness > 0, steepness, 1.0), state.error)),
             fastest=jnp.maximum(state.fastest, stage.fastest),
@@ -266,7 +268,7 @@ class TaylorStepper(AbstractStepper):
         top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, table.saddle), table.saddle)
         least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
-        return inward | state.beyond | (top >= state.peak) | (least < state.closeness)
+        return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # also a near tie
 
 
 class _Cut(NamedTuple):

@@ -97,11 +97,11 @@ def rocking_spectrum(
 
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
-    period = _axis("period", period)
+    period = axis("period", period)
     Block(alpha, 1.0, restitution)  # raises here, where values are known
 
     scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
-    found = _in_chunks(_under_motion(model, engine), (period,), scene, "spectrum", progress)
+    found = in_chunks(_under_motion(model, engine), (period,), scene, "spectrum", progress)
     scale = (scene[0], 2 * jnp.pi / period * scene[0])
     return _spectrum(period, found, scale)
 
@@ -180,18 +180,18 @@ def overturning_map(
 
 def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
     """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
-    ratio, intensity = _axis("frequency_ratio", frequency_ratio), _axis("intensity", intensity)
+    ratio, intensity = axis("frequency_ratio", frequency_ratio), axis("intensity", intensity)
     Block(alpha, 1.0, restitution)
 
     scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
     # Neighbours in intensity share a chunk: they move alike.
     columns, rows = (x.ravel() for x in jnp.meshgrid(ratio, intensity, indexing="ij"))
-    found = _in_chunks(_under_pulse(pulse, model, engine), (rows, columns), scene, label, progress)
+    found = in_chunks(_under_pulse(pulse, model, engine), (rows, columns), scene, label, progress)
     shape = (ratio.size, intensity.size)
     return jax.tree.map(lambda x: x.reshape(shape).T, found), ratio, intensity
 
 
-def _axis(name: str, values: Values) -> Float[Array, " n"]:
+def axis(name: str, values: Values) -> Float[Array, " n"]:
     array = jnp.atleast_1d(positive(name, values))
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")
@@ -238,9 +238,9 @@ def _runner(function: Callable) -> Callable:
     """`function(*point, scene)` over flat axes whose length is a multiple of the lanes."""
 
     def run(axes, scene):
-        chunks = [axis.reshape(-1, _LANES) for axis in axes]
+        chunks = [values.reshape(-1, _LANES) for values in axes]
         found = jax.lax.map(lambda chunk: jax.vmap(lambda *point: function(*point, scene))(*chunk), chunks)
-        return jax.tree.map(lambda x: x.reshape(-1), found)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
     return jax.jit(run, compiler_options=_compiler_options())
 
@@ -257,16 +257,18 @@ def _compiler_options() -> dict | None:
     return _CPU_OPTIONS
 
 
-def _in_chunks(function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None):
-    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape."""
+def in_chunks(
+    function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None, block: int | None = None
+):
+    """`function(*point, scene)` at every point of the flat axes, in blocks (of `block` points) of one compiled shape."""
     size = axes[0].size
-    block = min(_BLOCK, -(-size // _LANES) * _LANES)
+    block = block or min(_BLOCK, -(-size // _LANES) * _LANES)
     blocks = -(-size // block)
-    padded = [jnp.concatenate([axis, jnp.full(blocks * block - size, axis[-1])]) for axis in axes]
+    padded = [jnp.concatenate([values, jnp.full(blocks * block - size, values[-1])]) for values in axes]
     run, parts = _runner(function), []
     bar = Progress(size, label, progress)
     for i in range(blocks):
-        part = [axis[i * block : (i + 1) * block] for axis in padded]
+        part = [values[i * block : (i + 1) * block] for values in padded]
         # Results wait in host memory, whatever the size of the surface.
         parts.append(jax.tree.map(np.asarray, run(part, scene)))
         bar.update(min((i + 1) * block, size))

@@ -33,6 +33,10 @@ class State(eqx.Module):
     impact_velocity: Scalar  # of the rotation, just before it
     closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
     closeness_beyond: Scalar  # the same since the saddle was last crossed outward
+    clearance: Scalar  # how far from a graze it has been: the least height at which it turned back before the
+    # ground, or depth to which it would have come without the ground where it was being slowed down
+    peak_clearance: Scalar  # the same up to the peak
+    second: Scalar  # the next highest peak
     spread: Spread  # of opening and velocity
     overturned: Flag
     done: Flag
@@ -71,6 +75,9 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         impact_velocity=zero,
         closeness=jnp.where(side == 0, unlifted, jnp.where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
         closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
+        clearance=jnp.full_like(opening, jnp.inf),
+        peak_clearance=jnp.full_like(opening, jnp.inf),
+        second=zero,
         spread=Spread.none(opening).plus(eps * opening, eps * outward),
         overturned=no,
         done=no,

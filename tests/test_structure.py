@@ -49,7 +49,10 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "closed_form.pushover": set(),
     "closed_form": {f"closed_form.{name}" for name in ("single_lobe", "sine_pulse", "pushover", "restitution")},
     "similarity": {"block"},
-    "plot": {"spectra", "closed_form"},
+    "parameters": {"scene"},
+    "sensitivity": {"spectra", "parameters"},
+    "critical": {"spectra", "parameters"},
+    "plot": {"sensitivity", "critical", "closed_form"},
     "__init__": {"plot", "records", "similarity"},
     "__main__": {"__init__"},
 }
