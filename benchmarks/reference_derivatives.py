@@ -302,6 +302,20 @@ def texts(a, values, digits=20):
     return [a.text(value, digits) if value else "0" for value in values]
 
 
+def first(scene, many, dropped):
+    """The path of a scene, what is noted of it and its gradient; without the gradient where it is not wanted."""
+    try:
+        path = scene.run()
+        reason, notes = judge(scene, path, many)
+        slopes = None if reason else gradient(scene, path)
+    except ArithmeticError as error:
+        dropped[str(error)] += 1
+        return None, None, None
+    if slopes is None:
+        dropped[reason or "impact within the step"] += 1
+    return path, notes, slopes
+
+
 def find(a, index, model, kind, many, second, sampled, samples, dropped):
     """One scene with all that is stored of it."""
     rng = np.random.default_rng([SEED, index])
@@ -309,18 +323,8 @@ def find(a, index, model, kind, many, second, sampled, samples, dropped):
     while True:
         parameters = draw(rng, model, kind, many, peak)
         scene = Scene(a, model, kind, parameters, samples)
-        try:
-            path = scene.run()
-            reason, notes = judge(scene, path, many)
-            if reason:
-                dropped[reason] += 1
-                continue
-            slopes = gradient(scene, path)
-        except ArithmeticError as error:
-            dropped[str(error)] += 1
-            continue
+        path, notes, slopes = first(scene, many, dropped)
         if slopes is None:
-            dropped["impact within the step"] += 1
             continue
         rows, runs, worst = slopes
         if worst > AGREE:

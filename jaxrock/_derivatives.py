@@ -5,6 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
 
@@ -59,28 +60,22 @@ def _value_and_jacobian(function: Callable, structure, moves: list[bool]) -> Cal
     def both(leaves):
         moving = [leaf for leaf, moves_ in zip(leaves, moves) if moves_]
         sizes = [leaf.size for leaf in moving]
+        cuts = np.cumsum(sizes)[:-1]
 
         def of(moving):
             rest = iter(moving)
             return function(jax.tree.unflatten(structure, [next(rest) if m else x for x, m in zip(leaves, moves)]))
 
-        directions = jnp.split(jnp.eye(sum(sizes), dtype=jnp.result_type(*moving)), list(_ends(sizes)), axis=1)
+        directions = jnp.split(jnp.eye(sum(sizes), dtype=jnp.result_type(*moving)), cuts, axis=1)
         directions = [d.reshape(-1, *leaf.shape).astype(leaf.dtype) for d, leaf in zip(directions, moving)]
         value, columns = jax.vmap(lambda *d: jax.jvp(of, (moving,), (list(d),)), out_axes=(None, 0))(*directions)
 
         def per_leaf(out, column):
             if not jnp.issubdtype(out.dtype, jnp.inexact):
                 return None
-            parts = jnp.split(column, list(_ends(sizes)), axis=0)
+            parts = jnp.split(column, cuts, axis=0)
             return [jnp.moveaxis(p, 0, -1).reshape(*out.shape, *leaf.shape) for p, leaf in zip(parts, moving)]
 
         return value, [per_leaf(*pair) for pair in zip(jax.tree.leaves(value), jax.tree.leaves(columns), strict=True)]
 
     return both
-
-
-def _ends(sizes: list[int]):
-    total = 0
-    for size in sizes[:-1]:
-        total += size
-        yield total

@@ -49,8 +49,8 @@ class Diffrax(AbstractEngine):
     - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits.
     - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is
       only what it is trusted to keep.
-    - `adjoint`: `diffrax.ForwardMode()` (the default), `diffrax.RecursiveCheckpointAdjoint()` for reverse mode, or
-      `diffrax.DirectAdjoint()` (both, slower).
+    - `adjoint`: `diffrax.ForwardMode()` (the default: all modes, reverse by way of a small Jacobian),
+      `diffrax.RecursiveCheckpointAdjoint()` for reverse mode by many numbers, or `diffrax.DirectAdjoint()` (slower).
     - `max_solves`: budget of solves, each of one arc or a part of it; None takes 4,096 and four per piece of
       the motion.
 

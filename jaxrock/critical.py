@@ -57,6 +57,11 @@ class Critical(eqx.Module):
     complete: Bool[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
 
+    @property
+    def lowest(self) -> Float[Array, "..."]:
+        """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none."""
+        return jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
+
 
 def critical_amplitudes(
     block: Block,
@@ -88,7 +93,7 @@ def critical_amplitudes(
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
     factors = grid * (scenes.threshold / scenes.peak)[:, None]
-    return _critical(scenes, np.log(factors), _Amplitude(model, engine), scenes.amplitude, progress)
+    return _critical(scenes, np.log(factors), _Amplitude(model, engine), progress)
 
 
 def critical_durations(
@@ -115,7 +120,7 @@ def critical_durations(
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
-    return _critical(scenes, grid, _Duration(model, engine), scenes.end, progress)
+    return _critical(scenes, grid, _Duration(model, engine), progress)
 
 
 def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
@@ -133,7 +138,6 @@ class _Scenes(eqx.Module):
     threshold: np.ndarray  # [g], (scenes,)
     peak: np.ndarray  # bound of the acceleration [g]
     amplitude: np.ndarray  # as the motion names it [g]
-    end: np.ndarray  # [s]
     single: bool = eqx.field(static=True)
 
     @classmethod
@@ -157,7 +161,6 @@ class _Scenes(eqx.Module):
                 model.table(block_).threshold,
                 peak_bound(motion_),
                 jnp.abs(named(block_, motion_)["amplitude"]),
-                motion_.end,
             )
 
         return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
@@ -191,7 +194,7 @@ class _Kind:
         return jnp.where(decided, margin, jnp.nan), slope, found.impact_count
 
     def slopes(self, z, index, scenes):
-        """Derivatives of the root z by the parameters."""
+        """Derivatives of the logarithm of the critical value by the parameters."""
         block, motion = _pick(scenes, index)
         values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
 
@@ -199,8 +202,13 @@ class _Kind:
             place = rebuilt(block, motion, named(block, motion) | values)
             return self.margin(z, *place)[0]
 
+        def unit(values):
+            return jnp.log(self.unit(*rebuilt(block, motion, named(block, motion) | values)))
+
         by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
-        return {name: -slope / jnp.where(by_z == 0, jnp.nan, by_z) for name, slope in by_values.items()}
+        own = jax.jacfwd(unit)(values)
+        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
+        return {name: own[name] - slope / by_z for name, slope in by_values.items()}
 
 
 class _Amplitude(_Kind):
@@ -208,9 +216,13 @@ class _Amplitude(_Kind):
         """A larger motion."""
         return block, Scaled(motion, jnp.exp(z))
 
+    def unit(self, block, motion):
+        """What the factor multiplies: the amplitude [g]."""
+        return jnp.abs(named(block, motion)["amplitude"])
+
     def keeps(self, name: str) -> bool:
         """Whether the critical value depends on a parameter."""
-        return not name.endswith("amplitude")
+        return name != "amplitude"
 
 
 class _Duration(_Kind):
@@ -218,9 +230,13 @@ class _Duration(_Kind):
         """A longer motion is a larger p: only their product counts."""
         return eqx.tree_at(lambda b: b.p, block, block.p * jnp.exp(z)), motion
 
+    def unit(self, block, motion):
+        """What the factor multiplies: the duration of the motion [s]."""
+        return motion.end
+
     def keeps(self, name: str) -> bool:
         """Whether the critical value depends on a parameter."""
-        return not name.endswith(("duration", "period", "dt", "delay", "center"))
+        return name not in ("duration", "period", "dt")
 
 
 @functools.lru_cache(maxsize=32)
@@ -228,7 +244,7 @@ def _compiled(kind: type, model: Model, engine: AbstractEngine | None, slopes: b
     return kind(model, engine).slopes if slopes else kind(model, engine).at
 
 
-def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, scale: np.ndarray, progress: bool | None) -> Critical:
+def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, progress: bool | None) -> Critical:
     """Search, find, differentiate, and sort by scenes."""
     scene = scenes.block, scenes.motion
 
@@ -244,7 +260,8 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, scale: np.ndarray,
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
     names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
-    value = np.exp(ends["z"]) * scale[ends["index"]]
+    units = np.asarray(jax.vmap(lambda index: kind.unit(*_pick(scene, index)))(jnp.arange(grid.shape[0])))
+    value = np.exp(ends["z"]) * units[ends["index"]]
     derivative = np.zeros((order.size, len(names)))
     if order.size:
         slopes = run(True, ends["safe"], ends["index"])
@@ -345,7 +362,7 @@ def _roots(at: Callable, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         onto = ((values[1] < 0) == (margin[1, open_] < 0)).astype(int)
         for array, new in zip((z, margin, slope, impacts), values):
             array[onto, columns[open_]] = new
-    rising = margin[0] > 0
+    rising = ~(margin[0] < 0)  # zero is safe
     lost, safe = rising.astype(int), 1 - rising.astype(int)
     return {
         "index": index,

@@ -255,7 +255,9 @@ class AbstractStepper(eqx.Module):
         push = side * forcing * table.arm_at_rest
         here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
         spread = jax.lax.stop_gradient(state.spread.after_impact(speed, -there, -here, e))
-        here_without, weaker = here, jnp.minimum(here, there)
+        slowed = hit & (here < 0)  # by the forcing, before it hit the ground: without that it would have turned back
+        depth = speed**2 / (2 * jnp.where(slowed, -here, 1.0))
+        weaker = jnp.minimum(here, there)
         held = (weaker > 0) & (e < 1)
         here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
         remaining = 2 * rebound * (1 / here + e / there) / jnp.where(held, 1 - e * e, 1.0)
@@ -272,8 +274,6 @@ class AbstractStepper(eqx.Module):
         rests = hit & (dies | (rebound == 0))
         more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-        slowed = hit & (here_without < 0)
-        depth = speed**2 / (2 * jnp.where(slowed, -here_without, 1.0))
         wait = jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
         return replace(
             state,

@@ -34,7 +34,8 @@ class Outcome(eqx.Module):
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
     - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
-      peaks tie, or where before the peak an impact is grazed (both within 1e-9); nor if the block overturned.
+      peaks tie, or where before the peak an impact is grazed (both within 1e-9); nor if the block overturned. Where an
+      impact or the uplift falls on a jump of the motion, and in a tie, derivatives are those of one side.
     - `clearance`: how far from a graze the block has been before the peak [rad]: the least height at which it turned
       back before the ground, or the least depth to which it would have come where it hit the ground while being slowed
       down; infinite if there was neither. Where it is zero the number of impacts changes.

@@ -87,7 +87,7 @@ class Series(AbstractEngine):
         return self.max_steps or (4096 + 2 * scene.pieces if history else _OUTCOME_STEPS)
 
     def loop(self, unfinished, step, carry, budget: int):
-        """A loop that stops at the last lane; forward mode only."""
+        """A loop that stops at the last lane."""
         return jax.lax.while_loop(unfinished, step, carry)
 
 

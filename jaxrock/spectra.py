@@ -260,7 +260,7 @@ def _compiler_options() -> dict | None:
 def in_chunks(
     function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None, block: int | None = None
 ):
-    """`function(*point, scene)` at every point of the flat axes, in blocks (of `block` points) of one compiled shape."""
+    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape (`block` points)."""
     size = axes[0].size
     block = block or min(_BLOCK, -(-size // _LANES) * _LANES)
     blocks = -(-size // block)

@@ -177,3 +177,19 @@ def test_derivative_with_respect_to_a_model_parameter():
     values = jax.jit(jax.vmap(of))(jnp.array([0.1 - 1e-4, 0.1 + 1e-4]))
     assert float(slope) == pytest.approx(float(values[1] - values[0]) / 2e-4, rel=1e-5)
     assert 0 < float(value) < 0.2
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_history():
+    """Also just after the starts of arcs, where a solve is a single short step."""
+    times = jnp.linspace(0.02, 1.9, 95)
+
+    def rotations(amplitude, engine):
+        response = rk.simulate(BLOCK, rk.SinePulse(amplitude, 1.4), engine=engine, samples=2)
+        return response(times)[0]
+
+    exact, found = (
+        jax.jit(lambda a, e=engine: jax.jvp(lambda a: rotations(a, e), (a,), (1.0,))[1])(0.23)
+        for engine in (rk.Series(), rk.Diffrax(rtol=1e-10))
+    )
+    np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-6)

@@ -1,0 +1,316 @@
+"""Derivatives: against 40-digit differences, of every order, forward and reverse, and where they do not exist."""
+
+import functools
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.polynomial import jet
+from jaxrock.taylor import End, Start, arrive, expand
+
+MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
+PULSES = {
+    "sine": rk.SinePulse,
+    "exponential": rk.ExponentialPulse,
+    "half sine": rk.HalfSinePulse,
+    "cosine": rk.CosinePulse,
+    "triangle": rk.TriangularPulse,
+    "ricker symmetric": rk.RickerPulse,
+}
+RESULTS = ("max_rotation", "max_velocity", "time_of_max")
+SCENES = json.loads((Path(__file__).parent / "derivatives.json").read_text())["scenes"]
+
+
+def scene(kind, x):
+    """Block and motion from alpha, p, restitution and the motion's own parameters."""
+    block = rk.Block(x[0], x[1], x[2])
+    if kind == "record":
+        return block, x[3] * rk.example_record()
+    return block, PULSES[kind](*[x[k] for k in range(3, x.size)])
+
+
+def results(kind, model, x):
+    found = rk.outcome(*scene(kind, x), MODELS[model])
+    return jnp.stack([getattr(found, name) for name in RESULTS]), found
+
+
+@functools.cache
+def first(kind, model):
+    """Derivatives (scenes, results, parameters) and outcomes, compiled once."""
+    return jax.jit(jax.vmap(jax.jacfwd(functools.partial(results, kind, model), has_aux=True)))
+
+
+def points(kind, model, having="max_rotation"):
+    rows = [row for row in SCENES if row["kind"] == kind and row["model"] == model and having in row]
+    return rows, np.array([row["block"] + row["motion"] for row in rows])
+
+
+def slow(*row):
+    return pytest.param(*row, marks=pytest.mark.slow)
+
+
+EVERYWHERE = [(kind, model) for kind in (*PULSES, "record") for model in MODELS]
+QUICK = [("sine", "nonlinear"), ("exponential", "linear"), ("record", "nonlinear")]
+
+
+@pytest.mark.parametrize("kind, model", [row if row in QUICK else slow(*row) for row in EVERYWHERE])
+def test_first_derivatives(kind, model):
+    """630 scenes with up to 150 impacts, each by all its parameters: alpha, p, restitution, and those of the motion."""
+    rows, x = points(kind, model)
+    assert len(rows) >= 15
+    slopes, found = map(lambda part: jax.tree.map(np.asarray, part), first(kind, model)(x))
+    assert np.all(found.status == rk.Status.successful) and np.all(found.differentiable)
+    exact = np.array([[[float(c) for c in row[name]["gradient"]] for name in RESULTS] for row in rows])
+    # Relative to the derivative; where that is small next to the others, to a thousandth of the largest.
+    weight = np.where(x == 0, 1.0, np.abs(x))[:, None, :]
+    sizes = np.abs(exact) * weight
+    scale = np.maximum(sizes, 1e-3 * sizes.max(axis=2, keepdims=True)) / weight
+    np.testing.assert_array_less(np.abs(slopes - exact), 1e-9 * scale + 1e-300)
+    # A motion of another duration on a block of another size: only their product counts.
+    if kind in ("sine", "half sine", "cosine"):
+        np.testing.assert_allclose(x[:, 1] * slopes[:, 0, 1], x[:, 4] * slopes[:, 0, 4], rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
+def test_second_derivatives(model):
+    """Hessians of the peak of 30 and more scenes, by five parameters, against 40-digit differences."""
+    rows, x = points("sine", model, "hessian")
+    peak = functools.partial(results, "sine", model)
+    found = jax.jit(jax.vmap(jax.hessian(lambda q: peak(q)[0][0])))(x)
+    exact = np.array([[[float(c) for c in line] for line in row["hessian"]] for row in rows])
+    sizes = np.abs(exact * x[:, None, :] * x[:, :, None])
+    scale = np.maximum(sizes, 1e-3 * sizes.max(axis=(1, 2), keepdims=True)) / np.abs(x[:, None, :] * x[:, :, None])
+    assert len(rows) >= 20
+    np.testing.assert_array_less(np.abs(found - exact), 1e-6 * scale)
+
+
+@pytest.mark.slow
+def test_every_nesting_is_the_same():
+    """Forward over reverse, reverse over reverse, forward over forward, under vmap or not."""
+    x = jnp.array([0.2, 2.0, 0.9, 0.23, 1.4])
+
+    def peak(q):
+        return results("sine", "linear", q)[0][0]
+
+    exact = jax.jit(jax.hessian(peak))(x)
+    for nested in (jax.jacrev(jax.jacrev(peak)), jax.jacfwd(jax.jacfwd(peak)), jax.jacrev(jax.jacfwd(peak))):
+        np.testing.assert_allclose(jax.jit(nested)(x), exact, rtol=1e-11)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.hessian(peak)))(jnp.stack([x, x]))[1], exact, rtol=1e-11)
+
+
+def test_reverse_is_forward():
+    """A gradient by a vector is the same in both modes, to rounding; and under vmap of a sum."""
+    _, x = points("exponential", "linear")
+    slopes, _ = first("exponential", "linear")(x)
+    every = jax.vmap(functools.partial(results, "exponential", "linear"))
+    summed = jax.jit(jax.grad(lambda x: jnp.sum(every(x)[0][:, 0])))
+    np.testing.assert_allclose(summed(x), slopes[:, 0], rtol=1e-13)
+
+
+@pytest.mark.parametrize("model", ["nonlinear", slow("linear")])
+def test_all_samples_of_a_record(model):
+    """5,690 derivatives at once, in reverse: some against 40-digit differences, all of them summed along the record."""
+    record = rk.example_record()
+    gradient = jax.jit(
+        jax.value_and_grad(
+            lambda samples, x: rk.outcome(rk.Block(*x), rk.Record(samples, record.dt), MODELS[model]).max_rotation
+        )
+    )
+    rows, x = points("record", model, "samples")
+    assert len(rows) >= 3
+    for row, q in zip(rows, x):
+        value, slopes = gradient(q[3] * record.samples, q[:3])
+        known = row["samples"]
+        exact = np.array([float(c) for c in known["max_rotation"]]) / q[3]  # by samples before they are scaled
+        assert float(value) == pytest.approx(float(row["max_rotation"]["value"]), rel=1e-11)
+        size = np.abs(exact).max()
+        np.testing.assert_allclose(np.asarray(slopes)[known["indices"]], exact, rtol=1e-9, atol=1e-9 * size)
+        # After the peak, and while the block rests, a sample changes nothing: exactly.
+        quiet = np.isin(known["indices"], known["rest"] + known["after"])
+        assert np.all(np.asarray(slopes)[np.array(known["indices"])[quiet]] == 0)
+        along = float(jnp.dot(slopes, record.samples))
+        assert along == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_history_in_both_modes():
+    """Rotation at times fixed and moving, before and after impacts, linear: forward = reverse = differences."""
+    x = jnp.array([0.2, 2.0, 0.9, 0.26, 1.4, 1.7])
+
+    def rotations(q):
+        response = rk.simulate(rk.Block(*q[:3]), rk.SinePulse(q[3], q[4]), rk.Linear(), samples=2)
+        return response(jnp.stack([0.3 * q[4], 0.9 * q[4], q[5]]))[0]
+
+    forward, reverse = jax.jit(lambda q: (jax.jacfwd(rotations)(q), jax.jacrev(rotations)(q)))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12, atol=1e-14)
+    steps = 1e-4 * jnp.diag(x)
+    values = jax.jit(jax.vmap(rotations))(jnp.concatenate([x + k * steps for k in (-2, -1, 1, 2)])).reshape(4, 6, 3)
+    differences = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12e-4 * x[:, None])
+    np.testing.assert_allclose(forward, differences.T, rtol=1e-7, atol=1e-9)
+
+
+# ---- One step and one impact: independent formulas ----
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_a_step_against_its_own_series(model):
+    """The end of a step at a fixed time moves as the polynomial does when JAX differentiates it term by term."""
+    order = 12
+
+    def start(q):
+        table = model.table(rk.Block(q[0], 2.0))
+        forcing = [q[4 + k] for k in range(5)] + [0.0 * q[0]] * (order - 4)
+        return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], forcing)
+
+    def plainly(q):
+        return jnp.stack(jet(expand(start(q), order).opening, jnp.array(0.8), 1))
+
+    def by_weights(q):
+        opening, speed = jax.lax.stop_gradient(plainly(q))
+        no = jnp.array(False)
+        end = End(jnp.array(0.8), opening, speed, 0.0 * speed, 0.0 * speed, no, no, no)
+        return jnp.stack(arrive(order, start(q), end)[1:])
+
+    q = jnp.array([0.25, 0.7, 0.11, 0.05, 0.3, -0.2, 0.1, 0.05, -0.03])
+    np.testing.assert_allclose(by_weights(q), plainly(q), rtol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(by_weights)(q), jax.jacfwd(plainly)(q), rtol=1e-12, atol=1e-14)
+
+
+def test_saltation():
+    """Linear, three impacts: transition matrices of the flow, between them the saltation matrices of the impacts."""
+    alpha, p, e, amplitude, period = 0.2, 2.0, 0.9, 0.21, 1.4
+    block, pulse = rk.Block(alpha, p, e), rk.SinePulse(amplitude, period)
+    start = jnp.array([-0.01, 0.0])
+
+    def end(initial):
+        response = rk.simulate(block, pulse, rk.Linear(), initial=tuple(initial), duration=1.2, samples=2)
+        return jnp.stack(response(jnp.array(1.2))), (response.impact_times, response.impact_velocities)
+
+    found, (times, speeds) = jax.jit(jax.jacfwd(end, has_aux=True))(start)
+    times, speeds = (np.asarray(x)[np.isfinite(times)] for x in (times, speeds))
+    assert len(times) == 3
+
+    def flow(duration):
+        c, s = np.cosh(p * duration), np.sinh(p * duration)
+        return np.array([[c, s / p], [p * s, c]])
+
+    expected, last = np.eye(2), 0.0
+    for time, speed in zip(times, speeds):
+        u, side = amplitude * np.sin(2 * np.pi * time / period), -np.sign(speed)  # the corner it stood on
+        before, after = (-(p**2) * (s * alpha + u) for s in (side, -side))
+        jump = np.array([[e, 0.0], [(after - e * before) / speed, e]])
+        expected, last = jump @ flow(time - last) @ expected, time
+    expected = flow(1.2 - last) @ expected
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+
+
+# ---- Where derivatives end ----
+
+
+def bisected(function, lower, upper):
+    """Where a flag that is false at `lower` becomes true."""
+    for _ in range(60):
+        middle = (lower + upper) / 2
+        lower, upper = (lower, middle) if function(middle) else (middle, upper)
+    return lower, upper
+
+
+def test_an_overturned_block_has_no_peak_to_differentiate():
+    found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.5, 1.4))
+    assert bool(found.outcome.overturned) and not bool(found.valid)
+    assert np.all(np.isnan(found.max_rotation.elasticity)) and np.all(np.isfinite(found.margin.derivative))
+
+
+def test_a_planted_graze():
+    """A block comes back; a second lobe turns it just above the ground, or it just touches: derivatives jump there."""
+    block = rk.Block(0.2, 2.0, 0.6)
+
+    @jax.jit
+    def run(size):
+        motion = rk.HalfSinePulse(0.5, 0.35) + rk.HalfSinePulse(size, 0.5).shifted(1.05)
+        return rk.outcome(block, motion, rk.Linear())
+
+    assert int(run(0.644).impact_count) == 2 and int(run(0.646).impact_count) == 0
+    for size in (0.64, 0.644, 0.646, 0.65):
+        assert bool(run(size).differentiable) and run(size).status == rk.Status.successful
+        assert 0 < float(run(size).clearance) < 1e-3
+    for size in bisected(lambda size: int(run(size).impact_count) == 0, 0.644, 0.646):
+        found = run(size)
+        assert not bool(found.differentiable) or found.status == rk.Status.undecided
+        assert float(found.clearance) < 1e-9
+
+
+def test_a_tie_of_two_peaks():
+    """Two equal lobes, far apart: two equal peaks, of which no one is the peak."""
+    block = rk.Block(0.2, 2.0, 0.5)
+
+    def motion(second):
+        return rk.HalfSinePulse(0.4, 0.3) + rk.HalfSinePulse(second, 0.3).shifted(20.0)
+
+    run = jax.jit(lambda second: rk.outcome(block, motion(second)))
+    assert not bool(run(0.4).differentiable)
+    assert bool(run(0.41).differentiable) and bool(run(0.39).differentiable)
+    assert float(run(0.41).max_rotation) > float(run(0.39).max_rotation)
+
+
+def test_an_impact_at_the_end_of_the_motion():
+    """The forcing has a kink there, not a jump: derivatives are the same on both sides."""
+    history = jax.jit(lambda amplitude: rk.simulate(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.5), samples=2))
+    _, amplitude = bisected(lambda size: bool(history(size).impact_times[0] > 0.5), 0.5, 0.8)
+    assert float(history(amplitude).impact_times[0]) == pytest.approx(0.5, abs=1e-14)
+    near = np.array([[0.2, 2.0, 0.9, amplitude * (1 + d), 0.5] for d in (-1e-8, 1e-8)])
+    slopes, outcomes = first("sine", "nonlinear")(near)
+    assert np.all(outcomes.status == rk.Status.successful)
+    np.testing.assert_allclose(slopes[0, 0], slopes[1, 0], rtol=1e-5)
+
+
+# ---- Sensitivities ----
+
+
+def test_sensitivity_of_a_scene():
+    """Elasticities obey similarity, agree with the outcome's derivatives, and vanish with nothing to depend on."""
+    pulse = rk.ExponentialPulse(0.3, 0.8, -1.0)
+    found = rk.sensitivity(rk.Block(0.2, 2.0), pulse, rk.Linear())
+    assert bool(found.valid)
+    named = dict(zip(found.names, np.asarray(found.max_rotation.elasticity)))
+    assert found.names == ("alpha", "p", "restitution", "amplitude", "duration", "shape", "uplift_strength")
+    assert named["p"] == pytest.approx(named["duration"], rel=1e-10)  # only p t_d counts
+    assert named["alpha"] + named["amplitude"] == pytest.approx(1.0, rel=1e-10)  # linear: rotation over alpha
+    assert named["uplift_strength"] == -named["amplitude"]
+    # The single lobe's peak has a closed form.
+    shape = jnp.array([0.2 / 0.3, 1.6, -1.0])
+    exact = jax.jit(jax.grad(lambda s: rk.closed_form.single_lobe.peak_rotation(s[0], s[1], s[2])))(shape)
+    rotation = float(found.max_rotation.value) / 0.2
+    assert named["shape"] == pytest.approx(float(exact[2]) * -1.0 / rotation, rel=1e-9)
+    assert named["duration"] == pytest.approx(float(exact[1]) * 1.6 / rotation, rel=1e-9)
+
+
+def test_distances_tell_how_far_is_too_far():
+    """Moving the parameters by the distance to the boundary, along the steepest way, leads close to it."""
+    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.2465, 1.4)
+    found = rk.sensitivity(block, pulse)
+    way = np.asarray(found.margin.elasticity)[:-1]
+    move = 1 - float(found.boundary_distance) * way / np.linalg.norm(way)
+    values = dict(zip(found.names, np.asarray(found.values)[:-1] * move))
+    there = rk.outcome(
+        rk.Block(values["alpha"], values["p"], values["restitution"]),
+        rk.SinePulse(values["amplitude"], values["period"]),
+    )
+    assert 0 < float(found.boundary_distance) < 0.05
+    assert abs(float(there.margin)) < 0.1 * float(found.margin.value)
+    assert float(found.condition) > 1 and float(found.graze_distance) > 0
+
+
+def test_sensitivity_map():
+    found = rk.sensitivity_map([0.7, 0.9], [0.5, 1.0, 1.5], -1.0, model=rk.Linear(), restitution=0.9)
+    single = rk.sensitivity(rk.Block(0.2, 1.0, 0.9), rk.ExponentialPulse(0.2 / 0.9, 1.0, -1.0), rk.Linear())
+    assert found.sensitivity.max_rotation.elasticity.shape == (2, 3, 7)
+    np.testing.assert_allclose(
+        found.sensitivity.max_rotation.elasticity[1, 1], single.max_rotation.elasticity, rtol=1e-9, atol=1e-12
+    )
