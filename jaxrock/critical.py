@@ -69,6 +69,7 @@ def critical_amplitudes(
     model: Model = Housner(),
     *,
     intensity: tuple[float, float] = (1.0, 10.0),
+    derivatives: bool = True,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
@@ -79,6 +80,7 @@ def critical_amplitudes(
     - `block`, `motion`: one scene, or many: parameters of shape (scenes,). The amplitude of the motion plays no part.
     - `model`, `engine`: as in `outcome`.
     - `intensity`: where to look: least and largest amplitude over the uplift threshold [-]. Below 1 nothing moves.
+    - `derivatives`: whether to find them; without, they are not numbers (NaN).
     - `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
@@ -93,7 +95,7 @@ def critical_amplitudes(
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
     factors = grid * (scenes.threshold / scenes.peak)[:, None]
-    return _critical(scenes, np.log(factors), _Amplitude(model, engine), progress)
+    return _critical(scenes, np.log(factors), _Amplitude(model, engine), derivatives, progress)
 
 
 def critical_durations(
@@ -102,6 +104,7 @@ def critical_durations(
     model: Model = Housner(),
     *,
     factor: tuple[float, float] = (0.05, 20.0),
+    derivatives: bool = True,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
@@ -109,7 +112,7 @@ def critical_durations(
 
     **Arguments:**
 
-    - `block`, `motion`, `model`, `engine`, `progress`: as in `critical_amplitudes`.
+    - `block`, `motion`, `model`, `derivatives`, `engine`, `progress`: as in `critical_amplitudes`.
     - `factor`: where to look: least and largest duration over that of `motion` [-], all times stretched alike.
 
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
@@ -120,7 +123,7 @@ def critical_durations(
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
-    return _critical(scenes, grid, _Duration(model, engine), progress)
+    return _critical(scenes, grid, _Duration(model, engine), derivatives, progress)
 
 
 def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
@@ -244,7 +247,7 @@ def _compiled(kind: type, model: Model, engine: AbstractEngine | None, slopes: b
     return kind(model, engine).slopes if slopes else kind(model, engine).at
 
 
-def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, progress: bool | None) -> Critical:
+def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool, progress: bool | None) -> Critical:
     """Search, find, differentiate, and sort by scenes."""
     scene = scenes.block, scenes.motion
 
@@ -262,8 +265,8 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, progress: bool | N
     names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
     units = np.asarray(jax.vmap(lambda index: kind.unit(*_pick(scene, index)))(jnp.arange(grid.shape[0])))
     value = np.exp(ends["z"]) * units[ends["index"]]
-    derivative = np.zeros((order.size, len(names)))
-    if order.size:
+    derivative = np.full((order.size, len(names)), np.nan)
+    if derivatives and order.size:
         slopes = run(True, ends["safe"], ends["index"])
         derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
         derivative[~ends["balanced"]] = np.nan

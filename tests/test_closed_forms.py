@@ -217,6 +217,7 @@ def engine_lobe(strength, duration, shape, e):
     return rk.outcome(rk.Block(ALPHA, 1.0, e), pulse, rk.Linear())
 
 
+@pytest.mark.slow
 def test_engine_agrees_with_the_single_lobe():
     """10,000 random points in each region of safety, and verdicts in each region of overturning."""
     rng = np.random.default_rng(0)

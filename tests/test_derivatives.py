@@ -55,7 +55,7 @@ def slow(*row):
 
 
 EVERYWHERE = [(kind, model) for kind in (*PULSES, "record") for model in MODELS]
-QUICK = [("sine", "nonlinear"), ("exponential", "linear"), ("record", "nonlinear")]
+QUICK = [("sine", "nonlinear"), ("exponential", "linear")]
 
 
 @pytest.mark.parametrize("kind, model", [row if row in QUICK else slow(*row) for row in EVERYWHERE])
@@ -76,7 +76,8 @@ def test_first_derivatives(kind, model):
         np.testing.assert_allclose(x[:, 1] * slopes[:, 0, 1], x[:, 4] * slopes[:, 0, 4], rtol=1e-9, atol=1e-13)
 
 
-@pytest.mark.parametrize("model", ["linear", slow("nonlinear")])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
 def test_second_derivatives(model):
     """Hessians of the peak of 30 and more scenes, by five parameters, against 40-digit differences."""
     rows, x = points("sine", model, "hessian")
@@ -260,6 +261,7 @@ def test_a_tie_of_two_peaks():
     assert float(run(0.41).max_rotation) > float(run(0.39).max_rotation)
 
 
+@pytest.mark.slow
 def test_an_impact_at_the_end_of_the_motion():
     """The forcing has a kink there, not a jump: derivatives are the same on both sides."""
     history = jax.jit(lambda amplitude: rk.simulate(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.5), samples=2))
@@ -308,6 +310,7 @@ def test_distances_tell_how_far_is_too_far():
     assert float(found.condition) > 1 and float(found.graze_distance) > 0
 
 
+@pytest.mark.slow
 def test_sensitivity_map():
     found = rk.sensitivity_map([0.7, 0.9], [0.5, 1.0, 1.5], -1.0, model=rk.Linear(), restitution=0.9)
     single = rk.sensitivity(rk.Block(0.2, 1.0, 0.9), rk.ExponentialPulse(0.2 / 0.9, 1.0, -1.0), rk.Linear())

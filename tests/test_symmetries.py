@@ -27,7 +27,10 @@ MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
 outcome = jax.jit(rk.outcome)
 simulate = jax.jit(lambda block, motion, model, initial: rk.simulate(block, motion, model, initial=initial))
 
-scene = pytest.mark.parametrize("scene", SCENES)
+RARE = {"ricker, antisymmetric", "near-fault", "exponential"}  # other motions, the same engine
+scene = pytest.mark.parametrize(
+    "scene", [pytest.param(name, marks=pytest.mark.slow) if name in RARE else name for name in SCENES]
+)
 model = pytest.mark.parametrize("model", MODELS)
 
 
@@ -151,7 +154,7 @@ def test_history_and_outcome_agree(scene):
         np.testing.assert_allclose(np.abs(rotation), result.max_rotation, rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", [6, 12, 24])
+@pytest.mark.parametrize("order", [6, 12, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scene", ["sine, one impact", "record"])
 def test_order_of_the_series(scene, order):
     block, motion = SCENES[scene]
