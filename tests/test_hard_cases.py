@@ -182,7 +182,9 @@ def test_beyond_alpha_and_rescued():
     assert np.all(np.asarray(found.margin)[safe] > 0)
 
 
-@model
+@pytest.mark.parametrize(
+    "model", [rk.Linear(), pytest.param(rk.Housner(), marks=pytest.mark.slow)], ids=["linear", "nonlinear"]
+)
 def test_margin_is_smooth_through_the_boundary(model):
     """At every change of verdict along the intensity the margin goes through zero with the same slope."""
     block = rk.Block(0.2, 1.0, 0.9)
