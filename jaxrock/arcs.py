@@ -151,10 +151,6 @@ class ArcStepper(AbstractStepper):
         turned = turned & (after.impact_time > scene.motion.end)
         return replace(after, done=after.done | turned | (after.status != Status.successful))
 
-    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
-        """Not with arcs: they have adjoints of their own."""
-        raise NotImplementedError
-
     def finish(self, state: State) -> State:
         """Follow the free stage by the same arcs."""
         if not self.history:

@@ -84,10 +84,6 @@ class AbstractStepper(eqx.Module):
         """The state at the next event or step."""
 
     @abc.abstractmethod
-    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
-        """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
-
-    @abc.abstractmethod
     def finish(self, state: State) -> State:
         """A state at the end of the motion, brought to the end of the free stage: peak, verdict and margin."""
 

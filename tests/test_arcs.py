@@ -148,8 +148,8 @@ def test_forward_derivatives(exact_slopes):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint, tolerance",
-    [(diffrax.RecursiveCheckpointAdjoint(), 2e-7), (diffrax.DirectAdjoint(), 1e-6)],
-    ids=["checkpointed", "direct"],
+    [(diffrax.ForwardMode(), 2e-7), (diffrax.RecursiveCheckpointAdjoint(), 2e-7), (diffrax.DirectAdjoint(), 1e-6)],
+    ids=["forward, by its Jacobian", "checkpointed", "direct"],
 )
 def test_reverse_derivatives(adjoint, tolerance, exact_slopes):
     engine = rk.Diffrax(rtol=1e-10, adjoint=adjoint, max_solves=64)

@@ -286,6 +286,7 @@ def test_sensitivity_of_a_scene():
     assert named["p"] == pytest.approx(named["duration"], rel=1e-10)  # only p t_d counts
     assert named["alpha"] + named["amplitude"] == pytest.approx(1.0, rel=1e-10)  # linear: rotation over alpha
     assert named["uplift_strength"] == -named["amplitude"]
+    assert named["restitution"] == 0  # the peak comes before the first impact
     # The single lobe's peak has a closed form.
     shape = jnp.array([0.2 / 0.3, 1.6, -1.0])
     exact = jax.jit(jax.grad(lambda s: rk.closed_form.single_lobe.peak_rotation(s[0], s[1], s[2])))(shape)
