@@ -16,6 +16,8 @@ from jaxrock.critical import (
     critical_amplitudes as critical_amplitudes,
     critical_durations as critical_durations,
 )
+from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.grid import Grid as Grid
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
 from jaxrock.pulses import (
@@ -45,6 +47,7 @@ from jaxrock.spectra import (
     self_similar_spectrum as self_similar_spectrum,
 )
 from jaxrock.status import Status as Status
+from jaxrock.sweeps import sweep as sweep
 
 if TYPE_CHECKING:
     from jaxrock import plot as plot

@@ -1,6 +1,7 @@
 """The command line: simulate a block under a record, draw its spectrum, draw an overturning map."""
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
 
@@ -238,7 +239,11 @@ def main(words: list[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     import matplotlib
 
+    from jaxrock.devices import use_cpu_devices
+
     matplotlib.use("Agg")
+    with contextlib.suppress(RuntimeError):  # called by a program that computes already
+        use_cpu_devices()
     try:
         if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
             raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")

@@ -1,5 +1,6 @@
 """Argument checks: one message template, for values that are known and for values under jit."""
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Callable, Sequence
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Inexact
 
 Values = ArrayLike | Sequence[float]
@@ -37,11 +39,33 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     message = f"Argument `{name}` must {allowed}"
     good = holds(array)
     if isinstance(array, jax.core.Tracer) or isinstance(good, jax.core.Tracer):
+        if _put_down is not None and _put_down[0] == get_opaque_trace_state():
+            _put_down[1].append((message, ~jnp.all(good)))
+            return array
         return eqx.error_if(array, ~jnp.all(good), message + ".")
     known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
     if not good.all():
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
+
+
+_put_down: tuple | None = None
+
+
+@contextlib.contextmanager
+def put_down():
+    """Checks of traced values are not made, but put down: pairs of a message, and whether the check has failed.
+
+    A program that may raise is not kept by JAX's cache of compiled programs; one that returns what was put down is.
+    Checks within transformations of the function that is traced here are still made.
+    """
+    global _put_down
+    before, found = _put_down, []
+    _put_down = get_opaque_trace_state(), found
+    try:
+        yield found
+    finally:
+        _put_down = before
 
 
 def positive(name: str, value: Values) -> Inexact[Array, "..."]:

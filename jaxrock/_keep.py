@@ -4,13 +4,32 @@ import jax
 import jax.numpy as jnp
 
 
-def keep(value, witness):
+def unseen_one(witness):
+    """The number one, in a way that the compiler cannot see; `witness`: a number that is known at run time only and
+    never negative."""
+    # An exponential is never repeated either, and its underflow is exact.
+    return 1 + jnp.exp(jnp.where(witness < 0, 0.0, -2000.0).astype(jnp.asarray(witness).dtype))
+
+
+def keep_by(value, one):
     """Mark a value that many others use: it is computed once.
 
     On CPUs, XLA computes a cheap value again in every loop that uses it, so that a series, whose terms each use
-    all before, would be computed dozens of times a step. A division is never repeated: this one is by a one
-    that the compiler cannot see. `witness` is any number that is known at run time only and never negative.
+    all before, would be computed dozens of times a step. A division is never repeated: this one is by an
+    `unseen_one`.
     """
-    if jax.default_backend() != "cpu":
-        return value
-    return value / jnp.where(witness < 0, 2.0, 1.0).astype(jnp.asarray(value).dtype)
+    return value if jax.default_backend() != "cpu" else value / one
+
+
+def keep(value, witness):
+    """As `keep_by`, from a witness of the one."""
+    return (
+        value
+        if jax.default_backend() != "cpu"
+        else value / jnp.where(witness < 0, 2.0, 1.0).astype(jnp.asarray(value).dtype)
+    )
+
+
+def keep_flag(flag, witness):
+    """As `keep`, of a condition."""
+    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5

@@ -12,15 +12,17 @@ class Progress:
         self.shown = sys.stderr.isatty() if shown is None else shown
         self.forced = bool(shown)
         self.begun = time.monotonic()
+        self.done = 0
 
-    def update(self, done: int) -> None:
-        """Draw the bar at `done`."""
+    def add(self, more: int) -> None:
+        """Draw the bar with some more done."""
+        self.done += more
         spent = time.monotonic() - self.begun
         if not self.shown or (spent < 1 and not self.forced):
             return
-        filled = 30 * done // self.total
-        left = spent * (self.total - done) / max(done, 1)
-        end = "\n" if done >= self.total else ""
+        filled = 30 * self.done // self.total
+        left = spent * (self.total - self.done) / max(self.done, 1)
+        end = "\n" if self.done >= self.total else ""
         bar = "#" * filled + "." * (30 - filled)
-        sys.stderr.write(f"\r{self.label} [{bar}] {done:,}/{self.total:,}  {left:5.0f} s left{end}")
+        sys.stderr.write(f"\r{self.label} [{bar}] {self.done:,}/{self.total:,}  {left:5.0f} s left{end}")
         sys.stderr.flush()

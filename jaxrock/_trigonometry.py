@@ -1,7 +1,8 @@
-"""Sine and cosine that vectorise: XLA's own, in double precision on CPUs, are calls of a scalar function."""
+"""Functions that vectorise: XLA's own, in double precision on CPUs, are calls of a scalar function."""
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -36,6 +37,10 @@ _COSINE = (
 )
 
 
+# Of artanh(x)/x in x^2, |x| < 0.1716.
+_LOGARITHM = tuple(1 / (2 * k + 1) for k in range(11))
+
+
 def _horner(coefficients: tuple[float, ...], x: Real) -> Real:
     total = jnp.full_like(x, coefficients[-1])
     for c in reversed(coefficients[:-1]):
@@ -55,3 +60,17 @@ def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     sine, cosine = sine_cosine((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the rest of pi
     sign = 1 - 2 * jnp.abs(half_turns - 2 * jnp.round(half_turns / 2))
     return sign * sine, sign * cosine
+
+
+def logarithm(x: Real) -> Real:
+    """Natural logarithm of a positive normal number, to a few units of rounding."""
+    x = jnp.asarray(x)
+    info = jnp.finfo(x.dtype)
+    one, bias = 1 << info.nmant, info.maxexp - 1
+    bits = jax.lax.bitcast_convert_type(x, jnp.int64 if info.bits == 64 else jnp.int32)
+    # x = 2^power times a number in [1/sqrt 2, sqrt 2).
+    power = (bits + (one // 2 - one // 12)) // one - bias
+    part = jax.lax.bitcast_convert_type(bits - power * one, x.dtype)
+    ratio = (part - 1) / (part + 1)
+    square = ratio * ratio
+    return power.astype(x.dtype) * math.log(2) + 2 * ratio * _horner(_LOGARITHM, square)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._derivatives import differentiable
+from jaxrock.derivatives import differentiable
 from jaxrock.engine import AbstractEngine, AbstractStepper, either
 from jaxrock.guards import LONGEST, ORDER, Arc, Forcing, Illinois, field, first_guard, first_step, usual_step
 from jaxrock.models import Angle

@@ -23,12 +23,11 @@ from jaxrock.motion import AbstractMotion, Scaled
 from jaxrock.parameters import named, rebuilt
 from jaxrock.response import outcome
 from jaxrock.scene import peak_bound
-from jaxrock.spectra import in_chunks
 from jaxrock.status import Status
+from jaxrock.sweeps import surface
 
 _FIRST = 256  # intervals of the first sampling
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
-_LANES = 512  # points of one compiled call
 _TIGHT = 4e-15  # width of a bracket, relative
 
 
@@ -253,7 +252,7 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
 
     def run(slopes, z, index):
         function = _compiled(type(kind), kind.model, kind.engine, slopes)
-        return in_chunks(function, (jnp.asarray(z), jnp.asarray(index)), scene, "critical", progress, _LANES)
+        return surface(function, (z, index), scene, "critical", progress, outer=False)
 
     def at(z, index):
         return tuple(map(np.asarray, run(False, z, index)))

@@ -14,7 +14,9 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int, PyTree
 
-from jaxrock._keep import keep
+from jaxrock._keep import keep, keep_flag
+from jaxrock._pick import pick
+from jaxrock._trigonometry import logarithm
 from jaxrock.models import Angle
 from jaxrock.polynomial import Watch, first_event, rescaled, step_length
 from jaxrock.scene import Scene
@@ -93,16 +95,16 @@ class AbstractStepper(eqx.Module):
 
     def time(self, state: State) -> Scalar:
         """Time of a state [s]."""
-        return self.scene.knots[state.piece] + state.local
+        return pick(self.scene.knots, state.piece) + state.local
 
     def room(self, state: State) -> Scalar:
         """Time to the next knot or the stop [s]."""
-        to_knot = self.scene.lengths[state.piece] - state.local
+        to_knot = pick(self.scene.lengths, state.piece) - state.local
         return jnp.maximum(jnp.minimum(to_knot, self.stop - self.time(state)), 0.0)
 
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
         """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
-        to_knot = self.scene.lengths[state.piece] - state.local
+        to_knot = pick(self.scene.lengths, state.piece) - state.local
         ends = full & (to_knot <= self.stop - self.time(state))
         piece = state.piece + ends
         over = jnp.where(jnp.isfinite(self.stop), full & ~ends, piece >= self.scene.pieces)
@@ -130,7 +132,7 @@ class AbstractStepper(eqx.Module):
         room = self.room(state) / unit
         truncated = len(forcing) > order  # else a polynomial: exact
         length = step_length(forcing, tolerance * threshold, room) if truncated else room
-        never = scene.ceilings[state.piece] <= threshold
+        never = pick(scene.ceilings, state.piece) <= threshold
         # How far a step goes changes nothing: it has no derivative.
         room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
         scaled = rescaled(forcing, length)
@@ -159,11 +161,11 @@ class AbstractStepper(eqx.Module):
         full = (length >= room) & ~early
         piece, local, over = self.move_on(state, x * length * unit, full)
         piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
-        waited = self._lift(replace(state, piece=piece, local=local, done=over | (never & ~early)), passed, met, met)
-        lifted = self._lift(state, fixed[0], lifts, touching)
+        waited = self.lift(replace(state, piece=piece, local=local, done=over | (never & ~early)), passed, met, met)
+        lifted = self.lift(state, fixed[0], lifts, touching)
         return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
 
-    def _lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
+    def lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
         """Leave rest where `lifts`: positive acceleration drives negative rotation."""
         return replace(
             state,
@@ -174,12 +176,17 @@ class AbstractStepper(eqx.Module):
         )
 
     def escaped(self, state: State, angle: Angle) -> Flag:
-        """Whether no forcing still to come can bring it back: restoring + ceiling arm < 0 from here on, for certain."""
+        """Whether no forcing still to come can bring it back.
+
+        The most helpful forcing is the bound of all that is to come, for good: the block is lost if it is past the
+        stable manifold even then.
+        """
         table = self.scene.table
-        hold = table.restoring(angle) + self.scene.ceilings[state.piece] * table.arm(angle)
-        # At a speed v outward it gets over what still holds, if that is much less than v.
-        outward = state.beyond & (state.velocity >= 0) & (hold <= 1e-6 * state.velocity)
-        return outward & (state.velocity - hold > self.doubt * state.spread.along(1.0, 1.0))
+        ceiling = pick(self.scene.ceilings, state.piece)
+        hold = table.restoring(angle) + ceiling * table.arm(angle)
+        needed = jnp.where(hold > 0, table.held_manifold(angle, hold, ceiling), 0.0)
+        certain = state.velocity - needed > self.doubt * state.spread.along(1.0, 1.0)
+        return state.beyond & (state.velocity >= 0) & certain
 
     def spread_after(self, state: State, angle: Angle, push: Scalar, elapsed: Scalar, step: tuple) -> Spread:
         """Errors after `elapsed` seconds of rocking; `push`: side times acceleration [g]; `step`: what the engine's
@@ -201,7 +208,7 @@ class AbstractStepper(eqx.Module):
         # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
         # instant, far from its saddle, is not in balance.
         pull = jnp.maximum(jnp.abs(bend), jnp.abs(table.restoring(Angle.of(opening))))
-        stillness = (speed**2 + pull**2) / table.restoring_at_rest**2
+        stillness = keep((speed**2 + pull**2) / table.restoring_at_rest**2, state.local)
         turn = turning & (outward | state.beyond)
         closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
@@ -267,8 +274,8 @@ class AbstractStepper(eqx.Module):
             highest = 3 * rebound**2 * jnp.maximum(1 / here, e * e / there)
             least = (table.restoring(Angle.of(jnp.minimum(highest, table.saddle))) / table.restoring_at_rest) ** 2
             dies = dies & (highest <= state.peak) & (2 * rebound <= state.fastest) & (least >= state.closeness)
-        rests = hit & (dies | (rebound == 0))
-        more = jnp.log(low / jnp.maximum(rebound, low)) / jnp.log(jnp.clip(e, 1e-3, 1 - 1e-9))
+        rests = keep_flag(hit & (dies | (rebound == 0)), state.local)
+        more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(e, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
         wait = jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
         return replace(

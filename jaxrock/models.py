@@ -107,8 +107,20 @@ class Table(eqx.Module):
     def manifold(self, x: Scalar) -> Scalar:
         """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
         gap = self.saddle - x
-        distance = 2 * jnp.sin(gap / 2) if self.sinusoidal else gap  # half-angle form: no cancellation near the saddle
+        distance = (
+            2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
+        )  # half-angle form: no cancellation near the saddle
         return jnp.sqrt(self.stiffness) * distance
+
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar) -> Scalar:
+        """Outward velocity over p that just reaches the unstable equilibrium under a constant forcing.
+
+        `push`: the forcing against it [g]; `hold`: restoring moment and forcing at the angle, positive.
+        """
+        if not self.sinusoidal:
+            return hold / jnp.sqrt(-self.r1)
+        stiffness = jnp.hypot(_sum_of((self.rs, 1.0), (self.ms, push)), _sum_of((self.rc, 1.0), (self.mc, push)))
+        return jnp.sqrt(2 * jnp.maximum(stiffness - self.repulsion(angle, push), 0.0))
 
 
 class Housner(eqx.Module):
@@ -246,6 +258,10 @@ class EquationTable(eqx.Module):
     def threshold(self) -> Scalar:
         """Ground acceleration at which the block uplifts [g]."""
         return self.restoring_at_rest / self.arm_at_rest
+
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar) -> Scalar:
+        """As in `Table`; infinite, because nothing is known of the function beyond this angle."""
+        return jnp.full_like(hold, jnp.inf)
 
     def _first_zero(self) -> Scalar:
         """Where the block balances: a scan, bisection, and a Newton step that carries the derivatives."""

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import checked, finite, not_nan, one_of, positive
 from jaxrock._keep import keep
+from jaxrock._pick import pick
 from jaxrock._trigonometry import sine_cosine_of_any
 from jaxrock.motion import AbstractMotion
 
@@ -160,8 +161,8 @@ class ExponentialPulse(AbstractMotion):
         spiked = shape > 0
         down, up = jnp.where(spiked, 0.0, shape), jnp.where(spiked, shape, 0.0)
         # Distance from the nearer foot and from the peak, each without cancellation where it matters.
-        foot = jnp.stack([y, layer + y, 0.5 - y, layer - y])[piece]
-        peak = jnp.stack([0.5 - y, layer - y, y, layer + y])[piece]
+        foot = pick(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
+        peak = pick(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
         fall = jnp.exp(2 * down * foot) / _growth_ratio(down)
         rise = jnp.exp(-2 * up * peak) / _growth_ratio(-up)
         value_down = 2 * foot * _growth_ratio(2 * down * foot) / _growth_ratio(down)

@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import Values, as_real, checked, scalar
-from jaxrock._derivatives import differentiable
 from jaxrock.arcs import Diffrax
 from jaxrock.block import Block
+from jaxrock.derivatives import differentiable
 from jaxrock.engine import AbstractEngine, AbstractStepper
+from jaxrock.lanes import Quick
 from jaxrock.models import Equation, Housner, Model
 from jaxrock.motion import AbstractMotion
+from jaxrock.quick import glance, has_many_pieces, most_steps
 from jaxrock.scene import Scene
 from jaxrock.series import Series
 from jaxrock.state import State, initial_state, surpasses
@@ -259,7 +261,33 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
     def on_tape(scene):
         return _follow(*scene, engine, taped=True)
 
-    return (run if engine.reverse else differentiable(run, on_tape))((block, motion, model, initial))
+    scene = block, motion, model, initial
+    if engine.reverse:
+        return run(scene)
+    quick = _quick(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
+    return differentiable(run, on_tape, quick)(scene)
+
+
+def _quick(engine: Series, rounds: bool) -> Quick:
+    """The outcome by the quick pass; in rounds where some blocks are lost long before others."""
+
+    def begin(scene):
+        block, motion, model, initial = scene
+        scene = Scene.of(block, motion, model)
+        stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
+        return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+
+    def conclude(scene, state):
+        found = _conclude(begin(scene)[0], state)
+        return found, found.status != Status.successful
+
+    return Quick(
+        begin=lambda scene: begin(scene)[1],
+        follow=lambda scene, state, limit: glance(begin(scene)[0], state, limit),
+        unfinished=lambda scene, state: ~state.done & (state.steps < most_steps(scene[1].knots.size - 1)),
+        conclude=conclude,
+        round=256 if rounds else None,
+    )
 
 
 def _follow(block, motion, model, initial, engine, taped: bool) -> Outcome:

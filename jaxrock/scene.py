@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
+from jaxrock._pick import pick
 from jaxrock.block import Block
 from jaxrock.models import EquationTable, Model, Table
 from jaxrock.motion import AbstractMotion
@@ -91,7 +92,7 @@ class Scene(eqx.Module):
 
     def forcing(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[list[Scalar], Scalar]:
         """Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
-        unit = jnp.minimum(1 / self.p, self.scales[piece])
+        unit = jnp.minimum(1 / self.p, pick(self.scales, piece))
         during = piece < self.pieces
         inner = jnp.minimum(piece, self.pieces - 1)
         terms = self.motion.series(inner, local, unit, order)

@@ -16,8 +16,9 @@ from jaxrock.motion import AbstractMotion
 from jaxrock.parameters import named, rebuilt
 from jaxrock.pulses import ExponentialPulse
 from jaxrock.response import Outcome, outcome
-from jaxrock.spectra import axis, in_chunks
+from jaxrock.spectra import axis
 from jaxrock.status import Status
+from jaxrock.sweeps import surface
 
 Scalar = Inexact[Array, "..."]
 
@@ -172,10 +173,8 @@ def sensitivity_map(
     shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
     Block(alpha, 1.0, restitution)  # raises here, where values are known
     scene = shape, alpha, None if restitution is None else as_real("restitution", restitution)
-    rows, columns = (x.ravel() for x in jnp.meshgrid(strength, duration, indexing="ij"))
-    found = in_chunks(_under_lobe(model, engine), (rows, columns), scene, "sensitivity", progress)
-    shaped = jax.tree.map(lambda x: x.reshape(strength.size, duration.size, *x.shape[1:]), found)
-    return SensitivityMap(strength, duration, shape, shaped)
+    found = surface(_under_lobe(model, engine), (strength, duration), scene, "sensitivity", progress)
+    return SensitivityMap(strength, duration, shape, found)
 
 
 @functools.lru_cache(maxsize=32)

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, Inexact, Int
 
-from jaxrock._derivatives import differentiable, with_derivatives_of
-from jaxrock._keep import keep
+from jaxrock._keep import keep, unseen_one
+from jaxrock.derivatives import differentiable, with_derivatives_of
 from jaxrock.engine import AbstractEngine, AbstractStepper, either, when
 from jaxrock.free import free_stage
 from jaxrock.models import Angle, Table
@@ -163,7 +163,14 @@ class TaylorStepper(AbstractStepper):
         """Where a step starts, with time in `unit`."""
         stretch = keep(self.scene.p * unit, state.local)
         return Start(
-            self.scene.table, stretch, state.side, state.uplifting, state.opening, state.velocity * stretch, forcing
+            self.scene.table,
+            stretch,
+            state.side,
+            state.uplifting,
+            state.opening,
+            state.velocity * stretch,
+            forcing,
+            unseen_one(state.local),
         )
 
     def _rock(self, state: State, forcing, unit, rocking: Flag) -> State:

@@ -1,4 +1,4 @@
-"""Whole surfaces: rocking spectra and overturning maps, many scenes in chunks of one compiled shape."""
+"""Whole surfaces: rocking spectra and overturning maps."""
 
 import functools
 from collections.abc import Callable
@@ -6,11 +6,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._checks import Values, as_real, positive
-from jaxrock._progress import Progress
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
 from jaxrock.models import Housner, Model
@@ -18,19 +16,7 @@ from jaxrock.motion import AbstractMotion
 from jaxrock.pulses import SinePulse
 from jaxrock.response import Outcome, outcome
 from jaxrock.status import Status
-
-_LANES = 64  # neighbours that step together; more would not fit the first cache
-_BLOCK = 4096  # scenes of one compiled call
-
-# Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
-_CPU_OPTIONS = {
-    "xla_cpu_prefer_vector_width": 512,
-    "xla_cpu_enable_fast_math": True,
-    "xla_cpu_fast_math_honor_nans": True,
-    "xla_cpu_fast_math_honor_infs": True,
-    "xla_cpu_fast_math_honor_division": True,
-    "xla_cpu_fast_math_honor_functions": True,
-}
+from jaxrock.sweeps import surface
 
 
 class Spectrum(eqx.Module):
@@ -101,7 +87,7 @@ def rocking_spectrum(
     Block(alpha, 1.0, restitution)  # raises here, where values are known
 
     scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
-    found = in_chunks(_under_motion(model, engine), (period,), scene, "spectrum", progress)
+    found = surface(_under_motion(model, engine), (period,), scene, "spectrum", progress)
     scale = (scene[0], 2 * jnp.pi / period * scene[0])
     return _spectrum(period, found, scale)
 
@@ -185,10 +171,8 @@ def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, e
 
     scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
     # Neighbours in intensity share a chunk: they move alike.
-    columns, rows = (x.ravel() for x in jnp.meshgrid(ratio, intensity, indexing="ij"))
-    found = in_chunks(_under_pulse(pulse, model, engine), (rows, columns), scene, label, progress)
-    shape = (ratio.size, intensity.size)
-    return jax.tree.map(lambda x: x.reshape(shape).T, found), ratio, intensity
+    found = surface(_under_pulse(pulse, model, engine), (ratio, intensity), scene, label, progress)
+    return jax.tree.map(jnp.transpose, found), ratio, intensity
 
 
 def axis(name: str, values: Values) -> Float[Array, " n"]:
@@ -224,52 +208,10 @@ def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
 
 @functools.lru_cache(maxsize=32)
 def _under_pulse(pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
-    def one(intensity, ratio, scene):
+    def one(ratio, intensity, scene):
         alpha, restitution = scene
         block = Block(alpha, jnp.ones_like(alpha), restitution)
         motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
         return outcome(block, motion, model, engine=engine)
 
     return one
-
-
-@functools.lru_cache(maxsize=32)
-def _runner(function: Callable) -> Callable:
-    """`function(*point, scene)` over flat axes whose length is a multiple of the lanes."""
-
-    def run(axes, scene):
-        chunks = [values.reshape(-1, _LANES) for values in axes]
-        found = jax.lax.map(lambda chunk: jax.vmap(lambda *point: function(*point, scene))(*chunk), chunks)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
-
-    return jax.jit(run, compiler_options=_compiler_options())
-
-
-@functools.cache
-def _compiler_options() -> dict | None:
-    """The options, where this backend and this jaxlib know them."""
-    if jax.default_backend() != "cpu":
-        return None
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=_CPU_OPTIONS)(1.0)
-    except Exception:  # reported by an internal error type
-        return None
-    return _CPU_OPTIONS
-
-
-def in_chunks(
-    function: Callable, axes: tuple[Array, ...], scene, label: str, progress: bool | None, block: int | None = None
-):
-    """`function(*point, scene)` at every point of the flat axes, in blocks of one compiled shape (`block` points)."""
-    size = axes[0].size
-    block = block or min(_BLOCK, -(-size // _LANES) * _LANES)
-    blocks = -(-size // block)
-    padded = [jnp.concatenate([values, jnp.full(blocks * block - size, values[-1])]) for values in axes]
-    run, parts = _runner(function), []
-    bar = Progress(size, label, progress)
-    for i in range(blocks):
-        part = [values[i * block : (i + 1) * block] for values in padded]
-        # Results wait in host memory, whatever the size of the surface.
-        parts.append(jax.tree.map(np.asarray, run(part, scene)))
-        bar.update(min((i + 1) * block, size))
-    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:size]), *parts)

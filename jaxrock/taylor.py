@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import ArrayLike, Bool, Inexact
 
-from jaxrock._keep import keep
+from jaxrock._keep import keep, keep_by
 from jaxrock.models import Angle, Table
 from jaxrock.polynomial import derivative, horner
 
@@ -31,12 +31,13 @@ class Start(NamedTuple):
     opening: Scalar
     speed: Scalar  # of the opening, per unit
     forcing: list[Scalar]  # Taylor coefficients of the ground acceleration [g]
+    one: Scalar  # see `keep_by`
 
     @property
     def angle(self) -> Angle:
         """The opening angle with its sine and cosine."""
         angle = Angle.of(self.opening)
-        return Angle(angle.value, keep(angle.sine, self.stretch), keep(angle.cosine, self.stretch))
+        return Angle(angle.value, keep_by(angle.sine, self.one), keep_by(angle.cosine, self.one))
 
 
 class End(NamedTuple):
@@ -61,10 +62,16 @@ class Expansion(NamedTuple):
     arm: list[Scalar | None]
 
 
+def _total(terms: list):
+    """Their sum, in four chains side by side: additions one after the other would wait for each other."""
+    chains = [sum(terms[i + 4 :: 4], start=terms[i]) for i in range(min(4, len(terms)))]
+    return sum(chains[1:], start=chains[0]) if len(chains) < 4 else (chains[0] + chains[1]) + (chains[2] + chains[3])
+
+
 def _product(first: list, second: list, k: int):
     """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
     terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
-    return sum(terms) if terms else 0.0
+    return _total(terms) if terms else 0.0
 
 
 def expand(start: Start, order: int) -> Expansion:
@@ -72,14 +79,14 @@ def expand(start: Start, order: int) -> Expansion:
 
     The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
     """
-    table, stretch, angle = start.table, start.stretch, start.angle
+    table, angle, one = start.table, start.angle, start.one
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
     sine, cosine, arms = [angle.sine], [angle.cosine], []
-    scale = -(stretch**2)
+    scale = keep_by(-(start.stretch**2), one)
     for k in range(order - 1):
         if table.trigonometric and k > 0:
-            sine.append(keep(sum(slopes[j] * cosine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
-            cosine.append(keep(-sum(slopes[j] * sine[k - 1 - j] for j in range(k)) * (1 / k), stretch))
+            sine.append(keep_by(_total([slopes[j] * cosine[k - 1 - j] for j in range(k)]) * (1 / k), one))
+            cosine.append(keep_by(_total([slopes[j] * sine[k - 1 - j] for j in range(k)]) * (-1 / k), one))
 
         def combine(constant, line, of_sine, of_cosine, k):
             terms = [] if constant is None or k > 0 else [constant]
@@ -88,11 +95,12 @@ def expand(start: Start, order: int) -> Expansion:
             terms += [] if of_cosine is None else [of_cosine * cosine[k]]
             return sum(terms) if terms else None
 
-        arms.append(combine(table.m0, None, table.ms, table.mc, k))
+        arm = combine(table.m0, None, table.ms, table.mc, k)
+        arms.append(arm if arm is None else keep_by(arm, one))
         moment = _product(start.forcing, arms, k) * start.side
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
         moment = moment if restoring is None else moment + restoring
-        term = keep(scale * moment * (1 / ((k + 1) * (k + 2))), stretch)
+        term = keep_by(scale * moment * (1 / ((k + 1) * (k + 2))), one)
         if k == 0:
             term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)
@@ -174,7 +182,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
         zero = jnp.zeros_like(length)
         of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
         of_forcing = [of_push(j) for j in range(len(start.forcing))]
-        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_forcing))
+        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_forcing, zero))
 
     return of(powers), of([jnp.zeros_like(length)] + [k * power for k, power in enumerate(powers[:-1], 1)])
 

@@ -1,4 +1,4 @@
-"""All tests run in double precision."""
+"""All tests run in double precision, on two devices, so that surfaces are shared out."""
 
 import gc
 import json
@@ -9,6 +9,7 @@ import matplotlib
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
 
 

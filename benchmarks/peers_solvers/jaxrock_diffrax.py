@@ -1,0 +1,18 @@
+"""jaxrock's second engine, diffrax, on fewer scenes."""
+
+import jaxrock as rk
+
+from . import jaxrock_api
+
+FEW = {"P4": 16}  # scenes; else 200
+SETTINGS = ((1e-6, 1e-7), (1e-12, 1e-12))
+
+
+def ways(problem):
+    """The ways to solve a problem: (goal of the error, label, function of the chosen scenes)."""
+    solve = jaxrock_api.blocks if problem.motion == "record" else jaxrock_api.scenes
+
+    def made(rtol):
+        return lambda chosen: solve(problem, rk.Diffrax(rtol=rtol), chosen)
+
+    return [(goal, f"rtol {rtol:g}", made(rtol)) for goal, rtol in SETTINGS]

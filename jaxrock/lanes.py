@@ -1,0 +1,221 @@
+"""Many scenes at once: under `jax.vmap` a function of one scene runs in chunks of lanes that step together.
+
+A quick version of the function, where there is one, goes first; the scenes that it postpones are gathered and done
+by the careful one, again in chunks. On CPUs a chunk is compiled into one function, because its arrays are so short
+that handing them from kernel to kernel would take longer than the arithmetic.
+"""
+
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import jaxprs_in_params
+
+_LANES = 64  # of a chunk on CPUs: more would not fit the first cache
+_WIDE = 1 << 16  # on accelerators
+# What calls a library, and so cannot be compiled into one piece with its surroundings.
+_OUTSIDE = re.compile(
+    "callback|ffi|print|dot_general|conv_general|fft|sort|custom_call|cholesky|triangular|schur|^(lu|qr|svd|eigh?)$"
+)
+
+
+class Quick(NamedTuple):
+    """A quick version of a function of one scene.
+
+    - `begin(tree)`: a first state.
+    - `follow(tree, state, limit)`: the state where it is finished, or after `limit` steps in all.
+    - `unfinished(tree, state)`: whether it has to be followed further.
+    - `conclude(tree, state)`: the result, and whether that is postponed to the careful function.
+    - `round`: steps after which chunks are made up anew of the scenes that are unfinished; None: never.
+    """
+
+    begin: Callable
+    follow: Callable
+    unfinished: Callable
+    conclude: Callable
+    round: int | None
+
+
+def _lanes() -> int:
+    return _LANES if jax.default_backend() == "cpu" else _WIDE
+
+
+def in_lanes(careful: Callable, quick: Quick | None = None) -> Callable:
+    """`careful(tree)`, which under `jax.vmap` runs in chunks of lanes, after `quick` where that is given."""
+
+    @custom_vmap
+    def one(tree):
+        return careful(tree)
+
+    @one.def_vmap
+    def _(size, batched, tree):
+        found = _Batch(careful, quick, size, batched[0])(tree)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return one
+
+
+class _Batch:
+    """A function of one scene at `size` scenes: leaves that are `batched` have a leading axis."""
+
+    def __init__(self, careful, quick, size, batched):
+        self.careful, self.quick, self.size = careful, quick, size
+        self.flags, self.structure = jax.tree.flatten(batched)
+
+    def __call__(self, tree):
+        @custom_vmap
+        def run(leaves):
+            return self._run(leaves)
+
+        @run.def_vmap
+        def _(size, batched, leaves):
+            found = self._one_more_axis(size, batched[0], leaves)
+            return found, jax.tree.map(lambda _: True, found)
+
+        return run(self.structure.flatten_up_to(tree))
+
+    def _one_more_axis(self, size, batched, leaves):
+        """One more axis: both become one, unless arrays that all scenes share would be copied for each."""
+        shared = any(new and not old and jnp.ndim(x) > 1 for new, old, x in zip(batched, self.flags, leaves))
+        if shared:
+            moving = [x for x, new in zip(leaves, batched) if new]
+
+            def one(moving):
+                rest = iter(moving)
+                return self._run([next(rest) if new else x for x, new in zip(leaves, batched)])
+
+            return jax.lax.map(one, moving)
+
+        def merged(x, new, old):
+            if not (new or old):
+                return x
+            x = x if new else x[None]
+            x = x if old else x[:, None]
+            return jnp.broadcast_to(x, (size, self.size, *x.shape[2:])).reshape(size * self.size, *x.shape[2:])
+
+        flags = [new or old for new, old in zip(batched, self.flags)]
+        batch = _Batch(self.careful, self.quick, size * self.size, self.structure.unflatten(flags))
+        found = batch(self.structure.unflatten([merged(*each) for each in zip(leaves, batched, self.flags)]))
+        return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), found)
+
+    def _run(self, leaves):
+        # A number that all share is given to each: XLA aborts where a scalar goes into a function compiled into one.
+        flags = [flag or jnp.ndim(x) == 0 for x, flag in zip(leaves, self.flags)]
+        leaves = [jnp.broadcast_to(x, (self.size,)) if jnp.ndim(x) == 0 else x for x in leaves]
+        moving = [x for x, flag in zip(leaves, flags) if flag]
+        fixed = [x for x, flag in zip(leaves, flags) if not flag]
+
+        def scenes(function, moving, *more):
+            def one(moving, *more):
+                moving, rest = iter(moving), iter(fixed)
+                tree = self.structure.unflatten([next(moving if flag else rest) for flag in flags])
+                return function(tree, *more)
+
+            return jax.vmap(one)(moving, *more)
+
+        def careful(part):
+            return scenes(self.careful, part)
+
+        if self.quick is None:
+            return _chunked(careful, moving, self.size)
+        quick, begun = self.quick, scenes(self.quick.begin, moving)
+
+        def follow(limit, part, states):
+            return scenes(lambda tree, state: quick.follow(tree, state, limit), part, states)
+
+        def unfinished(states):
+            return scenes(quick.unfinished, moving, states)
+
+        if quick.round is None:
+            followed = _chunked(
+                lambda parts: follow(jnp.iinfo(jnp.int32).max, *parts), (moving, begun), self.size, True
+            )
+        else:
+            followed = _in_rounds(follow, unfinished, moving, begun, quick.round)
+        # Outside the chunks, so that what nobody asks for is not computed.
+        found, postponed = scenes(quick.conclude, moving, followed)
+        return _again(careful, moving, found, postponed)
+
+
+def _chunked(function: Callable, leaves, size: int, compact: bool = False):
+    """`function` of leaves with a leading axis of `size`, in chunks; the last is filled up with its last scene."""
+    lanes = min(_lanes(), size)
+    chunks = -(-size // lanes)
+
+    def cut(x):
+        x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
+        return x.reshape(chunks, lanes, *x.shape[1:])
+
+    def loop(parts):
+        return jax.lax.map(function, parts)
+
+    run = as_one_function(loop, size) if compact else loop
+    found = run(jax.tree.map(cut, leaves))
+    return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
+
+
+def _again(function: Callable, leaves: list, found, which):
+    """`found`, with the results of `function(leaves)` in the places `which`, in chunks."""
+    lanes = min(_lanes(), which.size)
+    count = which.sum()
+    order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
+    order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
+
+    def body(carry):
+        done, found = carry
+        places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
+        # What is past the last is done again, with the same result.
+        places = jnp.where(done + jnp.arange(lanes) < count, places, places[0])
+        more = function(jax.tree.map(lambda x: x[places], leaves))
+        return done + lanes, jax.tree.map(lambda x, new: x.at[places].set(new), found, more)
+
+    return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
+
+
+def _in_rounds(follow: Callable, unfinished: Callable, leaves: list, states, steps: int):
+    """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
+
+    def body(carry):
+        limit, states, left = carry
+        run = as_one_function(lambda parts: follow(limit, *parts), left.size)
+        states = _again(run, (leaves, states), states, left)
+        return limit + steps, states, unfinished(states)
+
+    carry = jnp.int32(steps), states, unfinished(states)
+    return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
+
+
+def as_one_function(function: Callable, size: int) -> Callable:
+    """`function`, on CPUs compiled into one piece: the XLA compiler takes the mark, or ignores it."""
+    if jax.default_backend() != "cpu" or size < _LANES:
+        return function
+
+    def both(*args):
+        # All arguments are results, too: XLA aborts over one that nothing uses after its simplifications.
+        return function(*args), jax.lax.optimization_barrier(args)
+
+    def marked(*args):
+        if _reaches_outside(jax.make_jaxpr(function)(*args).jaxpr):
+            return function(*args)
+        found, _ = jax.tree.map(mark, jax.jit(both)(*args))
+        return found
+
+    def mark(x):
+        return set_xla_metadata(x, xla_cpu_small_call="true", inlineable="false")
+
+    return marked
+
+
+def _reaches_outside(jaxpr) -> bool:
+    """Whether a program calls what cannot be compiled into one piece with it."""
+    for equation in jaxpr.eqns:
+        if _OUTSIDE.search(equation.primitive.name):
+            return True
+        for inner in jaxprs_in_params(equation.params):
+            if _reaches_outside(inner):
+                return True
+    return False

@@ -1,0 +1,285 @@
+"""The quick pass: Taylor steps in one flat loop without branches, for the many scenes that need no care.
+
+Every lane does the same work in every step: a series, a certificate of its shape, the turning point within it if
+there is one, and the first level that it meets (ground or saddle), where it is cut. What has no certificate, or
+comes to rest, is postponed: the series engine, which takes every care, does it afterwards.
+"""
+
+import functools
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact, Int
+
+from jaxrock._keep import keep, keep_by, keep_flag
+from jaxrock._pick import pick
+from jaxrock.polynomial import derivative, horner, jet, keeps_sign, step_length
+from jaxrock.series import TaylorStepper
+from jaxrock.state import State
+from jaxrock.status import Status
+from jaxrock.taylor import Start, expand
+
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
+
+_SHORTER = (1.0, 0.4, 0.1)  # shares of a step that are tried for a certificate
+_TURN, _MEET = (5, 9, 99), (4, 7, 12, 99)  # degrees of the polynomials whose roots Newton's iterations take
+_STEPS = 1000
+
+
+def _first_sign(value: Scalar, following: Scalar) -> Scalar:
+    return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+
+def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
+    """How much of a step is certain to turn once at most, as a share of it: the acceleration
+    keeps its sign there, or its derivative does. Zero if nothing is."""
+    bend = derivative(derivative(terms))
+    jerk = derivative(bend)
+    jerks = _first_sign(jerk[0], jerk[1])
+    share = jnp.zeros_like(length)
+    for part in reversed(_SHORTER):
+        sure = (keeps_sign(bend, rises, part * length) > 0) | (keeps_sign(jerk, jerks, part * length) > 0)
+        share = jnp.where(sure, part, share)
+    return share
+
+
+def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, at_start: Scalar, slope: Scalar, at_end: Scalar):
+    """The one root in [start, end], and Newton's last change of it; `slope`: at the start.
+
+    The iterations take polynomials of these `degrees`: the first need not be exact.
+    """
+    sign = jnp.where(at_start > 0, 1.0, -1.0)
+    value, slope, fall = sign * at_start, sign * slope * (end - start), sign * at_end
+    bend = fall - value - slope
+    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * bend, 0.0))
+    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * bend, root - slope)
+    x = keep(start + jnp.clip(share, 0.0, 1.0) * (end - start), end)
+    for degree in degrees:
+        value, slope = jet(terms[: degree + 1], x, 1)
+        change = value / slope
+        x = jnp.clip(x - change, start, end)
+    return x, jnp.abs(change)
+
+
+class _Part(NamedTuple):
+    """The part of a step on which the velocity changes sign once at most; time is in the unit of the series."""
+
+    length: Scalar
+    opening: Scalar  # at its end, with its derivatives
+    speed: Scalar
+    bend: Scalar
+    full: Flag  # goes as far as there is room
+    outward: Scalar  # sign of the velocity at its start
+    bends: Flag  # the velocity has an extremum
+    bound: Scalar  # of that
+    certain: Flag
+
+
+def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Part:
+    """As much of a step as is certain; `least`: what the last coefficients may contribute."""
+    one, before, first = start.one, terms[1], 2 * terms[2]
+    longest = step_length(terms, least, jnp.minimum(room, 16.0))
+    reaches = longest >= room * (1 - 1e-9)
+    longest = keep_by(jnp.where(reaches, room, longest), one)
+    rises = jnp.where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
+    outward = jnp.where(start.uplifting, 1.0, _first_sign(before, rises))
+    share = keep_by(_certified(terms, longest, rises), one)
+
+    def extremum(length):
+        opening, speed, bend = (keep_by(x, one) for x in jet(terms, length, 2))
+        bends = rises * bend < 0
+        # Between the tangents at the ends.
+        between = (speed - before - bend * length) / jnp.where(bends, first - bend, 1.0)
+        bound = before + first * between
+        return (opening, speed, bend), bends, bound, bends & (outward * speed >= 0) & (outward * bound <= 0)
+
+    (_, _, bend), _, _, twice = extremum(share * longest)
+    # Where the velocity may turn twice, the part ends about where the acceleration is zero.
+    share = keep_by(jnp.where(twice, share * first / jnp.where(twice, first - bend, 1.0), share), one)
+    length = keep_by(share * longest, one)
+    end, bends, bound, twice = extremum(length)
+    return _Part(length, *end, reaches & (share == 1), outward, bends, bound, (share > 0) & ~twice)
+
+
+class _Meeting(NamedTuple):
+    """Where a part of a step ends, and what happens until then."""
+
+    at: Scalar
+    certain: Flag
+    turned: Flag  # turned back before
+    turn_at: Scalar
+    top: Scalar  # opening angle there
+    top_bend: Scalar
+    crossing: Flag  # ends at the saddle
+    impact: Flag  # ends at the ground
+    stops: Flag  # ends where it turns
+
+
+def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
+    """The turning point within a part, and the first level that it meets, before it turns or after."""
+    one, saddle, zero = start.one, start.table.saddle, jnp.zeros_like(part.length)
+    turns = keep_flag(part.outward * part.speed < 0, state.local)
+    x_turn, last = _root(_TURN, derivative(terms), zero, part.length, terms[1], 2 * terms[2], part.speed)
+    # Where the velocity is zero the angle is exact to the square of what the time is.
+    certain = part.certain & (~turns | (last <= 1e-4 * x_turn))
+    turn_at = keep_by(jnp.where(turns, x_turn, part.length), one)
+    top, _, top_bend = (keep_by(x, one) for x in jet(terms, turn_at, 2))
+
+    crossing = (top >= saddle) != state.beyond
+    early = crossing | (top <= 0)
+    # If it turns before it crosses, the step ends where it turns.
+    stops = ~early & turns & ((part.opening >= saddle) != (top >= saddle))
+    impact = ~crossing & ((top <= 0) | (turns & ~stops & (part.opening <= 0)))
+    crossing, impact, stops = (keep_flag(x, state.local) for x in (crossing, impact, stops))
+    level = jnp.where(crossing, saddle, 0.0)
+    low, high = jnp.where(early, 0.0, turn_at), jnp.where(early, turn_at, part.length)
+    at_low = jnp.where(early, terms[0], top) - level
+    at_high = jnp.where(early, top, part.opening) - level
+    slope = jnp.where(early, terms[1], 0.0)
+    x_meet, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, at_low, slope, at_high)
+    meets = crossing | impact
+    at = keep_by(jnp.where(meets, x_meet, jnp.where(stops, turn_at, part.length)), one)
+    certain = certain & (~meets | (last <= 1e-7 * x_meet))
+    return _Meeting(at, certain, turns & (turn_at <= at), turn_at, top, top_bend, crossing, impact, stops)
+
+
+def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
+    """The largest speed between the ends of a step where it exceeds what is known, and whether that is certain."""
+    velocity, zero = derivative(terms), jnp.zeros_like(at)
+    x, last = _root(_TURN, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
+    faster = part.bends & (jnp.abs(part.bound) > known) & (x <= at)
+    return jnp.where(faster, jnp.abs(horner(velocity, x)), 0.0), ~faster | (last <= 1e-4 * x)
+
+
+def advance(stepper: TaylorStepper, state: State) -> State:
+    """One step of a lane that rocks."""
+    scene, order = stepper.scene, stepper.order
+    forcing, unit = stepper.forcing(state.piece, state.local)
+    start = stepper.start(state, forcing, unit)
+    stretch, one = start.stretch, start.one
+    terms = expand(start, order).opening
+    size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
+    least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
+    part = _part(start, terms, jnp.minimum(stepper.room(state), 32 * unit) / unit, least)
+    meeting = _meeting(start, terms, part, state)
+    at, crossing, impact = meeting.at, meeting.crossing, meeting.impact
+    fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
+    certain = keep_flag(meeting.certain & sure, state.local)
+
+    opening, speed, bend = (keep_by(x, one) for x in jet(terms, at, 2))
+    opening = jnp.where(crossing, scene.table.saddle, jnp.where(impact, 0.0, opening))
+    velocity = jnp.where(meeting.stops, 0.0, keep_by(speed / stretch, one))
+    elapsed = keep_by(at * unit, one)
+    full = part.full & ~(crossing | impact | meeting.stops)
+    piece, local, over = stepper.move_on(state, elapsed, full)
+    errors = 2 * least, 2 * least * jnp.maximum(order / (at * stretch), 1.0)
+    spread = stepper.spread_after(state, start.angle, state.side * forcing[0], elapsed, errors)
+    passed = replace(
+        state,
+        spread=jax.tree.map(lambda x: keep_by(x, one), spread),
+        local=state.local + meeting.turn_at * unit,  # until the turning point is noted
+        opening=opening,
+        velocity=velocity,
+        beyond=state.beyond ^ crossing,
+        uplifting=jnp.zeros_like(state.uplifting),
+        fastest=jnp.maximum(state.fastest, jnp.maximum(fast / stretch, jnp.abs(velocity))),
+        done=over,
+    )
+    noted = stepper.note(
+        passed,
+        part.outward > 0,
+        meeting.turned & ~crossing,
+        crossing,
+        jnp.where(crossing, scene.table.saddle, meeting.top),
+        jnp.where(crossing, velocity, 0.0),
+        keep_by(jnp.where(crossing, bend, meeting.top_bend) / stretch**2, one),
+    )
+    noted = replace(noted, piece=piece, local=local)
+    steepest = horner([k * jnp.abs(c) for k, c in enumerate(forcing)][1:] or [jnp.zeros_like(at)], part.length) / unit
+    hit = stepper.impact(noted, impact, velocity, horner(forcing, at), steepest, (part.length - at) * unit)
+    escaped = stepper.escaped(state, start.angle)
+    postponed = ~certain & ~escaped & (hit.status == Status.successful)
+    after = replace(
+        hit,
+        overturned=state.overturned | escaped,
+        done=hit.done | escaped | ~certain,
+        status=Status.where(postponed, Status.undecided, hit.status),
+    )
+    return stepper.checked(state, after)
+
+
+def wait(stepper: TaylorStepper, state: State) -> State:
+    """At rest: go on to where the acceleration exceeds the threshold, or as far as that is certain not to happen."""
+    scene, threshold, order = stepper.scene, stepper.scene.table.threshold, stepper.order
+    forcing, unit = stepper.forcing(state.piece, state.local)
+    room = jnp.minimum(stepper.room(state), 32 * unit) / unit
+    length = room
+    if len(forcing) > order:
+        length = jnp.minimum(room, step_length(forcing, stepper.tolerance * threshold, room))
+    slope = derivative(forcing) or [jnp.zeros_like(length)]
+    rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
+    share = jnp.zeros_like(length)
+    for part in reversed(_SHORTER):
+        share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
+    share = jnp.where((slope[0] == 0) & (len(forcing) <= 2), 1.0, share)
+    full = (length >= room * (1 - 1e-9)) & (share == 1)
+    length = keep(share * length, state.local)
+    end = horner(forcing, length)
+    slack = 8 * jnp.finfo(end.dtype).eps * threshold
+    lifts = jnp.abs(forcing[0]) > threshold + slack
+    touching = ~lifts & (jnp.abs(forcing[0]) >= threshold - slack)
+    meets = ~lifts & (jnp.abs(end) > threshold + slack)
+    level = jnp.sign(end) * threshold
+    missing = [forcing[0] - level, *forcing[1:]]
+    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, missing[0], slope[0], end - level)
+    elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit
+    full = full & ~meets & ~lifts
+    piece, local, over = stepper.move_on(state, elapsed, full)
+    piece = jnp.where(full & ~over, scene.after_quiet(piece), piece)
+    never = pick(scene.ceilings, state.piece) <= threshold
+    unclear = ~never & ((share == 0) | touching | (meets & (last > 1e-7 * x)))
+    rested = replace(
+        state,
+        piece=piece,
+        local=local,
+        done=over | never | unclear,
+        steps=state.steps + 1,
+        status=Status.where(unclear, Status.undecided, state.status),
+    )
+    return stepper.lift(rested, jnp.where(lifts, forcing[0], level), (lifts | meets) & ~unclear & ~never, meets)
+
+
+def most_steps(pieces: int) -> int:
+    """After how many steps a scene is left to the careful engine."""
+    return _STEPS + 3 * pieces
+
+
+def has_many_pieces(pieces: int) -> bool:
+    """Whether a motion is a record rather than a pulse."""
+    return pieces > 32
+
+
+def glance(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
+    """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
+    pieces = stepper.scene.pieces
+    limit = jnp.minimum(limit, most_steps(pieces))
+
+    def until(condition, step):
+        return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
+
+    def resting(state):
+        return state.side == 0
+
+    if has_many_pieces(pieces):
+        # Among many lanes under a record some rest at any time: all take both steps.
+        def step(s):
+            waited, rocked = wait(stepper, s), advance(stepper, s)
+            return jax.tree.map(lambda a, b: jnp.where(resting(s), a, b), waited, rocked)
+
+        return until(lambda s: True, step)(state)
+    rest = until(resting, lambda s: wait(stepper, s))
+    rock = until(lambda s: ~resting(s), lambda s: advance(stepper, s))
+    return until(lambda s: True, lambda s: rock(rest(s)))(state)

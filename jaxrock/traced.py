@@ -1,0 +1,89 @@
+"""A function as the program it traces to: equal programs are compiled once, and known again in another process."""
+
+import functools
+import hashlib
+from collections.abc import Callable, Iterator
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+
+from jaxrock._checks import put_down
+
+
+class Traced:
+    """`function(**point)` of numbers, called as `traced(*point, constants)`.
+
+    Two of them are equal if they trace to the same program, whatever the constants (a record, say): these are
+    arguments. `shapes` is what the function returns, `fingerprint` tells program and constants in any process.
+    Checks of arguments do not raise: a call returns the results, and for each of `messages` whether it applies.
+    """
+
+    def __init__(self, function: Callable, point: dict[str, jax.ShapeDtypeStruct]):
+        def checked(*values):
+            with put_down() as checks:
+                found = function(**dict(zip(point, values)))
+            messages.extend(message for message, _ in checks)
+            return found, tuple(failed for _, failed in checks)
+
+        messages = []
+        closed, shapes = jax.make_jaxpr(checked, return_shape=True)(*point.values())
+        self.shapes, self.messages, self.constants = shapes[0], tuple(messages), tuple(closed.consts)
+        self._jaxpr, self._tree = closed.jaxpr, jax.tree.structure(shapes)
+        # JAX prints no addresses and no arrays here: the arrays follow one by one.
+        told = hashlib.sha256(f"{closed.jaxpr}".encode())
+        callbacks = []
+        for part in _hidden(closed.jaxpr):
+            if callable(part):
+                callbacks.append(_same_callback(part))
+            else:
+                _tell(told, part)
+        self._key = (told.hexdigest(), self._tree, self.messages, tuple(callbacks))
+        for constant in self.constants:
+            _tell(told, constant)
+        self.fingerprint = told.hexdigest()
+
+    def __call__(self, *arguments):
+        """Evaluate at a point; the last argument are the constants."""
+        *point, constants = arguments
+        found = jaxpr_as_fun(ClosedJaxpr(self._jaxpr, list(constants)))(*point)
+        return jax.tree.unflatten(self._tree, found)
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __eq__(self, other):
+        return isinstance(other, Traced) and self._key == other._key
+
+
+def _tell(told, value) -> None:
+    array = np.asarray(value)
+    told.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+
+
+def _hidden(jaxpr: Jaxpr) -> Iterator:
+    """What the print of a program does not show: arrays within it, and functions it calls back."""
+    for equation in jaxpr.eqns:
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else (value,):
+                if isinstance(part, ClosedJaxpr):
+                    yield from part.consts
+                    yield from _hidden(part.jaxpr)
+                elif isinstance(part, Jaxpr):
+                    yield from _hidden(part)
+                elif "callback" in equation.primitive.name and callable(part):
+                    yield getattr(part, "callback_func", part)
+
+
+def _same_callback(function: Callable):
+    """What tells a function that a program calls back from others.
+
+    Checks of arguments (`equinox.error_if`) are made anew whenever they are traced; they are alike if they say the
+    same. Any other function is only like itself.
+    """
+    inner = function.func if isinstance(function, functools.partial) else function
+    if not getattr(inner, "__module__", "").startswith("equinox."):
+        return function
+    cells = [cell.cell_contents for cell in getattr(inner, "__closure__", None) or ()]
+    said = tuple(text for cell in cells for text in (cell if isinstance(cell, (list, tuple)) else [cell]))
+    return inner.__qualname__, tuple(text for text in said if isinstance(text, str))

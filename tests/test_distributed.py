@@ -1,0 +1,126 @@
+"""Many processes: a sweep gives the same bits however many share it, and goes on after one of them was killed.
+
+The processes are those of one machine, which talk over its loopback as machines do over a network.
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+PATIENCE = 240  # seconds; all of it takes some ten
+
+# Every process of a job runs this: own number, number of processes, port, folder, function, block at which to die.
+WORKER = """
+import os, signal, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+own, count, port, kill = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[6])
+folder, kind = sys.argv[4:6]
+import jaxrock as rk
+if count > 1:
+    jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
+rk.use_cpu_devices(1 + own % 2)
+import jax.numpy as jnp
+import numpy as np
+from jaxrock.store import Store
+
+def chaotic(alpha, p):
+    x, steps = jax.lax.while_loop(
+        lambda s: (s[0] < 0.99) & (s[1] < 50), lambda s: (p * s[0] * (1 - s[0]), s[1] + 1), (alpha, 0)
+    )
+    return {"x": jnp.sin(x), "steps": steps, "above": x > 0.5, "pair": jnp.stack([x, alpha])}
+
+def outcome(alpha, p):
+    return rk.outcome(rk.Block(alpha, p), rk.SinePulse(0.5, 1.0))
+
+store = None if folder == "-" else folder
+if kill >= 0:
+    write, done = Store.write, []
+    class Deadly:
+        def __setitem__(self, place, leaf):
+            os.kill(os.getpid(), signal.SIGKILL)
+    def dying(self, place, leaves):
+        if len(done) == kill:  # dies between its first array and its second
+            self._arrays[1] = Deadly()
+        write(self, place, leaves)
+        done.append(place)
+    Store.write = dying
+axes = dict(alpha=np.linspace(0.05, 0.3, 23), p=np.linspace(1.0, 3.9, 31))
+for _ in range(2 if store is None else 1):
+    grid = rk.sweep(globals()[kind], store=store, block=100, progress=False, **axes)
+leaves = {f"a{k}": leaf for k, leaf in enumerate(jax.tree.leaves(grid.values))}
+np.savez(f"{sys.argv[7]}/{own}.npz", resumed=grid.resumed, processes=jax.process_count(), **leaves)
+"""
+
+
+def job(count, folder, out, kind="chaotic", kill=-1):
+    """Start all processes of a job; the last one may die. Results of each, or how many blocks there were at the end."""
+    out.mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))} | {"JAX_PLATFORMS": "cpu"}
+    processes = []
+    for own in range(count):
+        dies = kill if own == count - 1 else -1
+        words = map(str, (own, count, port, folder, kind, dies, out))
+        with (out / f"{own}.log").open("w") as log:
+            processes.append(
+                subprocess.Popen([sys.executable, "-c", WORKER, *words], env=environment, stdout=log, stderr=log)
+            )
+    try:
+        end = time.monotonic() + PATIENCE
+        if kill >= 0:
+            assert processes[-1].wait(PATIENCE) == -signal.SIGKILL, (out / f"{count - 1}.log").read_text()
+            return None
+        for own, process in enumerate(processes):
+            code = process.wait(max(end - time.monotonic(), 1))
+            assert code == 0, (out / f"{own}.log").read_text()
+    finally:  # as a scheduler does
+        for process in processes:
+            process.kill()
+            process.wait()
+    return [dict(np.load(out / f"{own}.npz")) for own in range(count)]
+
+
+def bits(results):
+    return {name: (values.dtype, values.shape, values.tobytes()) for name, values in results.items() if name[0] == "a"}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    return bits(job(1, "-", tmp_path_factory.mktemp("job") / "alone")[0])
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_processes_share_a_sweep(tmp_path, alone, count):
+    found = job(count, "-", tmp_path / "out")
+    assert [int(results["processes"]) for results in found] == [count] * count
+    for results in found:
+        assert bits(results) == alone
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_killed_job_goes_on(tmp_path, alone, count):
+    """The last process dies in the middle of its second block; started again, the job computes only what is missing."""
+    pytest.importorskip("zarr")
+    store = tmp_path / "a.zarr"
+    job(count, store, tmp_path / "first", kill=1)
+    for results in job(count, store, tmp_path / "second"):
+        assert bits(results) == alone
+        assert 0 < int(results["resumed"]) < 23 * 31
+    for results in job(1, store, tmp_path / "third"):
+        assert bits(results) == alone and int(results["resumed"]) == 23 * 31
+
+
+@pytest.mark.slow
+def test_processes_share_outcomes(tmp_path):
+    alone = bits(job(1, "-", tmp_path / "alone", "outcome")[0])
+    for results in job(2, "-", tmp_path / "out", "outcome"):
+        assert bits(results) == alone

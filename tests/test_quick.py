@@ -1,0 +1,106 @@
+"""The quick pass that many scenes go through: the same results as the careful engine, one scene after the other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock._pick import pick
+from jaxrock._trigonometry import logarithm
+from jaxrock.polynomial import root_of
+from jaxrock.response import _quick, _start
+
+PULSES = {
+    "sine": rk.SinePulse,
+    "half sine": rk.HalfSinePulse,
+    "cosine (starts with a jump)": rk.CosinePulse,
+    "rectangle (ends with a jump)": rk.RectangularPulse,
+    "triangle (kink at its top)": rk.TriangularPulse,
+    "rounded lobe": lambda a, d: rk.ExponentialPulse(a, d, -2.0),
+    "spike": lambda a, d: rk.ExponentialPulse(a, d, 5.0),
+    "Ricker (quiet at first)": rk.RickerPulse,
+    "two pulses, overlapping": lambda a, d: rk.SinePulse(a, d) + rk.SinePulse(-0.7 * a, 0.6 * d).shifted(0.5 * d),
+}
+SLOW = set(PULSES) - {"sine", "rectangle (ends with a jump)", "two pulses, overlapping"}
+
+
+def scenes(count, seed=1):
+    """alpha, p, restitution, intensity, frequency ratio: stocky and slender, gentle to violent, damped to elastic."""
+    random = np.random.default_rng(seed)
+    low, high = np.array([[0.03, 0.5, 0.2, 0.99, 0.15], [0.6, 5.0, 1.0, 12.0, 9.0]])
+    return tuple(np.exp(random.uniform(np.log(low), np.log(high), (count, 5))).T)
+
+
+def under(pulse, model):
+    def one(alpha, p, restitution, intensity, ratio):
+        block = rk.Block(alpha, p, restitution)
+        return rk.outcome(block, pulse(intensity * model.table(block).threshold, 2 * jnp.pi / (ratio * p)), model)
+
+    return one
+
+
+def compare(quick: rk.Outcome, careful: rk.Outcome, alpha):
+    np.testing.assert_array_equal(quick.status._value, careful.status._value)
+    for name in ("overturned", "impact_count", "differentiable"):
+        np.testing.assert_array_equal(getattr(quick, name), getattr(careful, name), name)
+    # Two computations differ by the errors of both: ten standard ones.
+    atol = np.where(np.isfinite(careful.error), 10 * careful.error, 0) + 1e-13 * alpha
+    safe = ~np.asarray(careful.overturned)
+    assert np.all(np.abs(quick.max_rotation - careful.max_rotation)[safe] <= atol[safe])
+    np.testing.assert_allclose(quick.max_velocity, careful.max_velocity, rtol=1e-10)
+    np.testing.assert_allclose(quick.margin, careful.margin, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(quick.clearance, careful.clearance, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
+@pytest.mark.parametrize("pulse", [pytest.param(p, marks=pytest.mark.slow) if p in SLOW else p for p in PULSES])
+def test_many_scenes_are_as_each_alone(pulse, model):
+    points = scenes(400)
+    one = under(PULSES[pulse], model)
+    compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), points[0])
+
+
+def test_many_blocks_in_an_earthquake_are_as_each_alone():
+    """In rounds: some are lost long before others; many come to rest and uplift again."""
+    alpha, p, restitution, *_ = scenes(100)
+    record = 1.2 * rk.example_record()
+
+    def one(alpha, p, restitution):
+        return rk.outcome(rk.Block(alpha, p, restitution), record)
+
+    points = alpha, p, np.minimum(restitution, 0.95)
+    compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), alpha)
+
+
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
+def test_few_scenes_are_postponed(model):
+    """Otherwise the quick pass would be right, and slow."""
+    quick = _quick(rk.Series(), False)
+
+    def one(alpha, p, restitution, intensity, ratio):
+        block = rk.Block(alpha, p, restitution)
+        pulse = rk.SinePulse(intensity * model.table(block).threshold, 2 * jnp.pi / (ratio * p))
+        scene = block, pulse, model, tuple(jnp.asarray(x) for x in _start((0.0, 0.0)))
+        return quick.conclude(scene, quick.follow(scene, quick.begin(scene), 10_000))[1]
+
+    assert np.mean(jax.jit(jax.vmap(one))(*scenes(2000))) < 0.05
+
+
+@pytest.mark.parametrize("degree", [6, 8, 12, 16, 20, 31])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rough_roots(degree, dtype):
+    value = np.logspace(-30, 30, 1001, dtype=dtype)
+    np.testing.assert_allclose(root_of(value, degree), value.astype(float) ** (1 / degree), rtol=0.012)
+
+
+def test_logarithm():
+    value = np.concatenate([np.logspace(-300, 300, 1001), 1 + np.linspace(-0.5, 1, 1001), 1 + np.logspace(-15, -1, 50)])
+    np.testing.assert_allclose(logarithm(value), np.log(value), rtol=2e-15, atol=0)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 9, 100])
+def test_pick(count):
+    values, index = jnp.arange(10.0, 10.0 + count), jnp.arange(-1, count + 3)
+    expected = values[jnp.clip(index, 0, count - 1)]
+    np.testing.assert_array_equal(jax.vmap(lambda i: pick(values, jnp.maximum(i, 0)))(index), expected)

@@ -1,0 +1,250 @@
+"""Sweeps: every point in its place, whatever the shape of the grid, the size of a block and the number of devices."""
+
+import math
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.sweeps import Plan, Runner, layout, surface
+from jaxrock.traced import Traced
+
+COMPILED = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, duration, **_: COMPILED.append(event) if event.endswith("backend_compile_duration") else None
+)
+
+
+def simple(alpha, p):
+    """Something of every kind, which NumPy gives to the last bit."""
+    return {"sum": alpha + 16 * p, "above": alpha > p, "count": jnp.int32(8 * p), "pair": jnp.stack([alpha, p])}
+
+
+def lists(*sizes):
+    return {name: np.arange(1.0, n + 1) / 8 for name, n in zip(("alpha", "p"), sizes)}
+
+
+def expected(alpha, p):
+    return {
+        "sum": alpha + 16 * p,
+        "above": alpha > p,
+        "count": (8 * p).astype(np.int32),
+        "pair": np.stack([alpha, p], -1),
+    }
+
+
+@pytest.mark.parametrize("block", [None, 1, 7, 64, 1000])
+@pytest.mark.parametrize("sizes", [(1, 1), (3, 70), (70, 3), (1, 400), (40, 40)])
+def test_every_point_is_in_its_place(sizes, block):
+    axes = lists(*sizes)
+    if block == 1 and math.prod(sizes) > 400:
+        pytest.skip("slow, and the same")
+    grid = rk.sweep(simple, block=block, **axes)
+    wanted = expected(*np.meshgrid(*axes.values(), indexing="ij"))
+    assert grid.shape == sizes and grid.resumed == 0
+    for name, values in wanted.items():
+        assert grid.values[name].dtype == values.dtype
+        np.testing.assert_array_equal(grid.values[name], values)
+
+
+@pytest.mark.parametrize("size, block", [(1, None), (200, None), (200, 70)])
+def test_axes_side_by_side(size, block):
+    axes = lists(size, size)
+    grid = rk.sweep(simple, outer=False, block=block, **axes)
+    assert grid.shape == (size,)
+    for name, values in expected(*axes.values()).items():
+        np.testing.assert_array_equal(grid.values[name], values)
+
+
+def test_axes_keep_their_type_and_one_number_is_a_result():
+    grid = rk.sweep(lambda k: jnp.arange(5)[k] ** 2, k=[3, 1, 4])
+    np.testing.assert_array_equal(grid.values, [9, 1, 16])
+    assert repr(grid) == "Grid(outer, k: 3; value)"
+
+
+def test_sweep_is_made_of_outcomes():
+    record = rk.Record(0.3 * np.sin(np.linspace(0, 6, 40)), 0.05)
+    grid = rk.sweep(
+        lambda alpha, p: rk.outcome(rk.Block(alpha, p), record, rk.Linear()), alpha=[0.1, 0.2], p=np.linspace(1, 9, 40)
+    )
+    single = jax.jit(jax.vmap(lambda p: rk.outcome(rk.Block(0.2, p), record, rk.Linear())))(grid.axes["p"])
+    assert isinstance(grid.values, rk.Outcome) and np.all(grid.values.status == rk.Status.successful)
+    assert 0 < np.sum(grid.values.overturned) < grid.values.overturned.size
+    np.testing.assert_array_equal(grid.values.impact_count[1], single.impact_count)
+    np.testing.assert_allclose(grid.values.max_rotation[1], single.max_rotation, rtol=1e-11)
+
+
+def test_a_sweep_is_compiled_once():
+    """All its blocks, the last ones too; and it is not compiled again where only constants differ."""
+
+    def run(constant, sign=1, size=100):
+        held = jnp.full(3, constant)
+        return rk.sweep(lambda alpha, p: jnp.sum(held * alpha) + sign * p, block=300, **lists(size, 7)).values
+
+    def compilations(*arguments):
+        before = len(COMPILED)
+        run(*arguments)
+        return len(COMPILED) - before
+
+    run(0.0)  # what NumPy and JAX do on the way is compiled here
+    np.testing.assert_allclose(run(2.0)[3], 3.0 + lists(1, 7)["p"])
+    np.testing.assert_allclose(run(4.0)[3], 6.0 + lists(1, 7)["p"])
+    assert compilations(5.0) == 0
+    assert compilations(1.0, 2, 100) == compilations(1.0, 3, 40) > 0  # three blocks, one block
+
+
+def test_neighbours_share_a_chunk_and_chunks_are_dealt_in_turn():
+    found = surface(lambda x, _: jax.lax.axis_index("devices") + jnp.int32(0 * x), (np.arange(640.0),), (), "", False)
+    np.testing.assert_array_equal(found, np.repeat([0, 1] * 5, 64))
+
+
+@pytest.mark.parametrize("shape", [(10**3, 10**3, 10**3), (10**9,), (7, 13, 10**6), (2**20, 3), (257, 257)])
+def test_blocks_are_bounded_and_cover_the_grid(shape):
+    plan = Plan.of(tuple(np.broadcast_to(0.0, n) for n in shape), True)
+    assert math.prod(plan.block) <= 2**18
+    assert plan.sizes.sum() == math.prod(shape)
+    assert math.prod(plan.blocks) * math.prod(plan.block) <= 1.25 * math.prod(shape)  # what is padded at most
+
+
+def test_a_runner_takes_any_number_of_points():
+    runner = Runner(lambda x, _: x**2, (np.ones(1),), (), 0)
+    for size in (0, 1, 127, 128, 129, 8192, 20000):
+        np.testing.assert_array_equal(runner([np.arange(float(size))])[0], np.arange(float(size)) ** 2)
+
+
+@pytest.mark.parametrize("points, lanes", [(0, 1024), (2048, 1024), (2049, 2048), (10**6, 65536)])
+def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
+    shape = layout(points, 2, "gpu")
+    assert shape == (4, 2, lanes)
+    monkeypatch.setattr("jaxrock.sweeps.layout", lambda *_: shape)
+    x = np.arange(float(points))
+    np.testing.assert_array_equal(Runner(lambda x, _: x**2, (x,), (), points)([x])[0], x**2)
+
+
+def test_what_fills_a_batch_up_is_one_of_its_points():
+    """Any other point might take for ever."""
+    runner, seen = Runner(lambda x, _: x, (np.ones(1),), (), 0), []
+    call = runner._call
+    runner._call = lambda parts, *rest: seen.append(parts[0]) or call(parts, *rest)
+    runner([np.arange(5.0, 105.0)])
+    assert seen[0].size > 100 and np.isin(seen[0], np.arange(5.0, 105.0)).all()
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({}, "needs at least one axis"),
+        ({"alpha": 0.1}, "`alpha` must be a list of at least one number, but has shape"),
+        ({"alpha": []}, "`alpha` must be a list of at least one number"),
+        ({"alpha": [[0.1]]}, "`alpha` must be a list"),
+        ({"alpha": ["a"]}, "`alpha` must be a list .* type <U1"),
+        ({"alpha": [0.1], "p": [1.0, 2.0], "outer": False}, "one length, but alpha has 1, p has 2"),
+        ({"alpha": [0.1], "p": [1.0], "block": 0}, "`block` must be at least 1, but is 0"),
+        ({"alpha": [0.1], "p": [1.0], "load": False}, "`load` must be True"),
+        ({"sum": [0.1]}, "other names than the axes"),
+    ],
+)
+def test_bad_axes_raise(arguments, message):
+    function = (lambda **x: {"sum": x["sum"]}) if "sum" in arguments else simple
+    with pytest.raises(ValueError, match=message):
+        rk.sweep(function, **arguments)
+
+
+def test_values_out_of_range_raise():
+    with pytest.raises(
+        ValueError, match=r"^Argument `restitution` must be in \[0, 1\], but is not at the point \(1.3\).$"
+    ):
+        rk.sweep(lambda e: rk.Block(0.1, 1.0, e).restitution, e=[0.5, 1.3])
+
+
+def test_values_out_of_range_within_a_surface_raise():
+    with pytest.raises(
+        ValueError, match=r"^Argument `restitution` must be in \[0, 1\], but is not at the point \(1.3\).$"
+    ):
+        surface(lambda e, _: rk.Block(0.1, 1.0, e).restitution, (np.array([0.5, 1.3]),), (), "", False)
+
+
+def test_checks_do_not_keep_a_program_from_the_cache():
+    """JAX keeps no compiled program on disk that may call back to Python, which is how checks raise."""
+    traced = Traced(lambda e: rk.Block(0.1, 1.0, e).restitution, {"e": jax.ShapeDtypeStruct((), np.dtype(float))})
+    assert "Argument `restitution` must be in [0, 1]" in traced.messages
+    assert "callback" not in str(jax.make_jaxpr(traced)(0.5, ()))
+
+
+def test_progress(capsys):
+    rk.sweep(simple, **lists(3, 4), progress=True)
+    assert "12/12" in capsys.readouterr().err
+    rk.sweep(simple, **lists(3, 4))
+    assert capsys.readouterr().err == ""
+
+
+def point():
+    return {"x": jax.ShapeDtypeStruct((), np.dtype(float))}
+
+
+def test_programs_are_told_apart():
+    """Constants are arguments, but part of the fingerprint; arrays within a program are part of it."""
+    one, two = jnp.arange(3.0), jnp.arange(3.0) + 1
+    same = Traced(lambda x: x * one, point()), Traced(lambda x: x * two, point())
+    assert same[0] == same[1] and hash(same[0]) == hash(same[1])
+    assert same[0].fingerprint != same[1].fingerprint == Traced(lambda x: x * two, point()).fingerprint
+    assert same[0] != Traced(lambda x: x + one, point())
+    assert same[0] != Traced(lambda x: {"a": x * one}, point())
+    inner = [Traced(lambda x, c=c: jax.jit(lambda y: y * c)(x), point()) for c in (one, two)]
+    assert inner[0] != inner[1] and inner[0].fingerprint != inner[1].fingerprint
+    close = [Traced(lambda x, c=c: x * c, point()) for c in (0.1, np.nextafter(0.1, 1))]
+    assert close[0] != close[1] and close[0].fingerprint != close[1].fingerprint
+    called = [
+        Traced(lambda x, f=f: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"), point())
+        for f in (lambda x: x, lambda x: -x)
+    ]
+    assert called[0] != called[1]
+    checks = [Traced(lambda x: rk.Block(x, 1.0).restitution, point()) for _ in range(2)]
+    assert checks[0] == checks[1]
+
+
+def fresh(code, *, seed="0"):
+    """What a fresh interpreter prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={"PYTHONHASHSEED": seed, "JAX_PLATFORMS": "cpu", "PATH": ""},
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_fingerprints_are_the_same_in_every_process():
+    code = """
+import jax, numpy as np, jaxrock as rk
+from jaxrock.traced import Traced
+record = rk.Record(np.arange(5.0), 0.01)
+print(Traced(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtypeStruct((), "float32")}).fingerprint)
+"""
+    assert fresh(code, seed="1") == fresh(code, seed="2")
+
+
+@pytest.mark.parametrize(
+    "code, printed",
+    [
+        ("import jax, jaxrock as rk; print(rk.use_cpu_devices(3), rk.use_cpu_devices(3), jax.device_count())", "3 3 3"),
+        ("import jax, jaxrock as rk; rk.use_cpu_devices(2); jax.devices(); print(rk.use_cpu_devices(2))", "2"),
+        ("import os, jaxrock as rk; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+         "print(rk.use_cpu_devices())", "1"),
+        ("import os, jax; from jaxrock.__main__ import main; main(['run', '--out', '/dev/null']); "
+         "print(jax.device_count() == len(os.sched_getaffinity(0)))", "True"),
+    ],
+)  # fmt: skip
+def test_cpu_devices(code, printed):
+    assert fresh(code) == printed
+
+
+def test_cpu_devices_come_too_late():
+    assert jax.device_count() == 2
+    with pytest.raises(RuntimeError, match="already computes with 2 CPU devices: call `use_cpu_devices` before"):
+        rk.use_cpu_devices(3)
+    with pytest.raises(ValueError, match="`count` must be at least 1, but is 0"):
+        rk.use_cpu_devices(0)
