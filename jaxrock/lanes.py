@@ -1,26 +1,18 @@
 """Many scenes at once: under `jax.vmap` a function of one scene runs in chunks of lanes that step together.
 
 A quick version of the function, where there is one, goes first; the scenes that it postpones are gathered and done
-by the careful one, again in chunks. On CPUs a chunk is compiled into one function, because its arrays are so short
-that handing them from kernel to kernel would take longer than the arithmetic.
+by the careful one, again in chunks.
 """
 
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import jaxprs_in_params
 
-_LANES = 64  # of a chunk on CPUs: more would not fit the first cache
+_LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
 _WIDE = 1 << 16  # on accelerators
-# What calls a library, and so cannot be compiled into one piece with its surroundings.
-_OUTSIDE = re.compile(
-    "callback|ffi|print|dot_general|conv_general|fft|sort|custom_call|cholesky|triangular|schur|^(lu|qr|svd|eigh?)$"
-)
 
 
 class Quick(NamedTuple):
@@ -40,8 +32,8 @@ class Quick(NamedTuple):
     round: int | None
 
 
-def _lanes() -> int:
-    return _LANES if jax.default_backend() == "cpu" else _WIDE
+def _lanes(most: int, size: int) -> int:
+    return min(most if jax.default_backend() == "cpu" else _WIDE, size)
 
 
 def in_lanes(careful: Callable, quick: Quick | None = None) -> Callable:
@@ -103,16 +95,13 @@ class _Batch:
         return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), found)
 
     def _run(self, leaves):
-        # A number that all share is given to each: XLA aborts where a scalar goes into a function compiled into one.
-        flags = [flag or jnp.ndim(x) == 0 for x, flag in zip(leaves, self.flags)]
-        leaves = [jnp.broadcast_to(x, (self.size,)) if jnp.ndim(x) == 0 else x for x in leaves]
-        moving = [x for x, flag in zip(leaves, flags) if flag]
-        fixed = [x for x, flag in zip(leaves, flags) if not flag]
+        moving = [x for x, flag in zip(leaves, self.flags) if flag]
+        fixed = [x for x, flag in zip(leaves, self.flags) if not flag]
 
         def scenes(function, moving, *more):
             def one(moving, *more):
                 moving, rest = iter(moving), iter(fixed)
-                tree = self.structure.unflatten([next(moving if flag else rest) for flag in flags])
+                tree = self.structure.unflatten([next(moving if flag else rest) for flag in self.flags])
                 return function(tree, *more)
 
             return jax.vmap(one)(moving, *more)
@@ -131,9 +120,8 @@ class _Batch:
             return scenes(quick.unfinished, moving, states)
 
         if quick.round is None:
-            followed = _chunked(
-                lambda parts: follow(jnp.iinfo(jnp.int32).max, *parts), (moving, begun), self.size, True
-            )
+            endless = jnp.iinfo(jnp.int32).max
+            followed = _chunked(lambda parts: follow(endless, *parts), (moving, begun), self.size, _QUICK_LANES)
         else:
             followed = _in_rounds(follow, unfinished, moving, begun, quick.round)
         # Outside the chunks, so that what nobody asks for is not computed.
@@ -141,26 +129,22 @@ class _Batch:
         return _again(careful, moving, found, postponed)
 
 
-def _chunked(function: Callable, leaves, size: int, compact: bool = False):
+def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
     """`function` of leaves with a leading axis of `size`, in chunks; the last is filled up with its last scene."""
-    lanes = min(_lanes(), size)
+    lanes = _lanes(most, size)
     chunks = -(-size // lanes)
 
     def cut(x):
         x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
         return x.reshape(chunks, lanes, *x.shape[1:])
 
-    def loop(parts):
-        return jax.lax.map(function, parts)
-
-    run = as_one_function(loop, size) if compact else loop
-    found = run(jax.tree.map(cut, leaves))
+    found = jax.lax.map(function, jax.tree.map(cut, leaves))
     return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
 
 
 def _again(function: Callable, leaves: list, found, which):
     """`found`, with the results of `function(leaves)` in the places `which`, in chunks."""
-    lanes = min(_lanes(), which.size)
+    lanes = _lanes(_LANES, which.size)
     count = which.sum()
     order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
     order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
@@ -181,41 +165,8 @@ def _in_rounds(follow: Callable, unfinished: Callable, leaves: list, states, ste
 
     def body(carry):
         limit, states, left = carry
-        run = as_one_function(lambda parts: follow(limit, *parts), left.size)
-        states = _again(run, (leaves, states), states, left)
+        states = _again(lambda parts: follow(limit, *parts), (leaves, states), states, left)
         return limit + steps, states, unfinished(states)
 
     carry = jnp.int32(steps), states, unfinished(states)
     return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
-
-
-def as_one_function(function: Callable, size: int) -> Callable:
-    """`function`, on CPUs compiled into one piece: the XLA compiler takes the mark, or ignores it."""
-    if jax.default_backend() != "cpu" or size < _LANES:
-        return function
-
-    def both(*args):
-        # All arguments are results, too: XLA aborts over one that nothing uses after its simplifications.
-        return function(*args), jax.lax.optimization_barrier(args)
-
-    def marked(*args):
-        if _reaches_outside(jax.make_jaxpr(function)(*args).jaxpr):
-            return function(*args)
-        found, _ = jax.tree.map(mark, jax.jit(both)(*args))
-        return found
-
-    def mark(x):
-        return set_xla_metadata(x, xla_cpu_small_call="true", inlineable="false")
-
-    return marked
-
-
-def _reaches_outside(jaxpr) -> bool:
-    """Whether a program calls what cannot be compiled into one piece with it."""
-    for equation in jaxpr.eqns:
-        if _OUTSIDE.search(equation.primitive.name):
-            return True
-        for inner in jaxprs_in_params(equation.params):
-            if _reaches_outside(inner):
-                return True
-    return False

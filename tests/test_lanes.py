@@ -70,14 +70,3 @@ def test_more_axes(fast):
         nested((None, 0), (0, None))(x[0], samples), np.asarray(x[0])[:, None] * np.asarray(samples).sum(1)
     )
     np.testing.assert_array_equal(over(x[1, 2], samples[3]), x[1, 2] * samples[3].sum())
-
-
-def test_what_calls_python_is_left_in_pieces():
-    """It could not be compiled into one function."""
-
-    def called(tree):
-        return jax.pure_callback(np.negative, jax.ShapeDtypeStruct((), tree.dtype), tree, vmap_method="expand_dims")
-
-    fast = Quick(lambda x: x, lambda x, s, limit: called(s), lambda x, s: False, lambda x, s: (s, s > 0), None)
-    run = in_lanes(called, fast)
-    np.testing.assert_array_equal(jax.jit(jax.vmap(run))(jnp.arange(100.0)), -np.arange(100.0))
