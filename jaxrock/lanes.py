@@ -142,7 +142,7 @@ def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
     return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
 
 
-def _again(function: Callable, leaves: list, found, which):
+def _again(function: Callable, leaves, found, which):
     """`found`, with the results of `function(leaves)` in the places `which`, in chunks."""
     lanes = _lanes(_LANES, which.size)
     count = which.sum()
@@ -160,7 +160,7 @@ def _again(function: Callable, leaves: list, found, which):
     return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
 
 
-def _in_rounds(follow: Callable, unfinished: Callable, leaves: list, states, steps: int):
+def _in_rounds(follow: Callable, unfinished: Callable, leaves, states, steps: int):
     """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
 
     def body(carry):

@@ -57,7 +57,7 @@ def sweep(
       it is called again. All processes of a job use the same path. Needs `pip install "jaxrock[store]"`.
     - `load`: whether to return the results. They can stay in the store, if they are too many for the memory.
     - `block`: points that are computed, written and dealt to a process at a time; None: as many as fit well, between
-      4,096 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
+      65,536 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Grid`, the same in every process; None if the results stay in the store.

@@ -168,7 +168,7 @@ def test_a_step_against_its_own_series(model):
     def start(q):
         table = model.table(rk.Block(q[0], 2.0))
         forcing = [q[4 + k] for k in range(5)] + [0.0 * q[0]] * (order - 4)
-        return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], forcing)
+        return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], forcing, jnp.ones(()))
 
     def plainly(q):
         return jnp.stack(jet(expand(start(q), order).opening, jnp.array(0.8), 1))
