@@ -111,7 +111,7 @@ def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar
 
 
 def root_of(value: Scalar, degree: int) -> Scalar:
-    """The root of this degree (6 or more) of a positive number, to one per cent.
+    """The root of this degree (6 or more) of a positive number, to about one per cent.
 
     The bits of a float, read as an integer, are nearly its logarithm: a power function would not vectorise.
     """

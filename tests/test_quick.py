@@ -92,12 +92,12 @@ def test_few_scenes_are_postponed(model):
 def test_rough_roots(degree, dtype):
     value = np.logspace(-30, 30, 1001, dtype=dtype)
     found = jax.vmap(lambda v: root_of(v, degree))(jnp.asarray(value))
-    np.testing.assert_allclose(found, value.astype(float) ** (1 / degree), rtol=0.012)
+    np.testing.assert_allclose(found, value.astype(float) ** (1 / degree), rtol=0.003 + 0.065 / degree)
 
 
 def test_logarithm():
     value = np.concatenate([np.logspace(-300, 300, 1001), 1 + np.linspace(-0.5, 1, 1001), 1 + np.logspace(-15, -1, 50)])
-    np.testing.assert_allclose(logarithm(value), np.log(value), rtol=2e-15, atol=0)
+    np.testing.assert_allclose(logarithm(jnp.asarray(value)), np.log(value), rtol=2e-15, atol=0)
 
 
 @pytest.mark.parametrize("count", [1, 3, 8, 9, 100])
