@@ -107,9 +107,8 @@ class Table(eqx.Module):
     def manifold(self, x: Scalar) -> Scalar:
         """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
         gap = self.saddle - x
-        distance = (
-            2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
-        )  # half-angle form: no cancellation near the saddle
+        # In half the angle: no cancellation near the saddle.
+        distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar) -> Scalar:

@@ -1,8 +1,8 @@
 """The quick pass: Taylor steps in one flat loop without branches, for the many scenes that need no care.
 
 Every lane does the same work in every step: a series, a certificate of its shape, the turning point within it if
-there is one, and the first level that it meets (ground or saddle), where it is cut. What has no certificate, or
-comes to rest, is postponed: the series engine, which takes every care, does it afterwards.
+there is one, and the first level that it meets (ground or saddle), where it is cut. What has no certificate is
+postponed: the series engine, which takes every care, does it afterwards.
 """
 
 import functools
@@ -34,8 +34,10 @@ def _first_sign(value: Scalar, following: Scalar) -> Scalar:
 
 
 def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
-    """How much of a step is certain to turn once at most, as a share of it: the acceleration
-    keeps its sign there, or its derivative does. Zero if nothing is."""
+    """How much of a step is certain to turn once at most, as a share of it; zero if nothing is.
+
+    The acceleration keeps its sign there, or its derivative does.
+    """
     bend = derivative(derivative(terms))
     jerk = derivative(bend)
     jerks = _first_sign(jerk[0], jerk[1])

@@ -1,4 +1,4 @@
-"""Many scenes: points of labelled axes, in blocks of one compiled shape, over all devices, processes and interruptions.
+"""Many scenes: points of labelled axes, in blocks of few compiled shapes, over all devices, processes and interruptions.
 
 Three sizes: a *chunk* of neighbours steps together on one core (see `lanes`); a *batch* of chunks, dealt to the devices
 in turn, is one compiled call; a *block* of batches is a tile of the grid that is computed, written to a store, and
@@ -26,9 +26,9 @@ from jaxrock.grid import Grid, names_of, shape_of
 from jaxrock.store import Store, create, fingerprint
 from jaxrock.traced import Traced
 
-_CHUNK = 64  # neighbours that are dealt to a device together: they step together there
+_CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
-_ROWS, _ROWS_OF_GPU = 4, 4  # vmapped functions of up to 16,384 lanes (65,536 on a GPU) in one compiled call
+_ROWS = 4  # vmapped functions of up to 16,384 lanes (65,536 on a GPU) in one compiled call
 _SMALLEST_BLOCK = 65536
 _LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
 _BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
@@ -244,8 +244,8 @@ def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
     """Shape of a batch: rows, devices, lanes. As many lanes at once as there are points, in few different numbers,
     each of which is compiled."""
     share = -(-points // devices)
-    rows, least, most = (_ROWS, 64, 16384) if platform == "cpu" else (_ROWS_OF_GPU, 1024, 65536)
-    return rows, devices, 2 ** (min(max(share, least), most) - 1).bit_length()
+    least, most = (64, 16384) if platform == "cpu" else (1024, 65536)
+    return _ROWS, devices, 2 ** (min(max(share, least), most) - 1).bit_length()
 
 
 def _deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
@@ -341,7 +341,7 @@ def _compiled(function: Callable, mesh: Mesh) -> tuple[Callable, list[str]]:
         def put(number, found):
             return jax.tree.map(lambda whole, part: whole.at[number, 0].set(part), found, row(number))
 
-        # The number of rows is an argument, so that a grid of any size takes the same compiled program.
+        # The number of rows is an argument, so that grids of any number of rows take the same compiled program.
         empty = jax.tree.map(lambda x: jnp.zeros((own[0].shape[0], 1, *x.shape), x.dtype), jax.eval_shape(row, 0))
         return jax.lax.fori_loop(0, rows, put, empty)
 
