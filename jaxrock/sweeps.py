@@ -1,4 +1,4 @@
-"""Many scenes: points of labelled axes, in blocks of few compiled shapes, over all devices, processes and interruptions.
+"""Many scenes: points of labelled axes, in blocks of few compiled shapes, over devices, processes and interruptions.
 
 Three sizes: a *chunk* of neighbours steps together on one core (see `lanes`); a *batch* of chunks, dealt to the devices
 in turn, is one compiled call; a *block* of batches is a tile of the grid that is computed, written to a store, and
