@@ -17,7 +17,7 @@ from jaxrock.lanes import Quick
 from jaxrock.models import Equation, Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.quick import glance, has_many_pieces, most_steps
-from jaxrock.scene import Scene
+from jaxrock.scene import Scene, check_single
 from jaxrock.series import Series
 from jaxrock.state import State, initial_state, surpasses
 from jaxrock.status import Status
@@ -264,6 +264,7 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
     scene = block, motion, model, initial
     if engine.reverse:
         return run(scene)
+    check_single(block, motion)
     quick = _quick(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
     return differentiable(run, on_tape, quick)(scene)
 

@@ -29,6 +29,18 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
     return jnp.max(motion.bounds)
 
 
+def check_single(block: Block, motion: AbstractMotion) -> None:
+    """Raise ValueError where a parameter is an array outside of `jax.vmap`."""
+    for name, owner in (("block", block), ("motion", motion)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(owner):
+            allowed = 1 if jax.tree_util.keystr(path).endswith(".samples") else 0
+            if jnp.ndim(leaf) > allowed:
+                raise ValueError(
+                    f"Argument `{name}` must hold one scene, but `{jax.tree_util.keystr(path).lstrip('.')}` has "
+                    f"shape {jnp.shape(leaf)}. Use jax.vmap for many."
+                )
+
+
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion."""
 
@@ -48,14 +60,7 @@ class Scene(eqx.Module):
     @classmethod
     def of(cls, block: Block, motion: AbstractMotion, model: Model) -> "Scene":
         """Build the scene; raise ValueError where a parameter is an array outside of `jax.vmap`."""
-        for name, owner in (("block", block), ("motion", motion)):
-            for path, leaf in jax.tree_util.tree_leaves_with_path(owner):
-                allowed = 1 if jax.tree_util.keystr(path).endswith(".samples") else 0
-                if jnp.ndim(leaf) > allowed:
-                    raise ValueError(
-                        f"Argument `{name}` must hold one scene, but `{jax.tree_util.keystr(path).lstrip('.')}` has "
-                        f"shape {jnp.shape(leaf)}. Use jax.vmap for many."
-                    )
+        check_single(block, motion)
         dtype = jnp.result_type(block.alpha, block.p, *jax.tree.leaves(motion))
         block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
         knots, bounds, scales = motion.knots, motion.bounds, motion.scales

@@ -57,6 +57,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
+    finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
     return State(
         piece=count,
         local=zero,
@@ -80,8 +81,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         second=zero,
         spread=Spread.none(opening).plus(eps * opening, eps * outward),
         overturned=no,
-        done=no,
-        status=Status.where(jnp.isfinite(rotation) & jnp.isfinite(velocity), Status.successful, Status.not_finite),
+        done=~finite,
+        status=Status.where(finite, Status.successful, Status.not_finite),
         steps=count,
     )
 
