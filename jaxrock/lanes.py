@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-_LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
+from jaxrock._one_function import as_one_function
+
+_LANES, _QUICK_LANES = 64, 64  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
 _WIDE = 1 << 16  # on accelerators
 
 
@@ -114,13 +116,13 @@ class _Batch:
         quick, begun = self.quick, scenes(self.quick.begin, moving)
 
         def follow(limit, part, states):
-            return scenes(lambda tree, state: quick.follow(tree, state, limit), part, states)
+            return scenes(lambda tree, state: quick.follow(tree, state, limit[0]), part, states)
 
         def unfinished(states):
             return scenes(quick.unfinished, moving, states)
 
         if quick.round is None:
-            endless = jnp.iinfo(jnp.int32).max
+            endless = jnp.array([jnp.iinfo(jnp.int32).max])
             followed = _chunked(lambda parts: follow(endless, *parts), (moving, begun), self.size, _QUICK_LANES)
         else:
             followed = _in_rounds(follow, unfinished, moving, begun, quick.round)
@@ -138,7 +140,7 @@ def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
         x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
         return x.reshape(chunks, lanes, *x.shape[1:])
 
-    found = jax.lax.map(function, jax.tree.map(cut, leaves))
+    found = as_one_function(lambda parts: jax.lax.map(function, parts))(jax.tree.map(cut, leaves))
     return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
 
 
@@ -165,7 +167,8 @@ def _in_rounds(follow: Callable, unfinished: Callable, leaves, states, steps: in
 
     def body(carry):
         limit, states, left = carry
-        states = _again(lambda parts: follow(limit, *parts), (leaves, states), states, left)
+        run = as_one_function(follow)
+        states = _again(lambda parts: run(limit[None], *parts), (leaves, states), states, left)
         return limit + steps, states, unfinished(states)
 
     carry = jnp.int32(steps), states, unfinished(states)
