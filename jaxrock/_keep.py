@@ -1,12 +1,33 @@
 """Keeping XLA's CPU backend from computing the same thing again."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
+
+_kept = True
+
+
+@contextlib.contextmanager
+def nothing_kept():
+    """For programs that XLA does not compile: what is traced meanwhile keeps nothing."""
+    global _kept
+    before, _kept = _kept, False
+    try:
+        yield
+    finally:
+        _kept = before
+
+
+def _needed() -> bool:
+    return _kept and jax.default_backend() == "cpu"
 
 
 def unseen_one(witness):
     """The number one, in a way that the compiler cannot see; `witness`: a number that is known at run time only and
     never negative."""
+    if not _needed():
+        return jnp.ones_like(witness)
     # An exponential is never repeated either, and its underflow is exact.
     return 1 + jnp.exp(jnp.where(witness < 0, 0.0, -2000.0).astype(jnp.asarray(witness).dtype))
 
@@ -18,18 +39,14 @@ def keep_by(value, one):
     all before, would be computed dozens of times a step. A division is never repeated: this one is by an
     `unseen_one`.
     """
-    return value if jax.default_backend() != "cpu" else value / one
+    return value / one if _needed() else value
 
 
 def keep(value, witness):
     """As `keep_by`, from a witness of the one."""
-    return (
-        value
-        if jax.default_backend() != "cpu"
-        else value / jnp.where(witness < 0, 2.0, 1.0).astype(jnp.asarray(value).dtype)
-    )
+    return value / jnp.where(witness < 0, 2.0, 1.0).astype(jnp.asarray(value).dtype) if _needed() else value
 
 
 def keep_flag(flag, witness):
     """As `keep`, of a condition."""
-    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5
+    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5 if _needed() else flag

@@ -40,6 +40,9 @@ _COSINE = (
 # Of artanh(x)/x in x^2, |x| < 0.1716.
 _LOGARITHM = tuple(1 / (2 * k + 1) for k in range(11))
 
+# Of exp(x), |x| < 0.347.
+_EXPONENTIAL = tuple(1 / math.factorial(k) for k in range(14))
+
 
 def _horner(coefficients: tuple[float, ...], x: Real) -> Real:
     total = jnp.full_like(x, coefficients[-1])
@@ -56,7 +59,7 @@ def sine_cosine(x: Real) -> tuple[Real, Real]:
 
 def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     """Sine and cosine of any angle, as exact as the angle itself is rounded."""
-    half_turns = jnp.round(x / math.pi)
+    half_turns = jnp.round(x * (1 / math.pi))
     sine, cosine = sine_cosine((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the rest of pi
     sign = 1 - 2 * jnp.abs(half_turns - 2 * jnp.round(half_turns / 2))
     return sign * sine, sign * cosine
@@ -69,8 +72,22 @@ def logarithm(x: Real) -> Real:
     one, bias = 1 << info.nmant, info.maxexp - 1
     bits = jax.lax.bitcast_convert_type(x, jnp.int64 if info.bits == 64 else jnp.int32)
     # x = 2^power times a number in [1/sqrt 2, sqrt 2).
-    power = (bits + (one // 2 - one // 12)) // one - bias
+    power = ((bits + (one // 2 - one // 12)) >> info.nmant) - bias
     part = jax.lax.bitcast_convert_type(bits - power * one, x.dtype)
     ratio = (part - 1) / (part + 1)
     square = ratio * ratio
     return power.astype(x.dtype) * math.log(2) + 2 * ratio * _horner(_LOGARITHM, square)
+
+
+def exponential(x: Real) -> Real:
+    """exp(x), to a few units of rounding; zero where it is no normal number."""
+    x = jnp.asarray(x)
+    info = jnp.finfo(x.dtype)
+    power = jnp.round(jnp.clip(x / math.log(2), info.minexp - 1, info.maxexp))
+    # ln 2 in two parts: the products with the first are exact.
+    rest = (x - power * 0.6931471803691238) - power * 1.9082149292705877e-10
+    integer = jnp.int64 if info.bits == 64 else jnp.int32
+    # Half the power: 2^1024 is no number, but exp(709) is.
+    half = jax.lax.bitcast_convert_type((power.astype(integer) - 1 + info.maxexp - 1) << info.nmant, x.dtype)
+    value = _horner(_EXPONENTIAL, rest) * half * 2
+    return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))

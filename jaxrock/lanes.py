@@ -5,25 +5,32 @@ by the careful one, again in chunks.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.extend.core import Literal
 
-from jaxrock._one_function import as_one_function
+try:  # an extra
+    from jaxrock import native
+    from jaxrock.operations import Unsupported
+except ImportError:
+    native, Unsupported = None, ()
 
-_LANES, _QUICK_LANES = 64, 64  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
+_LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
 _WIDE = 1 << 16  # on accelerators
+_FEW = 64  # scenes for which it is not worth compiling the quick version
+_ENDLESS = jnp.iinfo(jnp.int32).max
 
 
 class Quick(NamedTuple):
     """A quick version of a function of one scene.
 
-    - `begin(tree)`: a first state.
-    - `follow(tree, state, limit)`: the state where it is finished, or after `limit` steps in all.
-    - `unfinished(tree, state)`: whether it has to be followed further.
-    - `conclude(tree, state)`: the result, and whether that is postponed to the careful function.
+    - `begin(tree)`: the scene as the other functions take it, and a first state.
+    - `follow(scene, state, limit)`: the state where it is finished, or after `limit` steps in all.
+    - `unfinished(scene, state)`: whether it has to be followed further.
+    - `conclude(scene, state)`: the result, and whether that is postponed to the careful function.
     - `round`: steps after which chunks are made up anew of the scenes that are unfinished; None: never.
     """
 
@@ -97,38 +104,107 @@ class _Batch:
         return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), found)
 
     def _run(self, leaves):
-        moving = [x for x, flag in zip(leaves, self.flags) if flag]
-        fixed = [x for x, flag in zip(leaves, self.flags) if not flag]
+        scenes = _Lanes(leaves, self.flags, self.structure)
+        if self.quick is None or self.size <= _FEW:
+            return _chunked(lambda part: scenes.each(self.careful, part), scenes.own, self.size)
+        # Outside the chunks, so that what nobody asks for is not computed.
+        ready, followed = self._followed(scenes)
+        found, postponed = ready.each(self.quick.conclude, ready.own, followed)
+        return _again(lambda part: scenes.each(self.careful, part), scenes.own, found, postponed)
 
-        def scenes(function, moving, *more):
-            def one(moving, *more):
-                moving, rest = iter(moving), iter(fixed)
-                tree = self.structure.unflatten([next(moving if flag else rest) for flag in self.flags])
-                return function(tree, *more)
-
-            return jax.vmap(one)(moving, *more)
-
-        def careful(part):
-            return scenes(self.careful, part)
-
-        if self.quick is None:
-            return _chunked(careful, moving, self.size)
-        quick, begun = self.quick, scenes(self.quick.begin, moving)
+    def _followed(self, scenes: "_Lanes"):
+        """The scenes as the quick version knows them, and their last states."""
+        quick, size = self.quick, self.size
+        ready, begun = scenes.begin(quick.begin)
 
         def follow(limit, part, states):
-            return scenes(lambda tree, state: quick.follow(tree, state, limit[0]), part, states)
+            return ready.each(lambda scene, state: quick.follow(scene, state, limit), part, states)
+
+        def natively(limit, part, states):
+            return ready.each_natively(quick.follow, limit, part, states)
+
+        if native is not None and jax.default_backend() == "cpu":
+            try:
+                if quick.round is None:
+                    return ready, natively(jnp.int32(_ENDLESS), ready.own, begun)
+                return ready, self._in_rounds(natively, ready, begun)
+            except Unsupported:
+                pass
+        if quick.round is None:
+            return ready, _chunked(lambda parts: follow(_ENDLESS, *parts), (ready.own, begun), size, _QUICK_LANES)
+        return ready, self._in_rounds(follow, ready, begun)
+
+    def _in_rounds(self, follow: Callable, ready: "_Lanes", states):
+        """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
 
         def unfinished(states):
-            return scenes(quick.unfinished, moving, states)
+            return ready.each(self.quick.unfinished, ready.own, states)
 
-        if quick.round is None:
-            endless = jnp.array([jnp.iinfo(jnp.int32).max])
-            followed = _chunked(lambda parts: follow(endless, *parts), (moving, begun), self.size, _QUICK_LANES)
-        else:
-            followed = _in_rounds(follow, unfinished, moving, begun, quick.round)
-        # Outside the chunks, so that what nobody asks for is not computed.
-        found, postponed = scenes(quick.conclude, moving, followed)
-        return _again(careful, moving, found, postponed)
+        def body(carry):
+            limit, states, left = carry
+            states = _again(lambda parts: follow(limit, *parts), (ready.own, states), states, left)
+            return limit + self.quick.round, states, unfinished(states)
+
+        carry = jnp.int32(self.quick.round), states, unfinished(states)
+        return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
+
+
+class _Lanes:
+    """Pytrees, one for each lane: leaves that are a lane's `own` have a leading axis, the others are shared."""
+
+    def __init__(self, leaves: list, flags: list[bool], structure):
+        self.leaves, self.flags, self.structure = leaves, flags, structure
+
+    @property
+    def own(self) -> list:
+        """Leaves that differ from lane to lane."""
+        return [x for x, flag in zip(self.leaves, self.flags) if flag]
+
+    def _tree(self, own: list):
+        rest = iter(own)
+        return self.structure.unflatten([next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)])
+
+    def each(self, function: Callable, own: list, *more):
+        """`function(tree, *more)` of lanes with these leaves of their own."""
+        return jax.vmap(lambda own, *more: function(self._tree(own), *more))(own, *more)
+
+    def each_natively(self, function: Callable, limit, own: list, states):
+        """`function(tree, state, limit)` in machine code of our own."""
+        states, structure = jax.tree.flatten(states)
+        count, rest = len(self.leaves), iter(own)
+        leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
+
+        def flat(leaves):
+            tree, state = self.structure.unflatten(leaves[:count]), structure.unflatten(leaves[count:-1])
+            return jax.tree.leaves(function(tree, state, leaves[-1]))
+
+        shared = [not flag for flag in self.flags] + [False] * len(states) + [True]
+        return structure.unflatten(native.run(flat, [*leaves, *states, limit], shared))
+
+    def begin(self, function: Callable) -> tuple["_Lanes", Any]:
+        """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of
+        every lane."""
+
+        def flat(own):
+            return jax.tree.leaves(function(self._tree(own)))
+
+        first = [x[0] for x in self.own]
+        shapes = jax.eval_shape(lambda own: function(self._tree(own)), first)
+        structure, count = jax.tree.structure(shapes[0]), len(jax.tree.leaves(shapes[0]))
+        flags = _follow_from(flat, first)[:count]
+        every = jax.vmap(flat)(self.own)
+        leaves = [many if flag else one for many, one, flag in zip(every, flat(first), flags)]
+        return _Lanes(leaves, flags, structure), jax.tree.unflatten(jax.tree.structure(shapes[1]), every[count:])
+
+
+def _follow_from(function: Callable, inputs: list) -> list[bool]:
+    """Which results of a function depend on its inputs."""
+    program = jax.make_jaxpr(function)(inputs).jaxpr
+    moved = set(program.invars)
+    for equation in program.eqns:
+        if any(not isinstance(x, Literal) and x in moved for x in equation.invars):
+            moved.update(equation.outvars)
+    return [not isinstance(x, Literal) and x in moved for x in program.outvars]
 
 
 def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
@@ -140,7 +216,7 @@ def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
         x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
         return x.reshape(chunks, lanes, *x.shape[1:])
 
-    found = as_one_function(lambda parts: jax.lax.map(function, parts))(jax.tree.map(cut, leaves))
+    found = jax.lax.map(function, jax.tree.map(cut, leaves))
     return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
 
 
@@ -160,16 +236,3 @@ def _again(function: Callable, leaves, found, which):
         return done + lanes, jax.tree.map(lambda x, new: x.at[places].set(new), found, more)
 
     return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
-
-
-def _in_rounds(follow: Callable, unfinished: Callable, leaves, states, steps: int):
-    """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
-
-    def body(carry):
-        limit, states, left = carry
-        run = as_one_function(follow)
-        states = _again(lambda parts: run(limit[None], *parts), (leaves, states), states, left)
-        return limit + steps, states, unfinished(states)
-
-    carry = jnp.int32(steps), states, unfinished(states)
-    return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]

@@ -28,9 +28,9 @@ def _sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, 
 
 def _harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
     """Taylor coefficients of the solution of u'' = -rate^2 u with the given value and slope."""
-    terms = [value, slope]
+    terms, square = [value, slope], rate**2
     for k in range(order - 1):
-        terms.append(-(rate**2) * terms[k] / ((k + 1) * (k + 2)))
+        terms.append(square * terms[k] * (-1 / ((k + 1) * (k + 2))))
     return terms[: order + 1]
 
 

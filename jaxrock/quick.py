@@ -6,6 +6,7 @@ postponed: the series engine, which takes every care, does it afterwards.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,13 +25,18 @@ from jaxrock.taylor import Start, expand
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
-_SHORTER = (1.0, 0.4, 0.1)  # shares of a step that are tried for a certificate
+_SHORTER = (0.4, 0.1)  # shares of a step that are tried for a certificate, after the whole
 _TURN, _MEET = (5, 9, 99), (4, 7, 12, 99)  # degrees of the polynomials whose roots Newton's iterations take
 _STEPS = 1000
 
 
 def _first_sign(value: Scalar, following: Scalar) -> Scalar:
     return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+
+def _if(needed: Flag, function: Callable, otherwise):
+    """`function()` where needed: skipped if no lane of a vector needs it."""
+    return jax.lax.cond(needed, function, lambda: otherwise)
 
 
 def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
@@ -41,11 +47,17 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     bend = derivative(derivative(terms))
     jerk = derivative(bend)
     jerks = _first_sign(jerk[0], jerk[1])
-    share = jnp.zeros_like(length)
-    for part in reversed(_SHORTER):
-        sure = (keeps_sign(bend, rises, part * length) > 0) | (keeps_sign(jerk, jerks, part * length) > 0)
-        share = jnp.where(sure, part, share)
-    return share
+
+    def sure(share):
+        return (keeps_sign(bend, rises, share * length) > 0) | (keeps_sign(jerk, jerks, share * length) > 0)
+
+    def shorter():
+        share = jnp.zeros_like(length)
+        for part in reversed(_SHORTER):
+            share = jnp.where(sure(part), part, share)
+        return share
+
+    return _if(~sure(1.0), shorter, jnp.ones_like(length))
 
 
 def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, at_start: Scalar, slope: Scalar, at_end: Scalar):
@@ -98,18 +110,25 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
         bound = before + first * between
         return (opening, speed, bend), bends, bound, bends & (outward * speed >= 0) & (outward * bound <= 0)
 
-    (_, _, bend), _, _, twice = extremum(share * longest)
-    # Where the velocity may turn twice, the part ends about where the acceleration is zero.
-    share = keep_by(jnp.where(twice, share * first / jnp.where(twice, first - bend, 1.0), share), one)
-    length = keep_by(share * longest, one)
-    end, bends, bound, twice = extremum(length)
-    return _Part(length, *end, reaches & (share == 1), outward, bends, bound, (share > 0) & ~twice)
+    whole = length, *_ = keep_by(share * longest, one), *extremum(share * longest)
+    (_, _, bend), _, _, twice = whole[1:]
+
+    def shorter():
+        # Where the velocity may turn twice, the part ends about where the acceleration is zero.
+        length = keep_by(share * longest * first / jnp.where(twice, first - bend, 1.0), one)
+        return length, *extremum(length)
+
+    length, end, bends, bound, still = _if(twice, shorter, whole)
+    return _Part(length, *end, reaches & (share == 1) & ~twice, outward, bends, bound, (share > 0) & ~still)
 
 
 class _Meeting(NamedTuple):
     """Where a part of a step ends, and what happens until then."""
 
     at: Scalar
+    opening: Scalar  # there, with its derivatives
+    speed: Scalar
+    bend: Scalar
     certain: Flag
     turned: Flag  # turned back before
     turn_at: Scalar
@@ -124,11 +143,16 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     """The turning point within a part, and the first level that it meets, before it turns or after."""
     one, saddle, zero = start.one, start.table.saddle, jnp.zeros_like(part.length)
     turns = keep_flag(part.outward * part.speed < 0, state.local)
-    x_turn, last = _root(_TURN, derivative(terms), zero, part.length, terms[1], 2 * terms[2], part.speed)
-    # Where the velocity is zero the angle is exact to the square of what the time is.
-    certain = part.certain & (~turns | (last <= 1e-4 * x_turn))
-    turn_at = keep_by(jnp.where(turns, x_turn, part.length), one)
-    top, _, top_bend = (keep_by(x, one) for x in jet(terms, turn_at, 2))
+
+    def turn():
+        x, last = _root(_TURN, derivative(terms), zero, part.length, terms[1], 2 * terms[2], part.speed)
+        x = keep_by(x, one)
+        opening, _, bend = (keep_by(value, one) for value in jet(terms, x, 2))
+        # Where the velocity is zero the angle is exact to the square of what the time is.
+        return x, opening, bend, last <= 1e-4 * x
+
+    turn_at, top, top_bend, sure = _if(turns, turn, (part.length, part.opening, part.bend, part.certain))
+    certain = part.certain & sure
 
     crossing = (top >= saddle) != state.beyond
     early = crossing | (top <= 0)
@@ -141,19 +165,31 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     at_low = jnp.where(early, terms[0], top) - level
     at_high = jnp.where(early, top, part.opening) - level
     slope = jnp.where(early, terms[1], 0.0)
-    x_meet, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, at_low, slope, at_high)
-    meets = crossing | impact
-    at = keep_by(jnp.where(meets, x_meet, jnp.where(stops, turn_at, part.length)), one)
-    certain = certain & (~meets | (last <= 1e-7 * x_meet))
-    return _Meeting(at, certain, turns & (turn_at <= at), turn_at, top, top_bend, crossing, impact, stops)
+
+    def meet():
+        x, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, at_low, slope, at_high)
+        x = keep_by(x, one)
+        return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
+
+    def at_end(of_turn, of_part):
+        return jnp.where(stops, of_turn, of_part)
+
+    otherwise = at_end(turn_at, part.length), at_end(top, part.opening), at_end(zero, part.speed)
+    otherwise = *otherwise, at_end(top_bend, part.bend), certain
+    at, opening, speed, bend, certain = _if(crossing | impact, meet, otherwise)
+    turned = turns & (turn_at <= at)
+    return _Meeting(at, opening, speed, bend, certain, turned, turn_at, top, top_bend, crossing, impact, stops)
 
 
 def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
     """The largest speed between the ends of a step where it exceeds what is known, and whether that is certain."""
     velocity, zero = derivative(terms), jnp.zeros_like(at)
-    x, last = _root(_TURN, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
-    faster = part.bends & (jnp.abs(part.bound) > known) & (x <= at)
-    return jnp.where(faster, jnp.abs(horner(velocity, x)), 0.0), ~faster | (last <= 1e-4 * x)
+
+    def extremum():
+        x, last = _root(_TURN, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
+        return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
+
+    return _if(part.bends & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.bends)))
 
 
 def advance(stepper: TaylorStepper, state: State) -> State:
@@ -171,9 +207,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
     certain = keep_flag(meeting.certain & sure, state.local)
 
-    opening, speed, bend = (keep_by(x, one) for x in jet(terms, at, 2))
-    opening = jnp.where(crossing, scene.table.saddle, jnp.where(impact, 0.0, opening))
-    velocity = jnp.where(meeting.stops, 0.0, keep_by(speed / stretch, one))
+    opening = jnp.where(crossing, scene.table.saddle, jnp.where(impact, 0.0, meeting.opening))
+    velocity = keep_by(meeting.speed / stretch, one)
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(crossing | impact | meeting.stops)
     piece, local, over = stepper.move_on(state, elapsed, full)
@@ -190,18 +225,26 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         fastest=jnp.maximum(state.fastest, jnp.maximum(fast / stretch, jnp.abs(velocity))),
         done=over,
     )
-    noted = stepper.note(
-        passed,
-        part.outward > 0,
-        meeting.turned & ~crossing,
-        crossing,
-        jnp.where(crossing, scene.table.saddle, meeting.top),
-        jnp.where(crossing, velocity, 0.0),
-        keep_by(jnp.where(crossing, bend, meeting.top_bend) / stretch**2, one),
-    )
-    noted = replace(noted, piece=piece, local=local)
-    steepest = horner([k * jnp.abs(c) for k, c in enumerate(forcing)][1:] or [jnp.zeros_like(at)], part.length) / unit
-    hit = stepper.impact(noted, impact, velocity, horner(forcing, at), steepest, (part.length - at) * unit)
+
+    def note():
+        return stepper.note(
+            passed,
+            part.outward > 0,
+            meeting.turned & ~crossing,
+            crossing,
+            jnp.where(crossing, scene.table.saddle, meeting.top),
+            jnp.where(crossing, velocity, 0.0),
+            keep_by(jnp.where(crossing, meeting.bend, meeting.top_bend) / stretch**2, one),
+        )
+
+    noted = replace(_if(meeting.turned | crossing, note, passed), piece=piece, local=local)
+
+    def strike():
+        slopes = [k * jnp.abs(c) for k, c in enumerate(forcing)][1:] or [jnp.zeros_like(at)]
+        steepest = horner(slopes, part.length) / unit
+        return stepper.impact(noted, impact, velocity, horner(forcing, at), steepest, (part.length - at) * unit)
+
+    hit = _if(impact, strike, noted)
     escaped = stepper.escaped(state, start.angle)
     postponed = ~certain & ~escaped & (hit.status == Status.successful)
     after = replace(
@@ -224,7 +267,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     slope = derivative(forcing) or [jnp.zeros_like(length)]
     rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
-    for part in reversed(_SHORTER):
+    for part in (*reversed(_SHORTER), 1.0):
         share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
     share = jnp.where((slope[0] == 0) & (len(forcing) <= 2), 1.0, share)
     full = (length >= room * (1 - 1e-9)) & (share == 1)
@@ -278,8 +321,7 @@ def glance(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> S
     if has_many_pieces(pieces):
         # Among many lanes under a record some rest at any time: all take both steps.
         def step(s):
-            waited, rocked = wait(stepper, s), advance(stepper, s)
-            return jax.tree.map(lambda a, b: jnp.where(resting(s), a, b), waited, rocked)
+            return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))
 
         return until(lambda s: True, step)(state)
     rest = until(resting, lambda s: wait(stepper, s))

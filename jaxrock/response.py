@@ -278,14 +278,14 @@ def _quick(engine: Series, rounds: bool) -> Quick:
         stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
         return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
 
-    def conclude(scene, state):
-        found = _conclude(begin(scene)[0], state)
+    def conclude(stepper, state):
+        found = _conclude(stepper, state)
         return found, found.status != Status.successful
 
     return Quick(
-        begin=lambda scene: begin(scene)[1],
-        follow=lambda scene, state, limit: glance(begin(scene)[0], state, limit),
-        unfinished=lambda scene, state: ~state.done & (state.steps < most_steps(scene[1].knots.size - 1)),
+        begin=begin,
+        follow=glance,
+        unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
         conclude=conclude,
         round=256 if rounds else None,
     )
