@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrock.lanes import Quick, in_lanes
+from jaxrock.lanes import Passes, in_lanes
 
 _MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
 
@@ -23,7 +23,7 @@ def _(primals, tangents):
     return with_derivatives_of(*primals), tangents[1]
 
 
-def differentiable(function: Callable, on_tape: Callable | None = None, quick: Quick | None = None) -> Callable:
+def differentiable(function: Callable, on_tape: Callable | None = None, passes: Passes | None = None) -> Callable:
     """`function(tree)` with derivatives of every order, forward and reverse, from forward mode alone.
 
     The derivative is a small Jacobian times the change of the inputs: one column for every number that is
@@ -31,9 +31,9 @@ def differentiable(function: Callable, on_tape: Callable | None = None, quick: Q
     function that makes value and Jacobian is `differentiable` in its turn, so second derivatives do, too.
 
     `on_tape`: the same function, through whose own code reverse mode goes; for derivatives by very many numbers.
-    `quick`: as in `in_lanes`; under `jax.vmap` all this runs in lanes.
+    `passes`: as in `in_lanes`; under `jax.vmap` all this runs in lanes.
     """
-    in_lanes_ = in_lanes(function, quick)
+    in_lanes_ = in_lanes(function, passes)
 
     @eqx.filter_custom_jvp
     def evaluate(tree):

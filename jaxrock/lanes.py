@@ -24,18 +24,20 @@ _FEW = 64  # scenes for which it is not worth compiling the quick version
 _ENDLESS = jnp.iinfo(jnp.int32).max
 
 
-class Quick(NamedTuple):
-    """A quick version of a function of one scene.
+class Passes(NamedTuple):
+    """A function of one scene in parts.
 
-    - `begin(tree)`: the scene as the other functions take it, and a first state.
-    - `follow(scene, state, limit)`: the state where it is finished, or after `limit` steps in all.
-    - `unfinished(scene, state)`: whether it has to be followed further.
-    - `conclude(scene, state)`: the result, and whether that is postponed to the careful function.
+    - `begin(tree)`: the scene as the other parts take it, and a first state.
+    - `quickly(scene, state, limit)`: the state where it is finished or given up, or after `limit` steps in all.
+    - `carefully(scene, state)`: the state where it is finished.
+    - `unfinished(scene, state)`: whether the quick pass has to go on.
+    - `conclude(scene, state)`: the result, and whether the quick pass has postponed it to the careful one.
     - `round`: steps after which chunks are made up anew of the scenes that are unfinished; None: never.
     """
 
     begin: Callable
-    follow: Callable
+    quickly: Callable
+    carefully: Callable
     unfinished: Callable
     conclude: Callable
     round: int | None
@@ -45,16 +47,16 @@ def _lanes(most: int, size: int) -> int:
     return min(most if jax.default_backend() == "cpu" else _WIDE, size)
 
 
-def in_lanes(careful: Callable, quick: Quick | None = None) -> Callable:
-    """`careful(tree)`, which under `jax.vmap` runs in chunks of lanes, after `quick` where that is given."""
+def in_lanes(function: Callable, passes: Passes | None = None) -> Callable:
+    """`function(tree)`, which under `jax.vmap` runs in chunks of lanes, quickly where it can."""
 
     @custom_vmap
     def one(tree):
-        return careful(tree)
+        return function(tree)
 
     @one.def_vmap
     def _(size, batched, tree):
-        found = _Batch(careful, quick, size, batched[0])(tree)
+        found = _Batch(function, passes, size, batched[0])(tree)
         return found, jax.tree.map(lambda _: True, found)
 
     return one
@@ -63,8 +65,8 @@ def in_lanes(careful: Callable, quick: Quick | None = None) -> Callable:
 class _Batch:
     """A function of one scene at `size` scenes: leaves that are `batched` have a leading axis."""
 
-    def __init__(self, careful, quick, size, batched):
-        self.careful, self.quick, self.size = careful, quick, size
+    def __init__(self, function, passes, size, batched):
+        self.function, self.passes, self.size = function, passes, size
         self.flags, self.structure = jax.tree.flatten(batched)
 
     def __call__(self, tree):
@@ -99,53 +101,67 @@ class _Batch:
             return jnp.broadcast_to(x, (size, self.size, *x.shape[2:])).reshape(size * self.size, *x.shape[2:])
 
         flags = [new or old for new, old in zip(batched, self.flags)]
-        batch = _Batch(self.careful, self.quick, size * self.size, self.structure.unflatten(flags))
+        batch = _Batch(self.function, self.passes, size * self.size, self.structure.unflatten(flags))
         found = batch(self.structure.unflatten([merged(*each) for each in zip(leaves, batched, self.flags)]))
         return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), found)
 
     def _run(self, leaves):
         scenes = _Lanes(leaves, self.flags, self.structure)
-        if self.quick is None or self.size <= _FEW:
-            return _chunked(lambda part: scenes.each(self.careful, part), scenes.own, self.size)
-        # Outside the chunks, so that what nobody asks for is not computed.
-        ready, followed = self._followed(scenes)
-        found, postponed = ready.each(self.quick.conclude, ready.own, followed)
-        return _again(lambda part: scenes.each(self.careful, part), scenes.own, found, postponed)
-
-    def _followed(self, scenes: "_Lanes"):
-        """The scenes as the quick version knows them, and their last states."""
-        quick, size = self.quick, self.size
-        ready, begun = scenes.begin(quick.begin)
-
-        def follow(limit, part, states):
-            return ready.each(lambda scene, state: quick.follow(scene, state, limit), part, states)
-
-        def natively(limit, part, states):
-            return ready.each_natively(quick.follow, limit, part, states)
-
-        if native is not None and jax.default_backend() == "cpu":
+        if self.passes is not None and native is not None and jax.default_backend() == "cpu":
             try:
-                if quick.round is None:
-                    return ready, natively(jnp.int32(_ENDLESS), ready.own, begun)
-                return ready, self._in_rounds(natively, ready, begun)
+                return self._natively(scenes)
             except Unsupported:
                 pass
-        if quick.round is None:
-            return ready, _chunked(lambda parts: follow(_ENDLESS, *parts), (ready.own, begun), size, _QUICK_LANES)
-        return ready, self._in_rounds(follow, ready, begun)
 
-    def _in_rounds(self, follow: Callable, ready: "_Lanes", states):
+        def function(own):
+            return scenes.each(self.function, own)
+
+        if self.passes is None or self.size <= _FEW:
+            return _chunked(function, scenes.own, self.size)
+        ready, begun = scenes.begin(self.passes.begin)
+
+        def quickly(limit, own, states):
+            return ready.each(lambda scene, state: self.passes.quickly(scene, state, limit), own, states)
+
+        if self.passes.round is not None:
+            followed = self._in_rounds(quickly, ready, begun)
+        else:
+            followed = _chunked(lambda part: quickly(_ENDLESS, *part), (ready.own, begun), self.size, _QUICK_LANES)
+        # Outside the chunks, so that what nobody asks for is not computed.
+        return _again(function, scenes.own, *ready.each(self.passes.conclude, ready.own, followed))
+
+    def _natively(self, scenes: "_Lanes"):
+        """Both passes in machine code of our own."""
+        ready, begun = scenes.begin(self.passes.begin)
+
+        def function(part):
+            own, states = part
+            return ready.each(self.passes.conclude, own, ready.each_natively(self.passes.carefully, own, states))[0]
+
+        if self.size <= _FEW:
+            return function((ready.own, begun))
+
+        def quickly(limit, own, states):
+            return ready.each_natively(self.passes.quickly, own, states, limit)
+
+        if self.passes.round is not None:
+            followed = self._in_rounds(quickly, ready, begun)
+        else:
+            followed = quickly(jnp.int32(_ENDLESS), ready.own, begun)
+        return _again(function, (ready.own, begun), *ready.each(self.passes.conclude, ready.own, followed))
+
+    def _in_rounds(self, quickly: Callable, ready: "_Lanes", states):
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
 
         def unfinished(states):
-            return ready.each(self.quick.unfinished, ready.own, states)
+            return ready.each(self.passes.unfinished, ready.own, states)
 
         def body(carry):
             limit, states, left = carry
-            states = _again(lambda parts: follow(limit, *parts), (ready.own, states), states, left)
-            return limit + self.quick.round, states, unfinished(states)
+            states = _again(lambda part: quickly(limit, *part), (ready.own, states), states, left)
+            return limit + self.passes.round, states, unfinished(states)
 
-        carry = jnp.int32(self.quick.round), states, unfinished(states)
+        carry = jnp.int32(self.passes.round), states, unfinished(states)
         return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
 
 
@@ -168,18 +184,18 @@ class _Lanes:
         """`function(tree, *more)` of lanes with these leaves of their own."""
         return jax.vmap(lambda own, *more: function(self._tree(own), *more))(own, *more)
 
-    def each_natively(self, function: Callable, limit, own: list, states):
-        """`function(tree, state, limit)` in machine code of our own."""
+    def each_natively(self, function: Callable, own: list, states, *limits):
+        """`function(tree, state, *limits)` in machine code of our own; all share the limits."""
         states, structure = jax.tree.flatten(states)
-        count, rest = len(self.leaves), iter(own)
+        count, end, rest = len(self.leaves), len(self.leaves) + len(states), iter(own)
         leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
 
         def flat(leaves):
-            tree, state = self.structure.unflatten(leaves[:count]), structure.unflatten(leaves[count:-1])
-            return jax.tree.leaves(function(tree, state, leaves[-1]))
+            tree, state = self.structure.unflatten(leaves[:count]), structure.unflatten(leaves[count:end])
+            return jax.tree.leaves(function(tree, state, *leaves[end:]))
 
-        shared = [not flag for flag in self.flags] + [False] * len(states) + [True]
-        return structure.unflatten(native.run(flat, [*leaves, *states, limit], shared))
+        shared = [not flag for flag in self.flags] + [False] * len(states) + [True] * len(limits)
+        return structure.unflatten(native.run(flat, [*leaves, *states, *limits], shared))
 
     def begin(self, function: Callable) -> tuple["_Lanes", Any]:
         """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of

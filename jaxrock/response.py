@@ -13,7 +13,7 @@ from jaxrock.arcs import Diffrax
 from jaxrock.block import Block
 from jaxrock.derivatives import differentiable
 from jaxrock.engine import AbstractEngine, AbstractStepper
-from jaxrock.lanes import Quick
+from jaxrock.lanes import Passes
 from jaxrock.models import Equation, Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.quick import glance, has_many_pieces, most_steps
@@ -265,12 +265,12 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
     if engine.reverse:
         return run(scene)
     check_single(block, motion)
-    quick = _quick(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
-    return differentiable(run, on_tape, quick)(scene)
+    passes = _passes(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
+    return differentiable(run, on_tape, passes)(scene)
 
 
-def _quick(engine: Series, rounds: bool) -> Quick:
-    """The outcome by the quick pass; in rounds where some blocks are lost long before others."""
+def _passes(engine: Series, rounds: bool) -> Passes:
+    """The outcome in parts; in rounds where some blocks are lost long before others."""
 
     def begin(scene):
         block, motion, model, initial = scene
@@ -282,9 +282,10 @@ def _quick(engine: Series, rounds: bool) -> Quick:
         found = _conclude(stepper, state)
         return found, found.status != Status.successful
 
-    return Quick(
+    return Passes(
         begin=begin,
-        follow=glance,
+        quickly=glance,
+        carefully=lambda stepper, state: _to_the_end(engine, stepper, state),
         unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
         conclude=conclude,
         round=256 if rounds else None,
@@ -295,13 +296,18 @@ def _follow(block, motion, model, initial, engine, taped: bool) -> Outcome:
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    # A tape holds all steps, as a history does.
-    budget = engine.budget(scene, history=taped)
     if taped:
-        state, _ = stepper.on_tape(state, budget)
+        # A tape holds all steps, as a history does.
+        state, _ = stepper.on_tape(state, engine.budget(scene, history=True))
     else:
-        state = engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+        state = _to_the_end(engine, stepper, state)
     return _conclude(stepper, state)
+
+
+def _to_the_end(engine: AbstractEngine, stepper: AbstractStepper, state: State) -> State:
+    """Follow a block to the end of the motion."""
+    budget = engine.budget(stepper.scene, history=False)
+    return engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
 
 
 def _conclude(stepper: AbstractStepper, state: State) -> Outcome:

@@ -7,6 +7,7 @@ waits for the threshold. Under `jax.vmap` lanes advance together, each at its ow
 lane needs is not taken.
 """
 
+import functools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -307,7 +308,8 @@ class _Step(NamedTuple):
         scene, order = stepper.scene, stepper.order
         coefficients = expand(start, order).opening
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
-        size = jnp.minimum(scene.alpha, jnp.max(jnp.abs(jnp.stack(coefficients[: max(order // 2, 4)]))))
+        size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
+        size = jnp.minimum(scene.alpha, size)
         length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
         length = keep(jnp.where(full, room, length), state.local)
