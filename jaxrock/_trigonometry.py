@@ -89,5 +89,5 @@ def exponential(x: Real) -> Real:
     integer = jnp.int64 if info.bits == 64 else jnp.int32
     # Half the power: 2^1024 is no number, but exp(709) is.
     half = jax.lax.bitcast_convert_type((power.astype(integer) - 1 + info.maxexp - 1) << info.nmant, x.dtype)
-    value = _horner(_EXPONENTIAL, rest) * half * 2
+    value = 2 * _horner(_EXPONENTIAL, rest) * half
     return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))

@@ -37,19 +37,14 @@ def _arithmetic(of_floats: str, of_integers: str):
     return operation
 
 
-def _quotient(e, _, x, y):
-    return e.b.fdiv(x, y) if is_float(x) else e.b.sdiv(x, _known(y))
+def _of_floats(function: Callable):
+    def operation(e, _, x, y):
+        if not is_float(x):
+            # A divisor of zero, if only in a lane that is done, would stop the process.
+            raise Unsupported("a division of integers")
+        return function(e, x, y)
 
-
-def _remainder(e, _, x, y):
-    return e.each("fmod", x, y) if is_float(x) else e.b.srem(x, _known(y))
-
-
-def _known(y):
-    """A divisor of integers: zero, if only in a lane that is done, would stop the process."""
-    if not isinstance(y, ir.Constant):
-        raise Unsupported("a division of integers")
-    return y
+    return operation
 
 
 def _compare(sign: str):
@@ -156,8 +151,8 @@ OPERATIONS: dict[str, Callable] = {
     "add_any": _arithmetic("fadd", "add"),
     "sub": _arithmetic("fsub", "sub"),
     "mul": _arithmetic("fmul", "mul"),
-    "div": _quotient,
-    "rem": _remainder,
+    "div": _of_floats(lambda e, x, y: e.b.fdiv(x, y)),
+    "rem": _of_floats(lambda e, x, y: e.each("fmod", x, y)),
     "min": _extremum("<"),
     "max": _extremum(">"),
     "neg": _negative,

@@ -9,7 +9,7 @@ import jaxrock as rk
 from jaxrock._pick import pick
 from jaxrock._trigonometry import logarithm
 from jaxrock.polynomial import root_of
-from jaxrock.response import _quick, _start
+from jaxrock.response import _passes, _start
 
 PULSES = {
     "sine": rk.SinePulse,
@@ -76,13 +76,14 @@ def test_many_blocks_in_an_earthquake_are_as_each_alone():
 @pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
 def test_few_scenes_are_postponed(model):
     """Otherwise the quick pass would be right, and slow."""
-    quick = _quick(rk.Series(), False)
+    passes = _passes(rk.Series(), False)
 
     def one(alpha, p, restitution, intensity, ratio):
         block = rk.Block(alpha, p, restitution)
         pulse = rk.SinePulse(intensity * model.table(block).threshold, 2 * jnp.pi / (ratio * p))
         scene = block, pulse, model, tuple(jnp.asarray(x) for x in _start((0.0, 0.0)))
-        return quick.conclude(scene, quick.follow(scene, quick.begin(scene), 10_000))[1]
+        stepper, state = passes.begin(scene)
+        return passes.conclude(stepper, passes.quickly(stepper, state, 10_000))[1]
 
     assert np.mean(jax.jit(jax.vmap(one))(*scenes(2000))) < 0.05
 

@@ -1,0 +1,173 @@
+"""Machine code for many lanes at once does what JAX does for each."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+native = pytest.importorskip("jaxrock.native", reason="needs llvmlite")
+
+from jaxrock.operations import Unsupported  # noqa: E402
+
+NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
+OTHERS = np.roll(NUMBERS, 5)
+WHOLE = np.array([0, 1, -1, 7, -7, 100, 2**31 - 1, -(2**31), 5, 6, 8, 9, 10], np.int32)
+
+
+def both(function, *values, shared=()):
+    """Results by machine code, and by JAX."""
+    values = [jnp.asarray(v) for v in values]
+    flags = [i in shared for i in range(len(values))]
+    found = jax.jit(lambda *v: native.run(lambda leaves: function(*leaves), list(v), flags))(*values)
+    axes = [None if flag else 0 for flag in flags]
+    return found, jax.vmap(lambda *v: function(*v), in_axes=axes)(*values)
+
+
+def agree(function, *values, shared=(), rtol=0.0):
+    for found, expected in zip(*both(function, *values, shared=shared), strict=True):
+        assert found.dtype == expected.dtype
+        np.testing.assert_allclose(found, expected, rtol=rtol, atol=0)
+        if rtol == 0 and found.dtype.kind == "f":
+            zero = found == 0
+            np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
+
+
+REAL = {
+    "sum": lambda x, y: x + y,
+    "difference": lambda x, y: x - y,
+    "product": lambda x, y: x * y,
+    "quotient": lambda x, y: x / y,
+    "smaller": jnp.minimum,
+    "larger": jnp.maximum,
+    "size": lambda x, y: jnp.abs(x),
+    "negative": lambda x, y: -x,
+    "sign": lambda x, y: jnp.sign(x),
+    "root": lambda x, y: jnp.sqrt(jnp.abs(x)),
+    "powers": lambda x, y: x**2 + y**3,
+    "down": lambda x, y: jnp.floor(x),
+    "up": lambda x, y: jnp.ceil(x),
+    "to even": lambda x, y: jnp.round(x),
+    "whole": lambda x, y: x.astype(jnp.int32),
+    "clipped": lambda x, y: jnp.clip(x, -2.0, y),
+    "chosen": lambda x, y: jnp.where(x < y, x, 2 * y),
+    "comparisons": lambda x, y: (x < y) | (x <= y) & (x != y) ^ (x == y) | ~(x >= y) & (x > y),
+    "finite": lambda x, y: jnp.isfinite(x),
+    "bits": lambda x, y: jax.lax.bitcast_convert_type(x, jnp.int64) >> 52,
+    "remainder": lambda x, y: jax.lax.rem(x, y),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_operations_on_real_numbers(name):
+    """Zeros of both signs, infinite, and what is not a number."""
+    agree(lambda x, y: [REAL[name](x, y)], NUMBERS, OTHERS, rtol=1e-15 if name == "powers" else 0.0)
+
+
+@pytest.mark.parametrize("name", ["sum", "quotient", "smaller", "sign", "to even", "whole", "chosen"])
+def test_operations_in_single_precision(name):
+    with np.errstate(over="ignore"):
+        x, y = NUMBERS.astype(np.float32), OTHERS.astype(np.float32)
+    agree(lambda x, y: [REAL[name](x, y)], x, y)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda k: k * 3 - 2,
+        lambda k: k.astype(float) / 2,
+        lambda k: k.astype(jnp.int64) + 2**40,
+        lambda k: jnp.sign(k) + jnp.abs(k),
+        lambda k: jnp.minimum(k, 3) + (k > 2),
+        lambda k: k << 2,
+    ],
+)
+def test_operations_on_integers(function):
+    agree(lambda k: [function(k)], WHOLE)
+
+
+@pytest.mark.parametrize("function", [jnp.exp, jnp.sin, jnp.cos, jnp.log, lambda x: jnp.arctan2(x, 2.0)])
+def test_functions(function):
+    """Our own: to a few units of rounding."""
+    x = np.linspace(0.01, 20, 50)
+    found, expected = both(lambda x: [function(x)], x)
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-15, atol=4e-16)
+
+
+def test_exponentials_at_the_ends():
+    x = np.array([-np.inf, -800.0, -708.0, -1e-300, 0.0, 709.7, 710.0, np.inf, np.nan])
+    found, _ = both(lambda x: [jnp.exp(x)], x)
+    with np.errstate(over="ignore"):
+        np.testing.assert_allclose(found[0], np.exp(np.where(x == -800, -np.inf, x)), rtol=1e-15)
+
+
+def test_loops_end_each_in_its_time():
+    """Nested; what is done does not go on, and gives no numbers that are not there to the others."""
+
+    def function(x, limit):
+        def outer(state):
+            i, total = state
+            j, part = jax.lax.while_loop(lambda s: s[0] < i, lambda s: (s[0] + 1, s[1] + x / (limit - s[0])), (0, 0.0))
+            return i + 1, total + part + j
+
+        return list(jax.lax.while_loop(lambda s: s[0] < limit, outer, (0, 0.0)))
+
+    agree(function, np.linspace(1, 2, 21), np.arange(21) % 7, rtol=1e-15)
+
+
+def test_cases():
+    """Skipped where no lane needs them; a loop inside serves the lanes of its case only."""
+
+    def function(x):
+        def grow():
+            return jax.lax.while_loop(lambda y: y < 100, lambda y: 2 * y, x), x
+
+        first = jax.lax.cond(x > 3, grow, lambda: (x, 0.0))
+        return [*first, jax.lax.cond(x > 50, lambda: jnp.sqrt(x), lambda: jnp.exp(-x))]
+
+    agree(function, np.linspace(0.1, 9, 31), rtol=1e-15)
+
+
+def test_what_a_loop_does_not_change():
+    """It is computed before the loop, whichever loop or case it stands in; numbers that are looked up change."""
+
+    def function(x, table, knots):
+        def step(s):
+            i, total = s
+            more = jax.lax.cond(i > 2, lambda: table[i] * jnp.exp(x), lambda: knots[0] - knots[1] * x)
+            return i + 1, total + more * jnp.arctan2(x, 2.0)
+
+        return list(jax.lax.while_loop(lambda s: s[0] < jnp.round(3 * x), step, (0, 0.0)))
+
+    agree(function, np.linspace(0, 2, 19), np.arange(20.0), np.array([1.0, 2.0]), shared=(1, 2), rtol=1e-14)
+    own = np.arange(19.0)[:, None] + np.arange(20.0), np.arange(38.0).reshape(19, 2)
+    agree(function, np.linspace(0, 2, 19), *own, rtol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
+def test_any_number_of_lanes(count):
+    agree(lambda x, y: [x + y, x > y], np.arange(float(count)), 3.0, shared=(1,))
+
+
+def test_places_outside_of_a_table():
+    agree(lambda i, table: [table[i]], np.array([-30, -1, 0, 9, 10, 300]), np.arange(10.0), shared=(1,))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jnp.linalg.norm(jnp.ones(9)) * x,
+        lambda x: jax.scipy.special.gamma(x),
+        lambda x: jnp.cumsum(x[None])[0],
+    ],
+)
+def test_what_is_not_known_is_said(function):
+    with pytest.raises(Unsupported):
+        both(lambda x: [function(x)], NUMBERS)
+
+
+def test_kept_by_the_compilation_cache(tmp_path):
+    """The code is made of the program alone, so that another process finds it again."""
+    from jaxrock.native import _registered, emit
+
+    program = jax.make_jaxpr(lambda x: [jnp.exp(x) * 3])(1.0)
+    assert _registered(emit(program, [False], 8, "program")) == _registered(emit(program, [False], 8, "program"))
