@@ -6,6 +6,7 @@ if no lane is in it. What no loop changes is computed before it.
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
@@ -117,6 +118,8 @@ class Emitter:
         return [read(x) for x in jaxpr.outvars]
 
     def _known(self, value):
+        if isinstance(value, jax.core.Tracer):
+            raise Unsupported("a number from outside")
         value = np.asarray(value)
         if value.ndim == 0:
             return self.constant(value, value.dtype)
