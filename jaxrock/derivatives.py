@@ -1,6 +1,7 @@
 """Derivatives of functions that JAX differentiates in forward mode only, or not at all."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,7 +48,9 @@ def differentiable(function: Callable, on_tape: Callable | None = None, passes: 
         moves, changes = [d is not None for d in all_changes], [d for d in all_changes if d is not None]
         if on_tape is not None and sum(d.size for d in changes) > _MANY:
             return eqx.filter_jvp(on_tape, (tree,), (change,))
-        value, jacobian = differentiable(_value_and_jacobian(function, structure, moves))(leaves)
+        along = _Along(structure, moves)
+        more = None if passes is None else along.passes(passes)
+        value, jacobian = differentiable(along.value_and_jacobian(function), passes=more)(leaves)
 
         def contracted(columns):
             return sum(jnp.tensordot(c, d, axes=d.ndim) for c, d in zip(columns, changes))
@@ -58,28 +61,79 @@ def differentiable(function: Callable, on_tape: Callable | None = None, passes: 
     return evaluate
 
 
-def _value_and_jacobian(function: Callable, structure, moves: list[bool]) -> Callable:
-    """`function` at leaves, with its real outputs' derivatives by the leaves that move (a list; None for others)."""
+class _Along(NamedTuple):
+    """Forward mode along every number of the leaves that move."""
 
-    def both(leaves):
-        moving = [leaf for leaf, moves_ in zip(leaves, moves) if moves_]
+    structure: Any  # of the tree
+    moves: list[bool]  # which of its leaves do
+
+    def _start(self, leaves):
+        """The moving leaves, their directions, and the tree of such leaves."""
+        moving = [leaf for leaf, moves in zip(leaves, self.moves) if moves]
         sizes = [leaf.size for leaf in moving]
-        cuts = np.cumsum(sizes)[:-1]
-
-        def of(moving):
-            rest = iter(moving)
-            return function(jax.tree.unflatten(structure, [next(rest) if m else x for x, m in zip(leaves, moves)]))
-
-        directions = jnp.split(jnp.eye(sum(sizes), dtype=jnp.result_type(*moving)), cuts, axis=1)
+        directions = jnp.split(jnp.eye(sum(sizes), dtype=jnp.result_type(*moving)), np.cumsum(sizes)[:-1], axis=1)
         directions = [d.reshape(-1, *leaf.shape).astype(leaf.dtype) for d, leaf in zip(directions, moving)]
-        value, columns = jax.vmap(lambda *d: jax.jvp(of, (moving,), (list(d),)), out_axes=(None, 0))(*directions)
 
-        def per_leaf(out, column):
+        def tree(moving):
+            rest = iter(moving)
+            return self.structure.unflatten([next(rest) if m else x for x, m in zip(leaves, self.moves)])
+
+        return moving, directions, tree
+
+    def _columns(self, value, tangents, leaves) -> list:
+        """For every leaf of a value its derivatives by the moving leaves, in their shapes; None for integers."""
+        moving = [leaf for leaf, moves in zip(leaves, self.moves) if moves]
+        cuts = np.cumsum([leaf.size for leaf in moving])[:-1]
+
+        def of(out, column):
             if not jnp.issubdtype(out.dtype, jnp.inexact):
                 return None
             parts = jnp.split(column, cuts, axis=0)
             return [jnp.moveaxis(p, 0, -1).reshape(*out.shape, *leaf.shape) for p, leaf in zip(parts, moving)]
 
-        return value, [per_leaf(*pair) for pair in zip(jax.tree.leaves(value), jax.tree.leaves(columns), strict=True)]
+        return [of(*pair) for pair in zip(jax.tree.leaves(value), jax.tree.leaves(tangents), strict=True)]
 
-    return both
+    def value_and_jacobian(self, function: Callable) -> Callable:
+        """`function(tree)` at leaves, with its real outputs' derivatives by the leaves that move (a list)."""
+
+        def both(leaves):
+            moving, directions, tree = self._start(leaves)
+            value, tangents = jax.vmap(
+                lambda *d: jax.jvp(lambda x: function(tree(x)), (moving,), (list(d),)), out_axes=(None, 0)
+            )(*directions)
+            return value, self._columns(value, tangents, leaves)
+
+        return both
+
+    def passes(self, passes: Passes) -> Passes:
+        """The same in parts. Only the careful pass has derivatives, so the quick one postpones all."""
+
+        def begin(leaves):
+            moving, directions, tree = self._start(leaves)
+            begun, tangents = _pushed(lambda x: passes.begin(tree(x)), (moving,), (directions,))
+            # Leaves go along for their shapes.
+            return (begun[0], tangents[0], leaves), (begun[1], tangents[1])
+
+        def carefully(scene, state):
+            return _pushed(passes.carefully, (scene[0], state[0]), (scene[1], state[1]))
+
+        def conclude(scene, state):
+            (value, postponed), (tangents, _) = _pushed(passes.conclude, (scene[0], state[0]), (scene[1], state[1]))
+            tangents = jax.tree.map(lambda x, d: x if d is None else d, value, tangents, is_leaf=lambda x: x is None)
+            return (value, self._columns(value, tangents, scene[2])), postponed
+
+        return Passes(begin, None, carefully, None, conclude, None)
+
+
+def _pushed(function: Callable, values: tuple, tangents: tuple):
+    """`function(*values)`, and its tangents (None for what is not real) from stacks of tangents like that."""
+    real, rest = eqx.partition(values, eqx.is_inexact_array)
+
+    def of_real(real):
+        found, other = eqx.partition(function(*eqx.combine(real, rest)), eqx.is_inexact_array)
+        return found, other
+
+    found, pushed, other = jax.vmap(lambda d: jax.jvp(of_real, (real,), (d,), has_aux=True), out_axes=(None, 0, None))(
+        tangents
+    )
+    return eqx.combine(found, other), pushed

@@ -1,9 +1,13 @@
 """From a program of scalars, traced by JAX, to LLVM's language: every scalar becomes a vector of lanes. Needs llvmlite.
 
+A small array is a NumPy array of such vectors, so that what moves its elements about takes no instructions.
 Loops go on until the last lane is done, and what is done does not change any more. A case of a condition is skipped
 if no lane is in it. What no loop changes is computed before it.
 """
 
+import functools
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,22 +15,16 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.operations import OPERATIONS, Unsupported
+from jaxrock.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported
 
-SMALL = 8  # numbers in an array that is kept in registers
+SMALL = 8  # length of the last axis of an array that is kept in registers
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
 
 
-class Array(NamedTuple):
-    """A small array: a vector for each of its numbers."""
-
-    elements: list
-
-
 class Memory(NamedTuple):
-    """An array in memory, of which single numbers are looked up."""
+    """A list of numbers in memory, of which single ones are looked up."""
 
     pointer: Any
     size: int
@@ -121,36 +119,29 @@ class Emitter:
         if isinstance(value, jax.core.Tracer):
             raise Unsupported("a number from outside")
         value = np.asarray(value)
-        if value.ndim == 0:
-            return self.constant(value, value.dtype)
-        if value.ndim > 1 or value.size > SMALL:
+        if value.size > SMALL**2:
             raise Unsupported("a large array in the program")
-        return Array([self.constant(x, value.dtype) for x in value])
+        return (
+            _each(lambda x: self.constant(x, value.dtype), value) if value.ndim else self.constant(value, value.dtype)
+        )
 
     def _place(self, equation, inputs: list, active) -> list:
         """Apply an operation, before the loops that do not change its operands."""
         if equation.primitive.name in _WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
-        depth = max((self._depth(x) for x in inputs), default=0)
+        depth = max((self._depths.get(id(x), 0) for x in _flat(inputs)), default=0)
         if depth == len(self._before):
             found = self._apply(equation, inputs, active)
         else:
             with self.b.goto_block(self._before[depth]):
                 found = self._apply(equation, inputs, active)
-        self._remember(found, depth)
+        self._remember(_flat(found), depth)
         return found
 
-    def _depth(self, value) -> int:
-        if isinstance(value, Array):
-            return max((self._depth(x) for x in value.elements), default=0)
-        return self._depths.get(id(value), 0)
-
     def _remember(self, values: list, depth: int) -> None:
-        for value in values:
-            self._alive.append(value)
-            self._depths[id(value)] = depth
-            if isinstance(value, Array):
-                self._remember(value.elements, depth)
+        self._alive += values
+        # What moves a value about changes nothing of it.
+        self._depths.update((id(x), depth) for x in values if id(x) not in self._depths or isinstance(x, ir.PhiInstr))
 
     def _apply(self, equation, inputs: list, active) -> list:
         name, parameters = equation.primitive.name, equation.params
@@ -160,29 +151,33 @@ class Emitter:
             return self._branch(parameters["branches"], inputs, active)
         if name in _WITH_PROGRAMS:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
-        if any(isinstance(x, (Array, Memory)) for x in inputs):
-            return [self._of_array(name, parameters, *inputs)]
+        if isinstance(inputs[0] if inputs else None, Memory):
+            return [self._of_memory(name, parameters, *inputs)]
+        if name in MOVES:
+            return [_unboxed(MOVES[name](parameters, *map(_boxed, inputs)))]
+        if name in SUMS:
+            array = inputs[0]
+            for axis in sorted(parameters["axes"], reverse=True):
+                parts = list(np.moveaxis(array, axis, 0))
+                array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)
+            return [_unboxed(array)]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
-        if equation.outvars[0].aval.shape:
-            raise Unsupported("an array that is made")
-        return [OPERATIONS[name](self, equation, *inputs)]
+        if any(isinstance(x, Memory) for x in inputs):
+            raise Unsupported(f"{name} of a long list")
+        return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
 
-    def _of_array(self, name: str, parameters: dict, array, *more):
+    def _of_memory(self, name: str, parameters: dict, memory, *more):
         if name == "slice" and not parameters["strides"]:
             (start,), (stop,) = parameters["start_indices"], parameters["limit_indices"]
-            if isinstance(array, Array):
-                return Array(array.elements[start:stop])
-            return Memory(self.b.gep(array.pointer, [_I64(start)]), stop - start, array.starts)
-        if name == "squeeze" and isinstance(array, Array):
-            return array.elements[0]
+            return Memory(self.b.gep(memory.pointer, [_I64(start)]), stop - start, memory.starts)
         if name == "squeeze":
-            return self._look_up(array, self.constant(0, np.int32))
-        if name == "dynamic_slice" and isinstance(array, Memory) and parameters["slice_sizes"] == (1,):
-            return Array([self._look_up(array, *more)])
-        if name in ("stop_gradient", "copy", "reshard", "pvary", "pcast"):
-            return array
-        raise Unsupported(f"{name} of an array")
+            return self._look_up(memory, self.constant(0, np.int32))
+        if name == "dynamic_slice" and parameters["slice_sizes"] == (1,):
+            return _boxed([self._look_up(memory, *more)])
+        if name in NOTHING:
+            return memory
+        raise Unsupported(f"{name} of a long list")
 
     def _look_up(self, memory: Memory, index):
         # An index outside is moved to the nearest inside, as `dynamic_slice` does.
@@ -200,27 +195,28 @@ class Emitter:
     def _loop(self, parameters: dict, inputs: list, active) -> list:
         n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
         of_cond, of_body, carry = inputs[:n_cond], inputs[n_cond : n_cond + n_body], inputs[n_cond + n_body :]
-        before = self.b.block
+        before, firsts = self.b.block, _flat(carry)
         head, inside, after = (self.b.append_basic_block(name) for name in ("head", "body", "after"))
         self.b.branch(head)
         self.b.position_at_end(head)
-        phis = [self.b.phi(x.type) for x in carry]
+        phis = [self.b.phi(x.type) for x in firsts]
+        state = _like(carry, phis)
         self._before.append(before)
         self._remember(phis, len(self._before))
-        (going,) = self.run(parameters["cond_jaxpr"], [*of_cond, *phis], active)
+        (going,) = self.run(parameters["cond_jaxpr"], [*of_cond, *state], active)
         going = self.b.and_(going, active)
         self.b.cbranch(self._any(going), inside, after)
         self.b.position_at_end(inside)
-        found = self.run(parameters["body_jaxpr"], [*of_body, *phis], going)
+        found = _flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
         kept = [phi if new is phi else self.b.select(going, new, phi) for new, phi in zip(found, phis)]
-        for phi, first, later in zip(phis, carry, kept):
+        for phi, first, later in zip(phis, firsts, kept):
             phi.add_incoming(first, before)
             phi.add_incoming(later, self.b.block)
         self.b.branch(head)
         self.b.position_at_end(after)
         self._before.pop()
         self._remember(phis, len(self._before))  # they change no more
-        return phis
+        return state
 
     def _branch(self, branches, inputs: list, active) -> list:
         which, *inputs = inputs
@@ -229,42 +225,88 @@ class Emitter:
         if not isinstance(which.type.element, ir.IntType) or which.type.element.width > 1:
             which = self.b.icmp_signed("!=", which, self.constant_of(0, which.type))
         first, second = branches
-        none = [None] * len(second.jaxpr.outvars)
-        found = none if first.jaxpr.eqns else self.run(first, inputs, active)
-        if found is none:
-            found = self._case(first, inputs, self.b.and_(self.b.not_(which), active), none)
-        found = self._case(second, inputs, self.b.and_(which, active), found)
-        self._remember(found, len(self._before))
-        return found
+        if first.jaxpr.eqns:
+            found = self._case(first, inputs, self.b.and_(self.b.not_(which), active), None)
+        else:
+            found = self.run(first, inputs, active)
+        return self._case(second, inputs, self.b.and_(which, active), found)
 
-    def _case(self, program, inputs: list, mask, others: list) -> list:
-        """The results of a case in the lanes of `mask`, `others` in the rest (None: it does not matter)."""
+    def _case(self, program, inputs: list, mask, others: list | None) -> list:
+        """The results of a case in the lanes of `mask`, `others` in the rest (None: whatever it is)."""
         before = self.b.block
         inside, after = self.b.append_basic_block("case"), self.b.append_basic_block("join")
         self.b.cbranch(self._any(mask), inside, after)
         self.b.position_at_end(inside)
         # What only depends on values from outside the loops goes before them, even if it is not needed there.
         found = self.run(program, inputs, mask)
-        chosen = [
-            new if old is None or new is old else self.b.select(mask, new, old) for new, old in zip(found, others)
-        ]
+        results = _flat(found)
+        others = [ir.Constant(x.type, ir.Undefined) for x in results] if others is None else _flat(others)
+        chosen = [new if new is old else self.b.select(mask, new, old) for new, old in zip(results, others)]
         end = self.b.block
         self.b.branch(after)
         self.b.position_at_end(after)
-        joined = []
-        for new, old in zip(chosen, others):
-            phi = self.b.phi(new.type)
+        joined = [self.b.phi(x.type) for x in results]
+        for phi, new, old in zip(joined, chosen, others):
             phi.add_incoming(new, end)
-            phi.add_incoming(ir.Constant(new.type, ir.Undefined) if old is None else old, before)
-            joined.append(phi)
-        return joined
+            phi.add_incoming(old, before)
+        self._remember(joined, len(self._before))
+        return _like(found, joined)
+
+
+def _boxed(x) -> np.ndarray:
+    """An array of vectors of what may be one vector; NumPy would look into them."""
+    if isinstance(x, np.ndarray):
+        return x
+    box = np.empty(len(x) if isinstance(x, list) else (), object)
+    box[...] = x
+    return box
+
+
+def _unboxed(x):
+    return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
+
+
+def _each(function: Callable, *inputs):
+    """`function` of single vectors, for every element of arrays of one shape."""
+    shape = next((x.shape for x in inputs if isinstance(x, np.ndarray)), None)
+    if shape is None:
+        return function(*inputs)
+    found = np.empty(shape, object)
+    for place in np.ndindex(shape):
+        found[place] = function(*(x[place] if isinstance(x, np.ndarray) else x for x in inputs))
+    return found
+
+
+def _flat(values: list) -> list:
+    """The single vectors in vectors and arrays."""
+    return [x for value in values for x in (value.ravel() if isinstance(value, np.ndarray) else [value])]
+
+
+def _like(values: list, vectors: list) -> list:
+    """Vectors and arrays like `values`, of other vectors."""
+    rest, found = iter(vectors), []
+    for value in values:
+        if isinstance(value, np.ndarray):
+            array = np.empty(value.shape, object)
+            array.ravel()[:] = [next(rest) for _ in range(value.size)]
+            found.append(array)
+        else:
+            found.append(next(rest))
+    return found
+
+
+def is_long(shape: tuple[int, ...]) -> bool:
+    """Whether an array stays in memory, where single numbers of it are looked up."""
+    if len(shape) > 1 and math.prod(shape) > SMALL**2:
+        raise Unsupported(f"an array of shape {shape}")
+    return len(shape) == 1 and shape[0] > SMALL
 
 
 def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """A function `void name(void **outputs, void **inputs)` that runs a program over arrays of many lanes.
 
     The first input is the number of lanes (int32, a multiple of `lanes`), then follow those of the program. What is
-    not `shared` has an axis of lanes: for arrays of up to `SMALL` numbers the last, for others the first.
+    not `shared` has an axis of lanes: for long lists the first, for others the last. Results have it last.
     """
     module, byte = ir.Module(name), ir.IntType(8)
     table = byte.as_pointer().as_pointer()
@@ -288,31 +330,31 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     b.cbranch(b.icmp_signed("<", first, count), inside, after)
     b.position_at_end(inside)
 
-    def vector(pointer, place):
-        return b.bitcast(b.gep(pointer, [place]), ir.VectorType(pointer.type.pointee, lanes).as_pointer())
+    def vector(pointer, at):
+        return b.bitcast(b.gep(pointer, [at]), ir.VectorType(pointer.type.pointee, lanes).as_pointer())
 
-    def load(source, place, is_shared):
-        value = e.splat(b.load(b.gep(source, [place]))) if is_shared else b.load(vector(source, place), align=1)
+    def load(source, at, is_shared):
+        value = e.splat(b.load(b.gep(source, [at]))) if is_shared else b.load(vector(source, at), align=1)
         return b.icmp_unsigned("!=", value, e.constant_of(0, value.type)) if source.type.pointee == byte else value
+
+    def place(number, is_shared=False):
+        return _I64(number) if is_shared else b.add(b.mul(count, _I64(number)), first)
 
     def argument(variable, source, is_shared):
         shape = variable.aval.shape
-        if not shape:
-            return load(source, _I64(0) if is_shared else first, is_shared)
-        if len(shape) > 1:
-            raise Unsupported(f"an array of shape {shape}")
-        if shape[0] <= SMALL:
-            places = [_I64(k) if is_shared else b.add(b.mul(count, _I64(k)), first) for k in range(shape[0])]
-            return Array([load(source, place, is_shared) for place in places])
-        rows = [b.mul(b.add(first, _I64(i)), _I64(shape[0])) for i in range(lanes)]
-        return Memory(source, shape[0], None if is_shared else rows)
+        if is_long(shape):
+            rows = [b.mul(b.add(first, _I64(i)), _I64(shape[0])) for i in range(lanes)]
+            return Memory(source, shape[0], None if is_shared else rows)
+        numbers = _boxed([load(source, place(k, is_shared), is_shared) for k in range(math.prod(shape))])
+        return _unboxed(numbers.reshape(shape))
 
     arguments = [argument(*each) for each in zip(jaxpr.invars, sources, shared, strict=True)]
     found = e.run(program, arguments, e.constant(True, bool))
-    for value, target in zip(found, targets):
-        if target.type.pointee == byte:
-            value = b.zext(value, ir.VectorType(byte, lanes))
-        b.store(value, vector(target, first), align=1)
+    for values, target in zip(found, targets):
+        for number, value in enumerate(_flat([values])):
+            if target.type.pointee == byte:
+                value = b.zext(value, ir.VectorType(byte, lanes))
+            b.store(value, vector(target, place(number)), align=1)
     first.add_incoming(_I64(0), entry)
     first.add_incoming(b.add(first, _I64(lanes)), b.block)
     b.branch(head)

@@ -28,7 +28,8 @@ class Passes(NamedTuple):
     """A function of one scene in parts.
 
     - `begin(tree)`: the scene as the other parts take it, and a first state.
-    - `quickly(scene, state, limit)`: the state where it is finished or given up, or after `limit` steps in all.
+    - `quickly(scene, state, limit)`: the state where it is finished or given up, or after `limit` steps in all; None:
+      there is no quick pass.
     - `carefully(scene, state)`: the state where it is finished.
     - `unfinished(scene, state)`: whether the quick pass has to go on.
     - `conclude(scene, state)`: the result, and whether the quick pass has postponed it to the careful one.
@@ -36,9 +37,9 @@ class Passes(NamedTuple):
     """
 
     begin: Callable
-    quickly: Callable
+    quickly: Callable | None
     carefully: Callable
-    unfinished: Callable
+    unfinished: Callable | None
     conclude: Callable
     round: int | None
 
@@ -116,7 +117,7 @@ class _Batch:
         def function(own):
             return scenes.each(self.function, own)
 
-        if self.passes is None or self.size <= _FEW:
+        if self.passes is None or self.passes.quickly is None or self.size <= _FEW:
             return _chunked(function, scenes.own, self.size)
         ready, begun = scenes.begin(self.passes.begin)
 
@@ -138,7 +139,7 @@ class _Batch:
             own, states = part
             return ready.each(self.passes.conclude, own, ready.each_natively(self.passes.carefully, own, states))[0]
 
-        if self.size <= _FEW:
+        if self.passes.quickly is None or self.size <= _FEW:
             return function((ready.own, begun))
 
         def quickly(limit, own, states):

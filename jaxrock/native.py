@@ -16,7 +16,7 @@ import numpy as np
 from llvmlite import binding, ir
 
 from jaxrock._keep import nothing_kept
-from jaxrock.emitter import SMALL, emit
+from jaxrock.emitter import emit, is_long
 
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
@@ -39,11 +39,11 @@ def run(function: Callable, leaves: list, shared: list[bool]) -> list:
         if same:
             return x
         x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
-        return x.T if x.ndim == 2 and x.shape[1] <= SMALL else x
+        return x if is_long(x.shape[1:]) else jnp.moveaxis(x, 0, -1)
 
-    results = [jax.ShapeDtypeStruct((size + more,), v.aval.dtype) for v in program.jaxpr.outvars]
+    results = [jax.ShapeDtypeStruct((*v.aval.shape, size + more), v.aval.dtype) for v in program.jaxpr.outvars]
     found = jax.ffi.ffi_call(name, results)(np.int32(size + more), *map(laid_out, leaves, shared))
-    return [x[:size] for x in found]
+    return [jnp.moveaxis(x, -1, 0)[:size] for x in found]
 
 
 class _Machine:

@@ -87,9 +87,10 @@ def _sign(e, equation, x):
 
 def _power(e, equation, x):
     exponent = equation.params["y"]
-    if exponent < 1:
+    if not is_float(x) or exponent == 0:
         raise Unsupported(f"power {exponent}")
-    return functools.reduce(e.b.fmul if is_float(x) else e.b.mul, [x] * exponent)
+    power = functools.reduce(e.b.fmul, [x] * abs(exponent))
+    return power if exponent > 0 else e.b.fdiv(e.constant(1, equation.invars[0].aval.dtype), power)
 
 
 def _convert(e, equation, x):
@@ -187,4 +188,31 @@ OPERATIONS: dict[str, Callable] = {
     "bitcast_convert_type": lambda e, q, x: e.b.bitcast(x, e.vector(q.params["new_dtype"])),
 }
 # What changes no value.
-OPERATIONS |= dict.fromkeys(("stop_gradient", "copy", "reshard", "pvary", "pcast"), lambda e, _, x: x)
+NOTHING = ("stop_gradient", "copy", "reshard", "pvary", "pcast")
+OPERATIONS |= dict.fromkeys(NOTHING, lambda e, _, x: x)
+
+# Of all numbers along axes of an array.
+SUMS = {"reduce_" + name: OPERATIONS[name] for name in ("min", "max", "and", "or")} | {"reduce_sum": OPERATIONS["add"]}
+
+
+def _broadcast(parameters, x):
+    shape = parameters["shape"]
+    places = dict(zip(parameters["broadcast_dimensions"], x.shape))
+    return np.broadcast_to(x.reshape([places.get(axis, 1) for axis in range(len(shape))]), shape)
+
+
+def _slice(parameters, x):
+    ends = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or [1] * x.ndim
+    return x[tuple(slice(*each) for each in zip(*ends))]
+
+
+# What moves the elements of small arrays about: functions of the parameters and NumPy arrays of vectors.
+MOVES: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast,
+    "slice": _slice,
+    "squeeze": lambda parameters, x: np.squeeze(x, parameters["dimensions"]),
+    "reshape": lambda parameters, x: x.reshape(parameters["new_sizes"]),
+    "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
+    "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
+    "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
+}

@@ -143,6 +143,27 @@ def test_what_a_loop_does_not_change():
     agree(function, np.linspace(0, 2, 19), *own, rtol=1e-14)
 
 
+def test_small_arrays():
+    """Derivatives in several directions at once, through a loop and a case; what moves numbers about."""
+
+    def function(x, pair, table):
+        def follow(x, pair):
+            def step(s):
+                return s[0] + 1, jax.lax.cond(
+                    s[1] > 2, lambda: s[1] / pair[0], lambda: s[1] * x + table[s[0]] + pair[1]
+                )
+
+            return jax.lax.while_loop(lambda s: s[0] < 9, step, (jnp.round(3 * x).astype(int), x))[1]
+
+        directions = np.eye(3)
+        value, slopes = jax.vmap(lambda d: jax.jvp(follow, (x, pair), (d[0], d[1:])), out_axes=(None, 0))(directions)
+        square = jnp.concatenate([slopes, slopes[::-1]]).reshape(2, 3).T
+        return [value, slopes, square, square.sum(0), square.max(), jnp.where(x > 1, slopes, 0.0)]
+
+    x = np.linspace(0, 2, 19)
+    agree(function, x, np.stack([3 + x, 0.1 * x], 1), np.arange(20.0) / 20, shared=(2,), rtol=1e-14)
+
+
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
 def test_any_number_of_lanes(count):
     agree(lambda x, y: [x + y, x > y], np.arange(float(count)), 3.0, shared=(1,))
@@ -155,7 +176,7 @@ def test_places_outside_of_a_table():
 @pytest.mark.parametrize(
     "function",
     [
-        lambda x: jnp.linalg.norm(jnp.ones(9)) * x,
+        lambda x: jnp.sort(jnp.stack([x, 2 * x]))[0],
         lambda x: jax.scipy.special.gamma(x),
         lambda x: jnp.cumsum(x[None])[0],
     ],
