@@ -17,7 +17,23 @@ from jaxrock.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.fragility import (
+    AbstractFragility as AbstractFragility,
+    FitStatus as FitStatus,
+    FragilityFit as FragilityFit,
+    LogNormalFragility as LogNormalFragility,
+    TabulatedFragility as TabulatedFragility,
+    fit_fragility as fit_fragility,
+)
 from jaxrock.grid import Grid as Grid
+from jaxrock.hazard import (
+    HazardCurve as HazardCurve,
+    allowed_scale as allowed_scale,
+    branch_weights as branch_weights,
+    survival_probability as survival_probability,
+    toppling_rate as toppling_rate,
+)
+from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
 from jaxrock.pulses import (

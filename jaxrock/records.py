@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._checks import one_of, positive
+from jaxrock._text import file_error, text_lines
 from jaxrock.motion import Record
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `block.GRAVITY`, the g of the papers)
@@ -83,7 +84,7 @@ def read_record(
     if column is not None and (isinstance(column, bool) or not isinstance(column, (int, np.integer)) or column < 0):
         raise ValueError(f"Argument `column` must be an integer, 0 or more, but is {column!r}.")
     path = Path(path)
-    lines = _lines(path)
+    lines = text_lines(path)
     reader = {"at2": _read_at2, "v2": _read_v2, "csv": _read_csv}[format or _format(lines, path.suffix)]
     samples, found, written, name = reader(path.name, lines, dt, unit, column)
     return Record(samples / _PER_G[written], found, name or path.stem)
@@ -102,27 +103,6 @@ def example_record() -> Record:
         return read_record(path)
 
 
-def _error(name: str, text: str) -> ValueError:
-    return ValueError(f"File `{name}`: {text}")
-
-
-def _lines(path: Path) -> list[str]:
-    """The lines of a text file, without their ends."""
-    data = path.read_bytes()
-    # Files from DOS end in bytes 26, which are no text but no damage either.
-    data = data.replace(b"\x1a", b"")
-    if re.search(rb"[\x00-\x08\x0e-\x1f]", data):
-        raise _error(path.name, "is not plain text: it is binary, or in an encoding such as UTF-16.")
-    if not data.strip():
-        raise _error(path.name, "is empty.")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")  # place names in old headers
-    # Not str.splitlines, which also breaks at form feeds and others, and so would count lines wrongly.
-    return re.split(r"\r\n|\r|\n", text)
-
-
 def _format(lines: list[str], suffix: str) -> str:
     if any(map(_V2_BLOCK.match, lines)):
         return "v2"
@@ -138,7 +118,7 @@ def _float(text: str) -> float:
 def _agreed_step(name: str, given: float | None, found: float) -> float:
     """The time step, after a comparison of what the user and the file say [s]."""
     if not 0 < found < np.inf:
-        raise _error(name, f"states a time step of {found:g} s, which is not positive.")
+        raise file_error(name, f"states a time step of {found:g} s, which is not positive.")
     if given is None:
         return found
     if abs(given - found) > 1e-3 * found:
@@ -156,7 +136,7 @@ def _agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
     found = _SPELLINGS.get(spelling)
     if found is None:
         known = "g, m/s2, cm/s2 or gal"
-        raise _error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")
+        raise file_error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")
     if given not in (None, found):
         raise ValueError(f"Argument `unit` must agree with file `{name}`, which is in {found!r}, but is {given!r}.")
     return found
@@ -187,16 +167,16 @@ def _block(name: str, lines: list[str], start: int, count: int, parse) -> np.nda
         row = parse(line)
         if row is not None:
             if not np.isfinite(row).all():
-                raise _error(name, f"line {number} holds a number that is not finite: {line.strip()[:60]!r}.")
+                raise file_error(name, f"line {number} holds a number that is not finite: {line.strip()[:60]!r}.")
             values += row
         elif re.search(r"POINTS OF|^\s*/&", line, re.IGNORECASE):
             break
         elif _LIKE_DATA.match(line) or 0 < len(values) < count:
-            raise _error(name, f"line {number} should hold samples, but is {line.strip()[:60]!r}.")
+            raise file_error(name, f"line {number} should hold samples, but is {line.strip()[:60]!r}.")
         elif values:
             break
     if len(values) != count or count == 0:
-        raise _error(name, f"header announces {count} samples, but {len(values)} follow.")
+        raise file_error(name, f"header announces {count} samples, but {len(values)} follow.")
     return np.array(values)
 
 
@@ -215,7 +195,7 @@ def _read_at2(name, lines, dt, unit, column):
         raise ValueError(f"Argument `column` must be None, because AT2 file `{name}` has one record, but is {column}.")
     last = next((number for number, line in enumerate(lines) if _at2_counts(line)), None)
     if last is None:
-        raise _error(name, "no header line states NPTS and DT, as an AT2 file must.")
+        raise file_error(name, "no header line states NPTS and DT, as an AT2 file must.")
     count, found = _at2_counts(lines[last])
     found = _agreed_step(name, dt, found)
     at = next((number for number in range(last + 1) if _AT2_UNIT.search(lines[number])), None)
@@ -230,7 +210,7 @@ def _read_v2(name, lines, dt, unit, column):
     """Samples, time step, unit and title of one channel of a CSMIP V2 file."""
     channels = [number for number, line in enumerate(lines) if _V2_BLOCK.match(line)]
     if not channels:
-        raise _error(name, "no line announces 'POINTS OF ACCEL DATA', as a corrected V2 file must.")
+        raise file_error(name, "no line announces 'POINTS OF ACCEL DATA', as a corrected V2 file must.")
     channel = 0 if column is None else column
     if channel >= len(channels):
         allowed = f"be 0 to {len(channels) - 1}, a channel of V2 file `{name}`"
@@ -266,22 +246,22 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str
             continue
         if not all(_FIELD.fullmatch(field) for field in fields):
             if rows:
-                raise _error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
+                raise file_error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
             if _LIKE_DATA.match(line):
                 hint = "if it belongs to a header, let it start with #"
-                raise _error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
+                raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
             continue
         row = [_float(field) if field[-1].isdigit() or field[-1] == "." else np.nan for field in fields]
         if not np.isfinite(row).all():
-            raise _error(name, f"line {number} holds a number that is not finite: {line[:60]!r}.")
+            raise file_error(name, f"line {number} holds a number that is not finite: {line[:60]!r}.")
         if rows and len(row) != len(rows[0]):
             columns = "columns" if len(row) > 1 else "column"
-            raise _error(name, f"line {number} has {len(row)} {columns}, but line {numbers[0]} has {len(rows[0])}.")
+            raise file_error(name, f"line {number} has {len(row)} {columns}, but line {numbers[0]} has {len(rows[0])}.")
         rows.append(row)
         numbers.append(number)
         first.append(fields[0])
     if not rows:
-        raise _error(name, "no line holds columns of numbers, and it is neither AT2 nor V2.")
+        raise file_error(name, "no line holds columns of numbers, and it is neither AT2 nor V2.")
     return np.array(rows), numbers, first
 
 
@@ -295,10 +275,10 @@ def _rounding(times: np.ndarray, printed: list[str]) -> float:
 def _step(name: str, times: np.ndarray, numbers: list[int], printed: list[str]) -> float:
     """The time step of equally spaced times [s]."""
     if times.size < 2:
-        raise _error(name, "has one row only, so its times give no time step.")
+        raise file_error(name, "has one row only, so its times give no time step.")
     step = (times[-1] - times[0]) / (times.size - 1)
     if not step > 0:
-        raise _error(name, "the times in column 0 do not increase.")
+        raise file_error(name, "the times in column 0 do not increase.")
     # Where rounding is half a step, to allow for it would hide a missing row.
     rounding = _rounding(times, printed)
     rounding = rounding if rounding < 0.45 * step else 0.0
@@ -308,7 +288,7 @@ def _step(name: str, times: np.ndarray, numbers: list[int], printed: list[str]) 
         usual = np.median(steps)
         worst = int(np.abs(steps - usual).argmax())
         where = f"{steps[worst]:g} s before line {numbers[worst + 1]}, but {usual:g} s elsewhere"
-        raise _error(name, f"the times in column 0 are not equally spaced: {where}.")
+        raise file_error(name, f"the times in column 0 are not equally spaced: {where}.")
     return float(f"{step:.12g}")  # 0.01, not 0.010000000000000002
 
 

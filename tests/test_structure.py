@@ -63,8 +63,11 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "parameters": {"scene"},
     "sensitivity": {"spectra", "parameters"},
     "critical": {"sweeps", "parameters"},
+    "fragility": set(),
+    "hazard": {"fragility"},
+    "hazard_files": {"hazard"},
     "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity"},
+    "__init__": {"plot", "records", "similarity", "hazard_files"},
     "__main__": {"__init__"},
 }
 

@@ -1,0 +1,238 @@
+"""Fragilities: how probable it is that a rock topples in a shaking of given intensity, and their fit to outcomes."""
+
+import abc
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import Values, as_real, checked, positive, share
+
+Real = Inexact[Array, "..."]
+
+
+class AbstractFragility(eqx.Module):
+    """The probability that a rock topples, against the intensity of the shaking: what every fragility offers.
+
+    One of your own needs `__call__`, and `knots` if it is not smooth.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, level: Values) -> Real:
+        """Probability that a shaking of intensity `level` (any shape) topples the rock."""
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        """Levels between which it is smooth, and changes as gently as a low polynomial: integrals are parted there."""
+        return jnp.zeros(0)
+
+
+class LogNormalFragility(AbstractFragility):
+    """The probability grows with the logarithm of the intensity as a normal distribution does.
+
+    **Arguments:**
+
+    - `median`: intensity that topples half of the time, in the unit of the hazard curve, positive.
+    - `dispersion`: standard deviation of the logarithm of the intensity that topples [-], positive.
+
+    **Raises:** ValueError for a value outside its range.
+    """
+
+    median: Real
+    dispersion: Real
+
+    def __init__(self, median: ArrayLike, dispersion: ArrayLike):
+        self.median = positive("median", median)
+        self.dispersion = positive("dispersion", dispersion)
+
+    def __call__(self, level: Values) -> Real:
+        z = jnp.log(jnp.asarray(level) / self.median) / self.dispersion
+        return jax.lax.erfc(-z / math.sqrt(2)) / 2
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        # Eight standard deviations away the probability is 0 or 1 to rounding.
+        return self.median * jnp.exp(self.dispersion * jnp.array([-8.0, -4.0, 0.0, 4.0, 8.0]))
+
+
+class TabulatedFragility(AbstractFragility):
+    """Probabilities at levels, straight lines over the logarithm of the intensity between them.
+
+    Below the first level nothing topples, above the last one its probability holds: for a fragility that grows, what
+    the table leaves open is never counted as toppling.
+
+    **Arguments:**
+
+    - `levels`: (n,) intensities, in the unit of the hazard curve, positive and rising; n at least 2.
+    - `probabilities`: (n,) of toppling, in [0, 1]; they may rise and fall, as overturning does with amplitude.
+
+    **Raises:** ValueError for values outside their ranges, or of other shapes.
+    """
+
+    levels: Inexact[Array, "*batch n"]
+    probabilities: Inexact[Array, "*batch n"]
+
+    def __init__(self, levels: Values, probabilities: Values):
+        self.levels = rising("levels", levels)
+        self.probabilities = beside("probabilities", share("probabilities", probabilities), self.levels)
+
+    def __call__(self, level: Values) -> Real:
+        level = jnp.asarray(level)
+        between = jnp.interp(jnp.log(level), jnp.log(self.levels), self.probabilities)
+        return jnp.where(level < self.levels[0], 0.0, between)
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        return self.levels
+
+
+def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
+    """Return `value` as an array of two positive levels or more, each above the one before."""
+    array = as_real(name, value)
+    if array.ndim == 0 or array.shape[-1] < 2:
+        raise ValueError(f"Argument `{name}` must hold at least two levels, but has shape {array.shape}.")
+    allowed = "be positive and finite, and rise from level to level"
+    return checked(name, array, allowed, lambda x: (jnp.diff(x, prepend=0.0) > 0) & (x < jnp.inf))
+
+
+def beside(name: str, array: Real, levels: Real) -> Real:
+    """Return `array` if it has a value for each level."""
+    if array.shape != levels.shape:
+        expected = f"have the shape {levels.shape} of `levels`"
+        raise ValueError(f"Argument `{name}` must {expected}, but has shape {array.shape}.")
+    return array
+
+
+class FitStatus(eqx.Enumeration):
+    """What became of a fit; `FitStatus[fit.status]` is the message."""
+
+    successful = "The likelihood has one maximum, and it was found."
+    separable = (
+        "No shaking that a rock survived was stronger than one that toppled it (or the reverse, or all ended alike): "
+        "the likelihood only grows as the dispersion shrinks or the median leaves the data. Outcomes that overlap "
+        "are needed; these only tell between which levels the median lies."
+    )
+    not_growing = "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
+    not_converged = "The maximum of the likelihood was not found."
+
+
+class FragilityFit(eqx.Module):
+    """What `fit_fragility` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+
+    - `fragility`: the `LogNormalFragility` of largest likelihood.
+    - `covariance`: (2, 2) of (ln median, ln dispersion), the inverse of the observed information: good for many
+      outcomes, too narrow for few.
+    - `log_likelihood`: at the maximum, without the binomial coefficients.
+    - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
+      outcomes are separable in the usual order, the median lies between them.
+    - `status`: a `FitStatus`.
+    """
+
+    fragility: LogNormalFragility
+    covariance: Inexact[Array, "2 2"]
+    log_likelihood: Inexact[Array, ""]
+    highest_survived: Inexact[Array, ""]
+    lowest_toppled: Inexact[Array, ""]
+    status: FitStatus
+
+
+def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> FragilityFit:
+    """The lognormal fragility under which outcomes are most probable (probit regression on the logarithm).
+
+    **Arguments:**
+
+    - `levels`: (n,) intensities of the shakings, positive.
+    - `toppled`: (n,) 0 or 1 (or False and True) for each shaking; or how many of its `trials` toppled.
+    - `trials`: how many were exposed at each level, (n,) or one number.
+
+    **Returns:** a `FragilityFit`, also for data that have no maximum: its status says so. It has derivatives
+    of first order by the data.
+
+    **Raises:** ValueError for arguments outside their ranges, or of other shapes.
+
+    **Source:** Silvapulle (1981), when the maximum exists; Baker (2015), the fit to counts at levels.
+    """
+    levels = positive("levels", levels)
+    if levels.ndim != 1 or levels.size == 0:
+        raise ValueError(f"Argument `levels` must be a list of at least one value, but has shape {levels.shape}.")
+    trials = checked("trials", trials, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+    if trials.shape not in ((), levels.shape):
+        raise ValueError(f"Argument `trials` must have shape {levels.shape} or (), but has shape {trials.shape}.")
+    toppled = beside("toppled", as_real("toppled", toppled), levels)
+    toppled = checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+    return _fit(levels, toppled, trials - toppled)
+
+
+@eqx.filter_jit
+def _fit(levels, toppled, survived) -> FragilityFit:
+    highest_survived, highest_toppled = (jnp.max(jnp.where(n > 0, levels, 0.0)) for n in (survived, toppled))
+    lowest_survived, lowest_toppled = (jnp.min(jnp.where(n > 0, levels, jnp.inf)) for n in (survived, toppled))
+    separable = (highest_survived <= lowest_toppled) | (highest_toppled <= lowest_survived)
+
+    logarithm = jnp.log(levels)
+    centre, spread = jnp.mean(logarithm), jnp.std(logarithm)
+    abscissa = (logarithm - centre) / jnp.where(separable, 1.0, spread)
+    line, converged = _probit_line(abscissa, toppled, survived)
+    # z = line[0] + line[1] (ln level - centre)/spread = (ln level - ln median)/dispersion.
+    z = line[0] + line[1] * abscissa
+    dispersion = spread / jnp.where(line[1] > 0, line[1], 1.0)
+    median = jnp.exp(centre - line[0] * dispersion)
+    growing = (line[1] > 0) & (median > 0) & (median < jnp.inf)
+    likelihood, _, curvature = _probit(z, toppled, survived)
+    # By ln median and ln dispersion; where the slopes add to zero, the curvature of z itself plays no part.
+    rows = jnp.stack([jnp.full_like(z, 1 / dispersion), z])
+
+    status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)
+    status = FitStatus.where(converged, status, FitStatus.not_converged)
+    status = FitStatus.where(separable, FitStatus.separable, status)
+    found = (
+        LogNormalFragility(1.0, 1.0),
+        jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T)),
+        likelihood,
+    )
+    # Put in afterwards: the constructor refuses NaN.
+    found = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), found, (median, dispersion))
+    good = status == FitStatus.successful
+    found = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), found)
+    return FragilityFit(*found, highest_survived, lowest_toppled, status)
+
+
+def _probit(z, toppled, survived):
+    """Log-likelihood of outcomes with the probability Phi(z), and its first and second derivative by each z."""
+    signed, counts = jnp.stack([z, -z]), jnp.stack([toppled, survived])
+    logarithm = log_ndtr(signed)
+    ratio = jnp.exp(-(signed**2) / 2 - logarithm) / math.sqrt(2 * math.pi)
+    slopes = counts * ratio
+    return jnp.sum(counts * logarithm), slopes[0] - slopes[1], -jnp.sum(slopes * (signed + ratio), axis=0)
+
+
+def _probit_line(abscissa, toppled, survived):
+    """Intercept and slope of z for which outcomes are most probable, and whether they were found.
+
+    The logarithm of the likelihood is concave, so that a step of Newton's method, cut short where it is too long,
+    always climbs.
+    """
+
+    def newton(line, abscissa, toppled, survived):
+        rows = jnp.stack([jnp.ones_like(abscissa), abscissa])
+        _, slope, curvature = _probit(line @ rows, toppled, survived)
+        return jnp.linalg.solve(rows @ (-curvature[:, None] * rows.T), rows @ slope)
+
+    fixed = jax.lax.stop_gradient((abscissa, toppled, survived))
+    shares = 0.5 ** jnp.arange(8.0)
+
+    def step(carry):
+        line, _, count = carry
+        change = newton(line, *fixed)
+        candidates = line + shares[:, None] * change
+        climbed = jax.vmap(lambda line: _probit(line[0] + line[1] * fixed[0], *fixed[1:])[0])(candidates)
+        return candidates[jnp.argmax(climbed)], jnp.max(jnp.abs(change)), count + 1
+
+    tight = jnp.sqrt(jnp.finfo(abscissa.dtype).eps)
+    start = jnp.zeros(2, abscissa.dtype), jnp.asarray(jnp.inf, abscissa.dtype), 0
+    line, change, _ = jax.lax.while_loop(lambda carry: (carry[1] > tight) & (carry[2] < 50), step, start)
+    # One step more, with derivatives by the data: those of first order are exact.
+    return line + newton(line, abscissa, toppled, survived), change <= tight

@@ -1,0 +1,704 @@
+"""Hazard curves and standing rocks: against closed forms, simulated centuries, and each other."""
+
+import csv
+import io
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from scipy.special import ndtr, ndtri
+
+import jaxrock as rk
+
+# A site in a seismic region: exceedances a year of peak accelerations [g], bending down in log-log.
+LEVELS = np.geomspace(0.005, 2.0, 18)
+
+
+def site_rate(level):
+    return 0.3 * (1 + level / 0.03) ** -2.2 * np.exp(-1.5 * level)
+
+
+CURVE = rk.HazardCurve(LEVELS, site_rate(LEVELS), "PGA")
+ROCK, TOUGH = rk.LogNormalFragility(0.35, 0.4), rk.LogNormalFragility(0.6, 0.25)
+
+
+class Own(rk.AbstractFragility):
+    """A user's fragility: the lognormal one, written anew."""
+
+    median: float = 0.35
+    dispersion: float = 0.4
+
+    def __call__(self, level):
+        return jax.scipy.stats.norm.cdf(jnp.log(level), jnp.log(self.median), self.dispersion)
+
+
+class Step(rk.AbstractFragility):
+    """Topples with the probability `share` from `edge` on, and never below."""
+
+    edge: float
+    share: float = 1.0
+
+    def __call__(self, level):
+        return jnp.where(jnp.asarray(level) < self.edge, 0.0, self.share)
+
+    @property
+    def knots(self):
+        return jnp.array([self.edge])
+
+
+def integral(probability, curve, breaks=()):
+    """Probability over the rates of a curve, in 30 digits, by its definition."""
+    mp.mp.dps = 30
+    levels, rates = ([mp.mpf(float(x)) for x in values] for values in (curve.levels, curve.rates))
+    total = mp.mpf(0)
+    for i in range(len(levels) - 1):
+        if mp.isinf(rates[i]):
+            continue
+        if rates[i + 1] == 0:
+            return total + rates[i] * probability(levels[i])
+        k = mp.log(rates[i] / rates[i + 1]) / mp.log(levels[i + 1] / levels[i])
+        ends = [levels[i], *(mp.mpf(x) for x in breaks if levels[i] < x < levels[i + 1]), levels[i + 1]]
+        density = lambda x, i=i, k=k: probability(x) * k * rates[i] * (x / levels[i]) ** -k / x
+        total += mp.quad(density, [mp.mpf(x) for x in ends])
+    return total + rates[-1] * probability(levels[-1])
+
+
+def lognormal(median, dispersion):
+    return lambda x: mp.ncdf(mp.log(x / mp.mpf(median)) / mp.mpf(dispersion))
+
+
+def assert_slopes(function, numbers):
+    """Derivatives of all results in three directions against central differences of sixth order."""
+    function = jax.jit(function)
+    along = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,))[1])
+    for seed in range(3):
+        direction = numbers * np.random.default_rng(seed).normal(size=numbers.size)
+        at = lambda n, h=1e-3, direction=direction: function(numbers + n * h * direction)
+        differences = (45 * (at(1) - at(-1)) - 9 * (at(2) - at(-2)) + at(3) - at(-3)) / 0.06
+        np.testing.assert_allclose(along(numbers, direction), differences, rtol=1e-8)
+
+
+# --------------------------------------------------------------------------------------- hazard curves
+
+
+def test_rates_between_levels_follow_power_laws():
+    np.testing.assert_allclose(CURVE.rate(LEVELS), CURVE.rates, rtol=1e-14)
+    middle = np.sqrt(LEVELS[1:] * LEVELS[:-1])
+    np.testing.assert_allclose(CURVE.rate(middle), np.sqrt(CURVE.rates[1:] * CURVE.rates[:-1]), rtol=1e-13)
+    power = rk.HazardCurve([0.1, 0.3, 2.0], 1e-3 * np.array([0.1, 0.3, 2.0]) ** -1.7)
+    x = np.geomspace(0.1, 2.0, 37)[1:-1]
+    np.testing.assert_allclose(power.rate(x), 1e-3 * x**-1.7, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "rates, level, expected",
+    [
+        pytest.param([3e-2, 1e-2, 1e-3], 0.05, 3e-2, id="weaker than the first level: not counted"),
+        pytest.param([3e-2, 1e-2, 1e-3], 0.4, 1e-3, id="the last level"),
+        pytest.param([3e-2, 1e-2, 1e-3], 0.41, 0.0, id="stronger than the last level: counted there"),
+        pytest.param([np.inf, 1e-2, 1e-3], 0.15, 1e-2, id="unknown, because too frequent"),
+        pytest.param([np.inf, 1e-2, 1e-3], 0.2, 1e-2, id="the first known"),
+        pytest.param([np.inf, 1e-2, 1e-3], 0.2 * 2**0.5, 1e-2 * 0.1**0.5, id="within the known"),
+        pytest.param([3e-2, 1e-2, 0.0], 0.2, 1e-2, id="the last known"),
+        pytest.param([3e-2, 1e-2, 0.0], 0.21, 0.0, id="unknown, because too rare"),
+        pytest.param([3e-2, 0.0, 0.0], 0.1, 3e-2, id="known at one level only"),
+        pytest.param([0.0, 0.0, 0.0], 0.1, 0.0, id="no hazard"),
+    ],
+)
+def test_ends_of_a_curve(rates, level, expected):
+    np.testing.assert_allclose(rk.HazardCurve([0.1, 0.2, 0.4], rates).rate(level), expected, rtol=1e-13)
+
+
+def test_probabilities_of_exceedance_are_those_of_a_poisson_process():
+    probabilities = 1 - np.exp(-50 * site_rate(LEVELS))
+    curve = rk.HazardCurve.from_probabilities(LEVELS, probabilities, 50.0, "PGA")
+    np.testing.assert_allclose(curve.rates, site_rate(LEVELS), rtol=1e-9)
+    assert curve.measure == "PGA"
+    known = rk.HazardCurve.from_probabilities([0.1, 0.2, 0.4], [1.0, 0.1, 0.0], 50.0)
+    np.testing.assert_allclose(known.rates, [np.inf, -np.log(0.9) / 50, 0.0], rtol=1e-14)
+
+
+def test_extended_curve_continues_the_power_laws():
+    x = np.array([0.05, 0.1, 0.2, 0.4, 0.8, 1.6])
+    rates = 1e-3 * x**-1.7
+    curve = rk.HazardCurve(x, np.where(x < 0.2, np.inf, np.where(x > 0.4, 0.0, rates)))
+    extended = curve.extended(0.01, 5.0)
+    np.testing.assert_allclose(extended.levels, [0.01, *x, 5.0])
+    np.testing.assert_allclose(extended.rates, 1e-3 * np.array([0.01, *x, 5.0]) ** -1.7, rtol=1e-13)
+
+
+@pytest.mark.parametrize("median", [0.02, 0.1, 0.5, 1.5])
+def test_what_a_curve_leaves_open_is_bounded(median):
+    """The rate under the full hazard lies between those under the curve that was cut, and under its power laws."""
+    fragility = rk.LogNormalFragility(median, 0.4)
+    levels = np.geomspace(1e-4, 1e2, 400)
+    curve = lambda part: rk.HazardCurve(levels[part], site_rate(levels[part]))
+    full = float(rk.toppling_rate(fragility, curve(slice(None))))
+    cut = curve(slice(180, 260))  # 0.05 g to 0.8 g
+    below, above = (float(rk.toppling_rate(fragility, c)) for c in (cut, cut.extended(1e-4, 1e2)))
+    assert below < full < above
+    # Above the last level, what is left open is at most its rate times the probability to withstand it.
+    beyond = curve(slice(0, 260))
+    most = float(beyond.rates[-1] * (1 - fragility(beyond.levels[-1])))
+    assert -1e-15 <= full - float(rk.toppling_rate(fragility, beyond)) <= most + 1e-15
+
+
+# --------------------------------------------------------------------------------------- toppling rates
+
+
+@pytest.mark.parametrize("k", [0.8, 2.3, 4.0])
+@pytest.mark.parametrize("median, dispersion", [(0.2, 0.6), (0.4, 0.3), (0.7, 0.05)])
+def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
+    """Cornell et al. (2002): k0 m^-k exp(k^2 b^2/2), in closed form, by quadrature, and as a fragility of a user."""
+    levels = np.geomspace(1e-7, 1e3, 80)
+    curve = rk.HazardCurve(levels, 1e-4 * levels**-k)
+    exact = 1e-4 * median**-k * np.exp((k * dispersion) ** 2 / 2)
+    rock, own = rk.LogNormalFragility(median, dispersion), Own(median, dispersion)
+    np.testing.assert_allclose(rk.toppling_rate(rock, curve), exact, rtol=1e-12)
+    np.testing.assert_allclose(rk.toppling_rate(own, curve), exact, rtol=1e-10)
+    np.testing.assert_allclose(-jnp.log(rk.survival_probability(rock, 1.0, curve)), exact, rtol=1e-10)
+    # Of one power law, two levels say all.
+    two = rk.HazardCurve(levels[[0, -1]], 1e-4 * levels[[0, -1]] ** -k)
+    np.testing.assert_allclose(rk.toppling_rate(rock, two), exact, rtol=1e-11)
+
+
+CURVES = {
+    "site": CURVE,
+    "few levels": rk.HazardCurve([0.1, 0.4, 0.6], [2e-2, 1e-3, 2e-4]),
+    "flat at first": rk.HazardCurve([0.1, 0.2, 0.4], [1e-3, 1e-3, 1e-5]),
+    "steep": rk.HazardCurve([0.1, 0.3, 0.35, 0.4], [1e-2, 1e-3, 1e-9, 1e-12]),
+    "first unknown": rk.HazardCurve([0.05, 0.1, 0.3, 0.8], [np.inf, 1e-2, 1e-3, 1e-5]),
+    "last unknown": rk.HazardCurve([0.1, 0.3, 0.5, 0.8], [1e-2, 1e-3, 0.0, 0.0]),
+    "one known": rk.HazardCurve([0.1, 0.2, 0.3, 0.8], [np.inf, np.inf, 1e-3, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("median, dispersion", [(0.35, 0.4), (0.25, 0.02), (1.5, 0.2), (0.02, 0.5)])
+def test_toppling_rate_is_the_integral_over_the_curve(name, median, dispersion):
+    """Both ways of integration against 30 digits, also where the fragility lies beyond the curve."""
+    rock, breaks = rk.LogNormalFragility(median, dispersion), median * np.exp(dispersion * np.arange(-8, 9, 2))
+    exact = float(integral(lognormal(median, dispersion), CURVES[name], breaks))
+    np.testing.assert_allclose(rk.toppling_rate(rock, CURVES[name]), exact, rtol=1e-11)
+    np.testing.assert_allclose(-jnp.log(rk.survival_probability(rock, 1.0, CURVES[name])), exact, rtol=1e-9, atol=1e-16)
+
+
+def test_tabulated_fragility():
+    """Straight lines over ln(level) between the table's levels, wherever these lie between those of the curve."""
+    levels, values = np.array([0.12, 0.25, 0.33, 0.5]), np.array([0.1, 0.7, 0.3, 0.9])
+    table = rk.TabulatedFragility(levels, values)
+    inside = np.geomspace(0.12, 0.5, 50)
+    np.testing.assert_allclose(table(inside), np.interp(np.log(inside), np.log(levels), values), rtol=1e-13)
+    np.testing.assert_allclose(table([0.119, 0.6]), [0.0, 0.9])
+
+    def line(x):
+        if x < levels[0]:
+            return mp.mpf(0)
+        i = min(np.searchsorted(levels, float(x), side="right") - 1, 2)
+        share = mp.log(x / mp.mpf(levels[i])) / mp.log(mp.mpf(levels[i + 1]) / mp.mpf(levels[i]))
+        return values[i] + (values[i + 1] - values[i]) * min(share, mp.mpf(1))
+
+    for curve in CURVES.values():
+        exact = float(integral(line, curve, levels))
+        np.testing.assert_allclose(rk.toppling_rate(table, curve), exact, rtol=1e-12)
+
+
+# --------------------------------------------------------------------------------------- survival
+
+
+def shakings(rng, curve, years):
+    """Times [years before present] and intensities of the shakings of some centuries."""
+    levels, rates = np.asarray(curve.levels), np.asarray(curve.rates)
+    count = rng.poisson(rates[0] * years)
+    rate = rates[0] * rng.uniform(size=count)
+    intensity = np.exp(np.interp(np.log(rate), np.log(rates[::-1]), np.log(levels[::-1])))
+    return rng.uniform(0, years, count), intensity
+
+
+# Kinds in turn: rocks of one kind are computed together, and must get their own ages.
+ROCKS = [ROCK, rk.TabulatedFragility([0.1, 0.3, 0.5], [0.0, 0.6, 0.3]), TOUGH, rk.LogNormalFragility(0.3, 0.5)]
+AGES = [300.0, 200.0, 900.0, 100.0]
+
+
+def test_survival_of_rocks_that_share_their_shakings():
+    """Poisson shakings, each drawn once for all rocks, each rock drawn by its fragility while it is fragile."""
+    rng, histories = np.random.default_rng(7), 8000
+    # All histories in one go: they are told apart by where in a long time they lie.
+    time, intensity = shakings(rng, CURVE, max(AGES) * histories)
+    history, ago = np.divmod(time, max(AGES))
+    toppled = np.zeros(time.shape, bool)
+    for rock, age in zip(ROCKS, AGES):
+        toppled |= (rng.uniform(size=time.size) < rock(intensity)) & (ago < age)
+    survived = 1 - np.unique(history[toppled]).size / histories
+    probability = float(rk.survival_probability(ROCKS, AGES, CURVE))
+    error = np.sqrt(probability * (1 - probability) / histories)
+    assert abs(survived - probability) < 3 * error
+    product = np.prod([rk.survival_probability(*pair, CURVE) for pair in zip(ROCKS, AGES)])
+    assert 0.2 < product < probability - 10 * error < 0.8, "shared shakings are not independent ones"
+
+
+def test_survival_against_direct_quadrature():
+    """The definition: over time before present, over the curve, 1 - product of (1 - F) of the rocks already fragile."""
+    x = np.exp(np.linspace(np.log(LEVELS[0]), np.log(LEVELS[-1]), 400_001))
+    rate = np.asarray(CURVE.rate(x))
+    middle, falls = np.sqrt(x[1:] * x[:-1]), rate[:-1] - rate[1:]
+    exponent = 0.0
+    for start, end in ((0.0, 100.0), (100.0, 200.0), (200.0, 300.0), (300.0, 900.0)):
+        there = [rock for rock, age in zip(ROCKS, AGES) if age >= end]
+        joint = lambda level, there=there: 1 - np.prod([1 - np.asarray(rock(level)) for rock in there], axis=0)
+        exponent += (end - start) * (np.sum(joint(middle) * falls) + rate[-1] * joint(x[-1:])[0])
+    np.testing.assert_allclose(rk.survival_probability(ROCKS, AGES, CURVE), np.exp(-exponent), rtol=1e-7)
+
+
+def test_limits_of_survival():
+    rate = float(CURVE.rate(0.4))
+    step = Step(0.4)
+    # Rocks without scatter of their own topple together: any number of them is one, the weakest counts.
+    one = rk.survival_probability(step, 500.0, CURVE)
+    np.testing.assert_allclose(one, np.exp(-500 * rate), rtol=1e-13)
+    np.testing.assert_allclose(rk.survival_probability([step] * 5, 500.0, CURVE), one, rtol=1e-13)
+    np.testing.assert_allclose(rk.survival_probability([step, Step(0.9), Step(0.5)], 500.0, CURVE), one, rtol=1e-13)
+    # Certain to topple in the weakest shaking that the curve knows; certain not to.
+    np.testing.assert_allclose(rk.survival_probability(Step(1e-3), 30.0, CURVE), np.exp(-30 * CURVE.rates[0]))
+    assert rk.survival_probability(Step(0.1, 0.0), 1e6, CURVE) == 1
+    assert rk.survival_probability(ROCK, 0.0, CURVE) == 1
+    np.testing.assert_allclose(
+        rk.survival_probability([ROCK, Step(0.1, 0.0)], 500.0, CURVE), rk.survival_probability(ROCK, 500.0, CURVE)
+    )
+    # Two rocks that withstand half of all shakings each, all by luck: half of a half remains.
+    halves = rk.survival_probability([Step(0.4, 0.5)] * 2, 500.0, CURVE)
+    np.testing.assert_allclose(halves, np.exp(-500 * rate * 0.75), rtol=1e-13)
+
+
+def test_a_rock_counts_since_it_became_fragile():
+    weak, strong = Step(0.2), Step(0.5)
+    low, high = float(CURVE.rate(0.2)), float(CURVE.rate(0.5))
+    for rocks, ages in (([weak, strong], [300.0, 900.0]), ([strong, weak], [900.0, 300.0])):
+        expected = np.exp(-300 * low - 600 * high)  # the weak one masks the strong one for as long as it is there
+        np.testing.assert_allclose(rk.survival_probability(rocks, ages, CURVE), expected, rtol=1e-13)
+    np.testing.assert_allclose(
+        rk.survival_probability([weak, strong], [900.0, 300.0], CURVE), np.exp(-900 * low), rtol=1e-13
+    )
+    # Of rocks of one age, order does not matter.
+    forth, back = (rk.survival_probability(rocks, 400.0, CURVE) for rocks in (ROCKS, ROCKS[::-1]))
+    np.testing.assert_allclose(forth, back, rtol=1e-13)
+
+
+def test_uncertain_ages_are_a_mean_over_samples():
+    samples = np.random.default_rng(1).uniform(100.0, 3000.0, (50, 2))
+    each = jax.vmap(lambda ages: rk.survival_probability([ROCK, TOUGH], ages, CURVE))(samples)
+    for i in (0, 17, 49):
+        np.testing.assert_allclose(each[i], rk.survival_probability([ROCK, TOUGH], samples[i], CURVE), rtol=1e-13)
+
+
+# --------------------------------------------------------------------------------------- branches and scales
+
+
+def test_weights_of_branches():
+    """Bayes by hand; and a branch under which the rock can hardly stand is left with nothing."""
+    np.testing.assert_allclose(rk.branch_weights([0.5, 0.3, 0.2], [0.1, 0.5, 0.0]), [0.25, 0.75, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(rk.branch_weights([2.0, 1.0, 1.0], [0.3, 0.3, 0.3]), [0.5, 0.25, 0.25], rtol=1e-14)
+    branches = rk.HazardCurve(np.tile(LEVELS, (3, 1)), site_rate(LEVELS) * np.array([[0.3], [1.0], [10.0]]))
+    survival = jax.vmap(lambda curve: rk.survival_probability(ROCK, 2000.0, curve))(branches)
+    rate = rk.toppling_rate(ROCK, CURVE)
+    np.testing.assert_allclose(survival, np.exp(-2000 * rate * np.array([0.3, 1.0, 10.0])), rtol=1e-9)
+    weights = rk.branch_weights(np.full(3, 1 / 3), survival)
+    np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
+    assert weights[0] > 0.8 and weights[2] < 1e-6
+
+
+def test_allowed_scale_under_a_power_law():
+    """Intensities times s raise the toppling rate of a power law by s^k: the factor in closed form."""
+    k, age = 2.3, 2e4
+    levels = np.geomspace(1e-5, 1e3, LEVELS.size)
+    curve = rk.HazardCurve(levels, 1e-5 * levels**-k, "PGA")
+    once = age * 1e-5 * 0.35**-k * np.exp((k * 0.4) ** 2 / 2)
+    exact = lambda probability: (-np.log(probability) / once) ** (1 / k)
+    scale = lambda p: rk.allowed_scale(ROCK, age, curve, p)
+    np.testing.assert_allclose(rk.allowed_scale(ROCK, age, curve), exact(0.05), rtol=1e-12)
+    # d s/d p = s/(k p ln p), and its derivative.
+    p, slope = 0.2, exact(0.2) / (k * 0.2 * np.log(0.2))
+    curvature = slope * (1 / (k * p * np.log(p)) - 1 / p - 1 / (p * np.log(p)))
+    found = jax.jit(lambda p: jax.jvp(jax.jacfwd(scale), (p,), (1.0,)))(p)
+    np.testing.assert_allclose(found, [slope, curvature], rtol=1e-9)
+
+
+def test_allowed_scale_brings_survival_to_the_probability():
+    probabilities = np.array([0.01, 0.05, 0.5])
+    scales = jax.jit(jax.vmap(lambda p: rk.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities)
+    survival = lambda scale: float(rk.survival_probability(ROCKS, AGES, CURVE.scaled(scale)))
+    np.testing.assert_allclose([survival(scale) for scale in scales], probabilities, rtol=1e-12)
+    assert survival(1.001 * scales[1]) < 0.05
+    np.testing.assert_allclose(CURVE.scaled(3.0).levels, 3 * LEVELS, rtol=1e-15)
+    np.testing.assert_array_equal(CURVE.scaled(3.0).rates, CURVE.rates)
+
+
+def test_no_factor_is_large_or_small_enough():
+    """The curve knows 0.21 shakings a year: in 14 years the weakest rock stands with more than 5 %."""
+    assert 14 * CURVE.rates[0] < -np.log(0.05) < 15 * CURVE.rates[0]
+    assert rk.allowed_scale(ROCK, 14.0, CURVE) == np.inf
+    assert 1 < rk.allowed_scale(ROCK, 15.0, CURVE) < np.inf
+    assert rk.allowed_scale(Step(1e-9), 2000.0, CURVE) == 0
+    slope = jax.jit(jax.grad(lambda age: rk.allowed_scale(ROCK, age, CURVE)))
+    assert slope(14.0) == 0
+    near = rk.allowed_scale(ROCK, 100.01, CURVE) - rk.allowed_scale(ROCK, 99.99, CURVE)
+    np.testing.assert_allclose(slope(100.0), near / 0.02, rtol=1e-6)
+
+
+def test_allowed_scale_is_the_first_of_several():
+    """A rock that only middling shakings topple stands under weak and under strong hazard."""
+    rock = rk.TabulatedFragility([0.2, 0.3, 0.5, 0.6], [0.0, 1.0, 1.0, 0.0])
+    curve = rk.HazardCurve([0.1, 0.11], [1e-3, 1e-3 * (1 - 1e-9)])
+    scale = rk.allowed_scale(rock, 6000.0, curve)
+    assert 2.0 < scale / (0.1 / 0.11) and scale < 3.0
+    for factor, probability in ((1.5, 1.0), (0.999 * scale, 0.0515), (1.001 * scale, 0.0485), (7.0, 1.0)):
+        np.testing.assert_allclose(rk.survival_probability(rock, 6000.0, curve.scaled(factor)), probability, rtol=0.03)
+
+
+def rebuilt(numbers):
+    """Rocks, ages and a curve from 9 numbers."""
+    medians, dispersions, ages, rest = numbers[:2], numbers[2:4], numbers[4:6], numbers[6:]
+    rocks = [rk.LogNormalFragility(m, b) for m, b in zip(medians, dispersions)]
+    rocks += [rk.TabulatedFragility(jnp.append(rest[0], 0.5), jnp.append(0.2, rest[1]))]
+    curve = rk.HazardCurve(LEVELS, CURVE.rates * jnp.asarray(LEVELS) ** (rest[2] - 1))
+    return rocks, jnp.append(ages, 80.0), curve
+
+
+def test_derivatives():
+    """By medians, dispersions, ages, an edge and a value of a table, and the slope of the curve."""
+
+    def results(numbers):
+        rocks, ages, curve = rebuilt(numbers)
+        rates = [rk.toppling_rate(rock, curve) for rock in (rocks[0], rocks[2])]
+        return jnp.stack([*rates, rk.survival_probability(rocks, ages, curve), rk.allowed_scale(rocks, ages, curve)])
+
+    assert_slopes(results, jnp.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05]))
+
+
+SLOPES = [
+    jax.jit(jax.value_and_grad(lambda curve: rk.toppling_rate(ROCK, curve))),
+    jax.jit(jax.value_and_grad(lambda curve: jnp.log(rk.survival_probability(ROCK, 50.0, curve)))),
+]
+
+
+@pytest.mark.parametrize("name", ["first unknown", "last unknown", "one known"])
+def test_derivatives_where_rates_are_unknown(name):
+    """In reverse mode. Nothing hangs on a rate that is not known, and results are proportional to all those known."""
+    known = np.isfinite(CURVES[name].rates) & (CURVES[name].rates > 0)
+    for function in SLOPES:
+        value, slopes = function(CURVES[name])
+        assert np.all(slopes.rates[~known] == 0)
+        np.testing.assert_allclose(slopes.rates[known] @ CURVES[name].rates[known], value, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "call, error",
+    [
+        (lambda: rk.HazardCurve([0.1, 0.1], [1e-2, 1e-3]), "`levels` must be positive and finite, and rise .* is 0.1"),
+        (lambda: rk.HazardCurve([0.0, 0.1], [1e-2, 1e-3]), "`levels` must be positive"),
+        (lambda: rk.HazardCurve([0.1], [1e-2]), r"`levels` must hold at least two levels, but has shape \(1,\)"),
+        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, 1e-2]), "`rates` must be 0 or more, never rise, .* but is 0.01"),
+        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, -1e-3]), "`rates` must be 0 or more"),
+        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, np.nan]), "`rates` must be 0 or more"),
+        (lambda: rk.HazardCurve([0.1, 0.2], [np.inf, 0.0]), "`rates` .* infinite only before a positive finite one"),
+        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, 1e-4, 1e-5]), r"`rates` must have the shape \(2,\) of `levels`"),
+        (
+            lambda: rk.HazardCurve.from_probabilities([0.1, 0.2], [1.1, 0.1], 50.0),
+            r"`probabilities` must be in \[0, 1\], but is 1.1",
+        ),
+        (lambda: rk.HazardCurve.from_probabilities([0.1, 0.2], [0.2, 0.1], 0.0), "`investigation_time` must be pos"),
+        (lambda: CURVE.extended(0.01, 5.0), "`lowest` must be positive and below the first level, but is 0.01"),
+        (lambda: CURVE.extended(0.001, 1.0), "`highest` must be finite and above the last level, but is 1.0"),
+        (lambda: CURVES["one known"].extended(0.01, 5.0), "`rates` must be known at two levels or more"),
+        (lambda: CURVE.scaled(-1.0), "`factor` must be positive"),
+        (lambda: rk.LogNormalFragility(0.3, 0.0), "`dispersion` must be positive and finite, but is 0.0"),
+        (lambda: rk.LogNormalFragility(-0.3, 0.1), "`median` must be positive"),
+        (lambda: rk.TabulatedFragility([0.1, 0.2], [0.5, 1.2]), r"`probabilities` must be in \[0, 1\], but is 1.2"),
+        (lambda: rk.TabulatedFragility([0.2, 0.1], [0.5, 0.7]), "`levels` must be positive and finite, and rise"),
+        (lambda: rk.TabulatedFragility([0.1, 0.2], [0.5]), "`probabilities` must have the shape"),
+        (
+            lambda: rk.survival_probability([ROCK], [1.0, 2.0], CURVE),
+            r"`ages` must be one for each of 1 rocks, .*\(2,\)",
+        ),
+        (lambda: rk.survival_probability([], 1.0, CURVE), "`ages` must be one for each of 0 rocks"),
+        (lambda: rk.survival_probability(ROCK, -1.0, CURVE), "`ages` must be 0 or more and finite, but is -1.0"),
+        (
+            lambda: rk.toppling_rate(rk.LogNormalFragility(np.array([0.3, 0.4]), 0.1), CURVE),
+            r"`fragilities` must each be of one rock, but one has shape \(2,\)",
+        ),
+        (
+            lambda: rk.toppling_rate(ROCK, rk.HazardCurve(np.array([[0.1, 0.2]]), np.array([[1e-2, 1e-3]]))),
+            r"`curve` must be one, but has levels of shape \(1, 2\). Use jax.vmap",
+        ),
+        (lambda: rk.allowed_scale(ROCK, 1.0, CURVE, 1.0), r"`probability` must be in \(0, 1\), but is 1.0"),
+        (lambda: rk.branch_weights([1.0, 1.0], [0.5]), "`prior` and `survival` must be lists of one length"),
+        (lambda: rk.branch_weights([-1.0, 1.0], [0.5, 0.5]), "`prior` must be 0 or more and finite, but is -1.0"),
+        (lambda: rk.branch_weights([0.0, 1.0], [0.5, 0.0]), "`survival` must be above 0 for a branch that has weight"),
+        (lambda: rk.fit_fragility([0.1, 0.2], [0.0, 2.0]), "`toppled` must be from 0 to `trials`, but is 2.0"),
+        (lambda: rk.fit_fragility([0.1, 0.2], [0.0]), r"`toppled` must have the shape \(2,\) of `levels`"),
+        (lambda: rk.fit_fragility([0.1, 0.2], [0.0, 1.0], [1.0, 1.0, 1.0]), "`trials` must have shape"),
+        (lambda: rk.fit_fragility([0.1, -0.2], [0.0, 1.0]), "`levels` must be positive"),
+        (lambda: rk.fit_fragility([], []), "`levels` must be a list of at least one value"),
+    ],
+)
+def test_wrong_arguments(call, error):
+    with pytest.raises(ValueError, match=error):
+        call()
+
+
+# --------------------------------------------------------------------------------------- fits
+
+
+def test_fit_to_counts_at_two_levels():
+    """Two counts fix the line: z = Phi^-1(share) at each level, with the variance p (1 - p)/(n phi^2)."""
+    levels, toppled, trials = np.array([0.2, 0.5]), np.array([3, 17]), np.array([20, 25])
+    # The levels without a trial say nothing.
+    fit = rk.fit_fragility(
+        np.append(levels, [0.1, 0.3, 2.0]), np.append(toppled, [0, 0, 0]), np.append(trials, [0, 0, 0])
+    )
+    assert fit.status == rk.FitStatus.successful
+    p, x = toppled / trials, np.log(levels)
+    z = ndtri(p)
+    line = lambda z: np.array([x[0] - z[0] * (x[1] - x[0]) / (z[1] - z[0]), np.log((x[1] - x[0]) / (z[1] - z[0]))])
+    parameters = np.log([fit.fragility.median, fit.fragility.dispersion])
+    np.testing.assert_allclose(parameters, line(z), rtol=1e-12)
+    variance = p * (1 - p) / trials / (np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)) ** 2
+    jacobian = np.stack([(line(z + 1e-6 * e) - line(z - 1e-6 * e)) / 2e-6 for e in np.eye(2)], axis=1)
+    np.testing.assert_allclose(fit.covariance, jacobian @ np.diag(variance) @ jacobian.T, rtol=1e-7)
+    likelihood = np.sum(toppled * np.log(p) + (trials - toppled) * np.log(1 - p))
+    np.testing.assert_allclose(fit.log_likelihood, likelihood, rtol=1e-13)
+
+
+def test_fit_recovers_a_fragility():
+    """Over many data sets of 200 shakings the truth lies in the ellipse of 95 % in 95 % of them."""
+    rng = np.random.default_rng(3)
+    levels = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (300, 200)))
+    toppled = rng.uniform(size=levels.shape) < ndtr(np.log(levels / 0.35) / 0.4)
+    fits = jax.vmap(rk.fit_fragility)(levels, toppled)
+    assert np.all(fits.status == rk.FitStatus.successful)
+    off = np.log(np.stack([fits.fragility.median / 0.35, fits.fragility.dispersion / 0.4], -1))
+    assert np.abs(off.mean(0)).max() < 0.03
+    distance = np.einsum("ni,nij,nj->n", off, np.linalg.inv(fits.covariance), off)
+    assert 0.92 < np.mean(distance < -2 * np.log(0.05)) < 0.98
+
+
+def test_fit_to_single_outcomes_is_the_fit_to_their_counts():
+    levels = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    toppled, trials = np.array([1, 2, 4, 3, 5]), np.array([6, 6, 6, 4, 5])
+    single = np.concatenate([np.arange(n) < k for k, n in zip(toppled, trials)])
+    a, b = rk.fit_fragility(levels, toppled, trials), rk.fit_fragility(np.repeat(levels, trials), single)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)):
+        np.testing.assert_allclose(x, y, rtol=1e-10)
+    assert a.highest_survived == 0.4 and a.lowest_toppled == 0.1
+
+
+@pytest.mark.parametrize(
+    "levels, toppled, status, between",
+    [
+        pytest.param([1, 2, 3, 4], [0, 0, 1, 1], "separable", (2, 3), id="a gap between survived and toppled"),
+        pytest.param([1, 2, 2, 3], [0, 0, 1, 1], "separable", (2, 2), id="they meet at one level"),
+        pytest.param([1, 2, 3], [1, 1, 1], "separable", (0, 1), id="all toppled"),
+        pytest.param([1, 2, 3], [0, 0, 0], "separable", (3, np.inf), id="all survived"),
+        pytest.param([2, 2, 2], [0, 1, 1], "separable", (2, 2), id="one level only"),
+        pytest.param([1, 2, 3, 4], [1, 1, 0, 0], "separable", (4, 1), id="upside down"),
+        pytest.param([5], [1], "separable", (0, 5), id="one shaking"),
+        pytest.param([], [], "separable", (0, np.inf), id="none"),
+        pytest.param([1, 2, 3, 4], [1, 1, 0, 1], "not_growing", (3, 1), id="weaker ones topple more"),
+        pytest.param([1, 1.5, 2, 3, 4], [1, 0, 0, 0, 1], "not_growing", (3, 1), id="weakest and strongest"),
+        pytest.param([1, 2, 2, 4], [0, 1, 0, 0], "not_growing", (4, 2), id="hardly any"),
+        pytest.param([1, 2, 3, 4], [0, 1, 0, 1], "successful", (3, 2), id="just overlapping"),
+    ],
+)
+def test_fit_says_what_the_data_do_not(levels, toppled, status, between):
+    unused = 5 - len(levels)  # levels without a trial, so that all are compiled as one
+    fit = rk.fit_fragility(
+        np.array(levels + [0.5] * unused), np.array(toppled + [0] * unused), np.array([1] * len(levels) + [0] * unused)
+    )
+    assert fit.status == getattr(rk.FitStatus, status)
+    assert (fit.highest_survived, fit.lowest_toppled) == between
+    numbers = [fit.fragility.median, fit.fragility.dispersion, fit.log_likelihood, *fit.covariance.ravel()]
+    assert np.all(np.isfinite(numbers)) if status == "successful" else np.all(np.isnan(numbers))
+
+
+def test_fit_has_derivatives():
+    """How median and dispersion follow levels and counts."""
+
+    def results(numbers):
+        fit = rk.fit_fragility(numbers[:4], numbers[4:], 8)
+        return jnp.stack([fit.fragility.median, fit.fragility.dispersion])
+
+    assert_slopes(results, jnp.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
+
+
+# --------------------------------------------------------------------------------------- files
+
+IMLS = [0.005, 0.0192, 0.145, 0.5, 1.0]
+SITES = {(-122.5, 38.1): [0.87, 0.65, 0.06, 4e-4, 0.0], (-121.93, 38.1): [1.0, 0.9, 0.3, 2e-3, 1e-5]}
+
+
+def engine_file(kind="mean", time=50.0, imt="PGA", sites=SITES, form="poe-%.7f", names=None):
+    """A hazard-curve file as `openquake.baselib.writers.write_csv` writes it: lines end in CR LF."""
+    out = io.StringIO()
+    writer = csv.writer(out)
+    header = ["lon", "lat", "depth", *(form % level for level in IMLS)]
+    header = ["custom_site_id", *header] if names else header
+    comment = dict(generated_by="OpenQuake engine 3.20.0", start_date="2024-06-03T09:36:04", checksum=2107362341)
+    comment |= dict(kind=kind, investigation_time=time, imt=imt)
+    text = ", ".join(f"{key}={value!r}" for key, value in comment.items())
+    writer.writerow(["#", *[""] * (len(header) - 2), text])
+    writer.writerow(header)
+    for i, ((lon, lat), poes) in enumerate(sites.items()):
+        row = [f"{x:.5f}" for x in (lon, lat, -0.1 * i)] + [f"{p:.6E}" for p in poes]
+        writer.writerow([names[i], *row] if names else row)
+    return out.getvalue()
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a file and return its path."""
+
+    def write(content, name="hazard_curve-mean-PGA_12.csv"):
+        path = tmp_path / name
+        path.write_bytes(content.encode())
+        return path
+
+    return write
+
+
+def test_file_of_the_engine(file):
+    found = rk.read_hazard_curves(file(engine_file()))
+    np.testing.assert_allclose(found.longitude, [-122.5, -121.93])
+    np.testing.assert_allclose(found.latitude, [38.1, 38.1])
+    np.testing.assert_allclose(found.depth, [0.0, -0.1])
+    assert (found.kinds, found.names, found.curves.measure) == (("mean",), ("", ""), "PGA")
+    assert found.curves.rates.shape == (1, 2, 5)
+    curve = found.at(0, 0)
+    np.testing.assert_allclose(curve.levels, IMLS)
+    np.testing.assert_allclose(curve.rates, -np.log1p(-np.array([0.87, 0.65, 0.06, 4e-4, 0.0])) / 50, rtol=1e-12)
+    assert np.isinf(found.at(1, 0).rates[0]), "a probability printed as 1 tells no rate"
+    assert 0 < rk.survival_probability(ROCK, 1000.0, curve) < 1
+    assert found.at(1).rates.shape == (1, 5)
+
+
+def test_files_of_several_branches(file):
+    kinds = ["rlz-000", "rlz-001", "quantile-0.15"]
+    more = lambda factor: {site: [min(p * factor, 1.0) for p in poes] for site, poes in SITES.items()}
+    paths = [
+        file(engine_file(kind, sites=more(1 - 0.1 * i)), f"hazard_curve-{kind}.csv") for i, kind in enumerate(kinds)
+    ]
+    found = rk.read_hazard_curves(paths)
+    assert found.kinds == tuple(kinds)
+    assert found.curves.levels.shape == found.curves.rates.shape == (3, 2, 5)
+    np.testing.assert_allclose(found.at(0, 2).rates[1], -np.log1p(-0.8 * 0.65) / 50, rtol=1e-12)
+    survival = jax.vmap(lambda curve: rk.survival_probability(ROCK, 1000.0, curve))(found.at(1))
+    single = [rk.survival_probability(ROCK, 1000.0, found.at(1, branch)) for branch in range(3)]
+    np.testing.assert_allclose(survival, single, rtol=1e-13)
+    sites = jax.vmap(jax.vmap(lambda curve: rk.toppling_rate(ROCK, curve)))(found.curves)
+    np.testing.assert_allclose(sites[2, 1], rk.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
+
+
+OLD = "lon,lat,depth,poe-0.1,poe-0.4,poe-1.0\n0.00000,0.00000,-0.10000,4.528811E-01,5.589804E-02,5.585141E-03\n"
+
+
+@pytest.mark.parametrize(
+    "content, kind, measure, names",
+    [
+        pytest.param(engine_file("max", imt="SA(0.1)"), "max", "SA(0.1)", ("", ""), id="spectral acceleration"),
+        pytest.param(engine_file(imt="SDi(0.3,2.0)"), "mean", "SDi(0.3,2.0)", ("", ""), id="comma in the measure"),
+        pytest.param(engine_file(form="poe-%.5e"), "mean", "PGA", ("", ""), id="levels since 3.25"),
+        pytest.param(engine_file(names=["0:CD", "1001"]), "mean", "PGA", ("0:CD", "1001"), id="custom site ids"),
+        pytest.param(
+            engine_file().replace("\r\n", "\n") + "\n\n", "mean", "PGA", ("", ""), id="line feeds, blank lines"
+        ),
+        pytest.param(
+            '# quantile-0.1, investigation_time=50.0,imt="PGA"\n' + OLD, "quantile-0.1", "PGA", ("",), id="old quantile"
+        ),
+        pytest.param(
+            "# source_model_tree_path=('b1',), gsim_tree_path=('b1',), investigation_time=50.0,imt=PGV\n" + OLD,
+            "source_model_tree_path=('b1',), gsim_tree_path=('b1',)",
+            "PGV",
+            ("",),
+            id="old branch",
+        ),
+        pytest.param(
+            "# mean, investigation_time=50.0, imt=PGA\n" + OLD.replace("depth,", "").replace("-0.10000,", ""),
+            "mean",
+            "PGA",
+            ("",),
+            id="no depth",
+        ),
+    ],
+)
+def test_variants_of_files(file, content, kind, measure, names):
+    found = rk.read_hazard_curves(str(file(content)))
+    assert (found.kinds, found.curves.measure, found.names) == ((kind,), measure, names)
+    first = [0.005, 0.0192] if "0.0192" in content or "1.92" in content else [0.1, 0.4]
+    np.testing.assert_allclose(found.at(0, 0).levels[:2], first)
+    probability = 0.65 if first[0] == 0.005 else 5.589804e-2
+    np.testing.assert_allclose(found.at(0, 0).rates[1], -np.log1p(-probability) / 50, rtol=1e-12)
+
+
+def test_noise_of_single_precision_is_levelled(file):
+    content = engine_file().replace("6.500000E-01", "8.700001E-01").replace("0.000000E+00", "4.000001E-04")
+    rates = rk.read_hazard_curves(file(content)).at(0, 0).rates
+    assert rates[1] == rates[0] and rates[4] == rates[3]
+
+
+@pytest.mark.parametrize(
+    "content, error",
+    [
+        ("", r"File `broken.csv`: is empty\."),
+        (engine_file().split("\r\n", 1)[1], "line 1 should be a comment that states investigation_time and imt"),
+        (engine_file().replace("investigation_time=50.0, ", ""), "line 1 should be a comment"),
+        (engine_file().replace("imt='PGA'", "x=1"), "line 1 should be a comment"),
+        (engine_file().replace("=50.0", "=0.0"), "line 1 states an investigation time of '0.0'"),
+        (engine_file().replace("=50.0", "=None"), "line 1 states an investigation time of 'None'"),
+        (engine_file().split("\r\n")[0], "line 2 should name the columns of hazard curves"),
+        (engine_file(form="PGA-%s"), "line 2 should name the columns of hazard curves.*is 'lon,lat,depth,PGA-0.005"),
+        (engine_file().replace("lon,", "x,"), "line 2 should name the columns"),
+        (engine_file().replace(",poe-0.1450000", ",vs30"), "line 2 should name the columns"),
+        (engine_file().replace("poe-0.1450000", "poe-x"), "line 2 holds 'x', which is not a finite number"),
+        (engine_file().replace("poe-0.1450000", "poe-0.0000000"), "line 2 should hold at least two levels"),
+        ("\r\n".join(engine_file().split("\r\n")[:2]), "holds no sites"),
+        (engine_file().replace(",0.000000E+00", ""), "line 3 has 7 columns, but the header has 8"),
+        (engine_file().replace("8.700000E-01", "nan"), "line 3 holds 'nan', which is not a finite number"),
+        (engine_file().replace("6.500000E-01", "6.5x"), "line 3 holds '6.5x'"),
+        (engine_file().replace("-121.93000", ""), "line 4 holds '', which is not a finite number"),
+        (engine_file().replace("6.500000E-01", "1.650000E+00"), r"line 3 holds a probability that is not in \[0, 1\]"),
+        (engine_file().replace("6.500000E-01", "8.710000E-01"), "line 3 holds probabilities that rise with the level"),
+        (engine_file(sites={(0.0, 0.0): [1, 1, 1, 0, 0]}), "line 3 holds no probability between 0 and 1"),
+        ("PK\x03\x04\x00\x00", "is not plain text"),
+    ],
+)
+def test_damaged_files(file, content, error):
+    with pytest.raises(ValueError, match="File `broken.csv`: " + error.removeprefix("File `broken.csv`: ")):
+        rk.read_hazard_curves(file(content, "broken.csv"))
+
+
+@pytest.mark.parametrize(
+    "content, error",
+    [
+        (engine_file(imt="PGV"), "File `other.csv`: differs in its measure from file `first.csv`"),
+        (engine_file().replace("poe-0.145", "poe-0.146"), "differs in its levels"),
+        (engine_file().replace("-121.93", "-121.94"), "differs in its sites"),
+        (engine_file(names=["a", "b"]), "differs in its sites"),
+        (engine_file().split("-121.93")[0], "differs in its sites"),
+    ],
+)
+def test_files_that_do_not_belong_together(file, content, error):
+    with pytest.raises(ValueError, match=error):
+        rk.read_hazard_curves([file(engine_file(), "first.csv"), file(content, "other.csv")])
+
+
+def test_what_is_not_there(file):
+    found = rk.read_hazard_curves(file(engine_file()))
+    with pytest.raises(ValueError, match="`site` must be from 0 to 1, but is 2"):
+        found.at(2)
+    with pytest.raises(ValueError, match="`branch` must be from 0 to 0, but is -1"):
+        found.at(0, -1)
+    with pytest.raises(ValueError, match="`paths` must be a file or a list of files, but is empty"):
+        rk.read_hazard_curves([])
+    with pytest.raises(FileNotFoundError):
+        rk.read_hazard_curves("nowhere.csv")
