@@ -8,6 +8,7 @@ vector register, and then for the next few. XLA calls it as a foreign function.
 import ctypes
 import functools
 import hashlib
+import threading
 from collections.abc import Callable
 
 import jax
@@ -30,10 +31,9 @@ def run(function: Callable, leaves: list, shared: list[bool]) -> list:
     like = [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves)]
     with nothing_kept():
         program = jax.make_jaxpr(lambda leaves: function(leaves))(like)
-    machine = _machine()
-    name = _registered(emit(program, shared, machine.lanes, "program"))
+    name = registered(program, shared)
     size = next(x.shape[0] for x, same in zip(leaves, shared) if not same)
-    more = -size % machine.lanes
+    more = -size % _machine().lanes
 
     def laid_out(x, same):
         if same:
@@ -76,24 +76,27 @@ def _machine() -> _Machine:
     return _Machine()
 
 
-def _registered(module: ir.Module) -> str:
-    """The name under which XLA finds the function of a module: made of its text, so that compiled programs that a
+_registered, _one_at_a_time = set(), threading.Lock()
+
+
+def registered(program, shared: list[bool]) -> str:
+    """The name under which XLA finds the machine code of a program: made of its text, so that compiled programs that a
     cache keeps find it again."""
-    _add_handler(module)
-    return _register(str(module))
-
-
-@functools.cache
-def _register(text: str) -> str:
+    module = emit(program, shared, _machine().lanes, "program")
+    _add_handler(module, len(program.jaxpr.outvars), 1 + len(shared))
+    text = str(module)
     name = "jaxrock_" + hashlib.sha256(text.encode()).hexdigest()[:20]
-    address = _machine().compile(text.replace("jaxrock_handler", name), name)
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-    jax.ffi.register_ffi_target(name, new(address, b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+    with _one_at_a_time:
+        if name not in _registered:
+            address = _machine().compile(text.replace("jaxrock_handler", name), name)
+            new = ctypes.pythonapi.PyCapsule_New
+            new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+            jax.ffi.register_ffi_target(name, new(address, b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+            _registered.add(name)
     return name
 
 
-def _add_handler(module: ir.Module) -> None:
+def _add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
     """Add the function that XLA calls: `handler(frame)`, by the offsets of XLA's C interface for foreign functions.
 
     Frame: at 8 extensions, at 16 the interface (its version at 32), at 32 the stage, at 72 the arguments, at 112 the
@@ -105,48 +108,23 @@ def _add_handler(module: ir.Module) -> None:
     program.linkage = "internal"
     b = ir.IRBuilder(handler.append_basic_block("entry"))
     (frame,) = handler.args
+    done = ir.Constant(_POINTER, None)
 
     def at(pointer, offset, kind=_POINTER):
-        return b.bitcast(b.gep(pointer, [_I64(offset)]), kind.as_pointer())
+        return b.load(b.bitcast(b.gep(pointer, [_I64(offset)]), kind.as_pointer()))
 
-    extension = b.load(at(frame, 8))
-    with b.if_then(b.icmp_unsigned("!=", extension, ir.Constant(_POINTER, None))):
-        with b.if_then(b.icmp_signed("==", b.load(at(extension, 8, _I32)), _I32(1))):
-            version = b.load(at(b.load(at(frame, 16)), 32, _I64))
-            b.store(version, at(b.load(at(extension, 24)), 24, _I64))
-            b.ret(ir.Constant(_POINTER, None))
-    with b.if_then(b.icmp_signed("==", b.load(at(frame, 32, _I32)), _I32(3))):
+    extension = at(frame, 8)
+    with b.if_then(b.icmp_unsigned("!=", extension, done)):
+        with b.if_then(b.icmp_signed("==", at(extension, 8, _I32), _I32(1))):
+            version = at(at(frame, 16), 32, _I64)
+            b.store(version, b.bitcast(b.gep(at(extension, 24), [_I64(24)]), _I64.as_pointer()))
+            b.ret(done)
+    with b.if_then(b.icmp_signed("==", at(frame, 32, _I32), _I32(3))):
         tables = []
-        for offset, count_at in ((112, 96), (72, 56)):
-            count = b.load(at(frame, count_at, _I64))
-            buffers = b.bitcast(b.load(at(frame, offset)), _POINTER.as_pointer())
+        for offset, count in ((112, outputs), (72, inputs)):
             table = b.alloca(_POINTER, count)
-            with _counted(b, count) as i:
-                data = b.load(at(b.load(b.gep(buffers, [i])), 24))
-                b.store(data, b.gep(table, [i]))
+            for i in range(count):
+                b.store(at(at(at(frame, offset), 8 * i), 24), b.gep(table, [_I32(i)]))
             tables.append(table)
         b.call(program, tables)
-    b.ret(ir.Constant(_POINTER, None))
-
-
-class _counted:
-    """A loop over 0, 1, ... below a count."""
-
-    def __init__(self, builder: ir.IRBuilder, count):
-        self.b, self.count = builder, count
-
-    def __enter__(self):
-        b, before = self.b, self.b.block
-        self.head, inside, self.after = (b.append_basic_block() for _ in range(3))
-        b.branch(self.head)
-        b.position_at_end(self.head)
-        self.index = b.phi(_I64)
-        self.index.add_incoming(_I64(0), before)
-        b.cbranch(b.icmp_signed("<", self.index, self.count), inside, self.after)
-        b.position_at_end(inside)
-        return self.index
-
-    def __exit__(self, *_):
-        self.index.add_incoming(self.b.add(self.index, _I64(1)), self.b.block)
-        self.b.branch(self.head)
-        self.b.position_at_end(self.after)
+    b.ret(done)

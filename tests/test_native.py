@@ -186,9 +186,8 @@ def test_what_is_not_known_is_said(function):
         both(lambda x: [function(x)], NUMBERS)
 
 
-def test_kept_by_the_compilation_cache(tmp_path):
-    """The code is made of the program alone, so that another process finds it again."""
-    from jaxrock.native import _registered, emit
-
-    program = jax.make_jaxpr(lambda x: [jnp.exp(x) * 3])(1.0)
-    assert _registered(emit(program, [False], 8, "program")) == _registered(emit(program, [False], 8, "program"))
+def test_programs_have_names_of_their_own():
+    """Made of the program alone, so that another process finds it again in the compilation cache."""
+    program, other = (jax.make_jaxpr(lambda x, factor=factor: [jnp.exp(x) * factor])(1.0) for factor in (3, 4))
+    assert native.registered(program, [False]) == native.registered(program, [False])
+    assert len({native.registered(*each) for each in ((program, [False]), (program, [True]), (other, [False]))}) == 3
