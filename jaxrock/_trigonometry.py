@@ -91,3 +91,10 @@ def exponential(x: Real) -> Real:
     half = jax.lax.bitcast_convert_type((power.astype(integer) - 1 + info.maxexp - 1) << info.nmant, x.dtype)
     value = 2 * _horner(_EXPONENTIAL, rest) * half
     return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))
+
+
+def exponential_less_one(x: Real) -> Real:
+    """exp(x) - 1, to a few units of rounding of the result."""
+    x = jnp.asarray(x)
+    near = x * _horner(tuple(c / (k + 1) for k, c in enumerate(_EXPONENTIAL)), x)
+    return jnp.where(jnp.abs(x) < 0.346, near, exponential(x) - 1)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from llvmlite import ir
 
-from jaxrock._trigonometry import exponential, logarithm, sine_cosine_of_any
+from jaxrock._trigonometry import exponential, exponential_less_one, logarithm, sine_cosine_of_any
 
 _BOOL = np.dtype(bool)
 _CONTRACT = ("contract",)  # a product and a sum may be rounded once
@@ -167,6 +167,7 @@ OPERATIONS: dict[str, Callable] = {
     "round": _round,
     "is_finite": _is_finite,
     "exp": _by(exponential),
+    "expm1": _by(exponential_less_one),
     "log": _by(logarithm),
     "sin": _by(lambda x: sine_cosine_of_any(x)[0]),
     "cos": _by(lambda x: sine_cosine_of_any(x)[1]),
@@ -215,4 +216,5 @@ MOVES: dict[str, Callable] = {
     "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
     "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
     "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
+    "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
 }

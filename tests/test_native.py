@@ -93,6 +93,12 @@ def test_functions(function):
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-15, atol=4e-16)
 
 
+def test_exponential_less_one():
+    x = np.concatenate([np.linspace(-3, 3, 61), [-1e-300, 1e-12, -800.0]])
+    found, expected = both(lambda x: [jnp.expm1(x)], x)
+    np.testing.assert_allclose(found[0], expected[0], rtol=2e-15)
+
+
 def test_exponentials_at_the_ends():
     x = np.array([-np.inf, -800.0, -708.0, -1e-300, 0.0, 709.7, 710.0, np.inf, np.nan])
     found, _ = both(lambda x: [jnp.exp(x)], x)
@@ -158,7 +164,15 @@ def test_small_arrays():
         directions = np.eye(3)
         value, slopes = jax.vmap(lambda d: jax.jvp(follow, (x, pair), (d[0], d[1:])), out_axes=(None, 0))(directions)
         square = jnp.concatenate([slopes, slopes[::-1]]).reshape(2, 3).T
-        return [value, slopes, square, square.sum(0), square.max(), jnp.where(x > 1, slopes, 0.0)]
+        return [
+            value,
+            slopes,
+            jnp.stack([x, value])[0],
+            square,
+            square.sum(0),
+            square.max(),
+            jnp.where(x > 1, slopes, 0.0),
+        ]
 
     x = np.linspace(0, 2, 19)
     agree(function, x, np.stack([3 + x, 0.1 * x], 1), np.arange(20.0) / 20, shared=(2,), rtol=1e-14)
