@@ -87,9 +87,13 @@ def exponential(x: Real) -> Real:
     # ln 2 in two parts: the products with the first are exact.
     rest = (x - power * 0.6931471803691238) - power * 1.9082149292705877e-10
     integer = jnp.int64 if info.bits == 64 else jnp.int32
-    # Half the power: 2^1024 is no number, but exp(709) is.
-    half = jax.lax.bitcast_convert_type((power.astype(integer) - 1 + info.maxexp - 1) << info.nmant, x.dtype)
-    value = 2 * _horner(_EXPONENTIAL, rest) * half
+
+    def power_of_two(k):
+        return jax.lax.bitcast_convert_type((k.astype(integer) + info.maxexp - 1) << info.nmant, x.dtype)
+
+    # In two parts: 2^1024 is no number, but exp(709) is.
+    half = jnp.floor(power * 0.5)
+    value = _horner(_EXPONENTIAL, rest) * power_of_two(half) * power_of_two(power - half)
     return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))
 
 

@@ -105,20 +105,20 @@ class Emitter:
         jaxpr = getattr(program, "jaxpr", program)
         values = dict(zip(jaxpr.invars, arguments))
         for variable, value in zip(jaxpr.constvars, getattr(program, "consts", ())):
-            values[variable] = self._known(value)
+            values[variable] = self._known(value, variable.aval.dtype)
 
         def read(atom):
-            return self._known(atom.val) if isinstance(atom, Literal) else values[atom]
+            return self._known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
             found = self._place(equation, [read(x) for x in equation.invars], active)
             values.update(zip(equation.outvars, found))
         return [read(x) for x in jaxpr.outvars]
 
-    def _known(self, value):
+    def _known(self, value, dtype):
         if isinstance(value, jax.core.Tracer):
             raise Unsupported("a number from outside")
-        value = np.asarray(value)
+        value = np.asarray(value, dtype)
         if value.size > SMALL**2:
             raise Unsupported("a large array in the program")
         return (
@@ -129,19 +129,20 @@ class Emitter:
         """Apply an operation, before the loops that do not change its operands."""
         if equation.primitive.name in _WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
-        depth = max((self._depths.get(id(x), 0) for x in _flat(inputs)), default=0)
+        vectors = _flat([x for x in inputs if not isinstance(x, Memory)])
+        depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
         if depth == len(self._before):
             found = self._apply(equation, inputs, active)
         else:
             with self.b.goto_block(self._before[depth]):
                 found = self._apply(equation, inputs, active)
-        self._remember(_flat(found), depth)
+        self._remember(_flat([x for x in found if not isinstance(x, Memory)]), depth)
         return found
 
     def _remember(self, values: list, depth: int) -> None:
         self._alive += values
-        # What moves a value about changes nothing of it.
-        self._depths.update((id(x), depth) for x in values if id(x) not in self._depths or isinstance(x, ir.PhiInstr))
+        # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
+        self._depths.update((id(x), min(depth, self._depths.get(id(x), depth))) for x in values)
 
     def _apply(self, equation, inputs: list, active) -> list:
         name, parameters = equation.primitive.name, equation.params
@@ -153,9 +154,11 @@ class Emitter:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
             return [self._of_memory(name, parameters, *inputs)]
+        if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
+            raise Unsupported(f"{name} of a long list")
         if name in MOVES:
             return [_unboxed(MOVES[name](parameters, *map(_boxed, inputs)))]
-        if name in SUMS:
+        if name in SUMS and inputs[0].size:
             array = inputs[0]
             for axis in sorted(parameters["axes"], reverse=True):
                 parts = list(np.moveaxis(array, axis, 0))
@@ -163,8 +166,6 @@ class Emitter:
             return [_unboxed(array)]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
-        if any(isinstance(x, Memory) for x in inputs):
-            raise Unsupported(f"{name} of a long list")
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
 
     def _of_memory(self, name: str, parameters: dict, memory, *more):
@@ -267,18 +268,20 @@ def _unboxed(x):
 
 
 def _each(function: Callable, *inputs):
-    """`function` of single vectors, for every element of arrays of one shape."""
-    shape = next((x.shape for x in inputs if isinstance(x, np.ndarray)), None)
-    if shape is None:
+    """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
+    if not any(isinstance(x, np.ndarray) for x in inputs):
         return function(*inputs)
-    found = np.empty(shape, object)
-    for place in np.ndindex(shape):
-        found[place] = function(*(x[place] if isinstance(x, np.ndarray) else x for x in inputs))
+    inputs = np.broadcast_arrays(*map(_boxed, inputs))
+    found = np.empty(inputs[0].shape, object)
+    for place in np.ndindex(found.shape):
+        found[place] = function(*(x[place] for x in inputs))
     return found
 
 
 def _flat(values: list) -> list:
     """The single vectors in vectors and arrays."""
+    if any(isinstance(value, Memory) for value in values):
+        raise Unsupported("a long list that changes")
     return [x for value in values for x in (value.ravel() if isinstance(value, np.ndarray) else [value])]
 
 

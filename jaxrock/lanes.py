@@ -15,7 +15,7 @@ from jax.extend.core import Literal
 try:  # an extra
     from jaxrock import native
     from jaxrock.operations import Unsupported
-except ImportError:
+except (ImportError, OSError):
     native, Unsupported = None, ()
 
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
@@ -90,7 +90,7 @@ class _Batch:
 
             def one(moving):
                 rest = iter(moving)
-                return self._run([next(rest) if new else x for x, new in zip(leaves, batched)])
+                return self(self.structure.unflatten([next(rest) if new else x for x, new in zip(leaves, batched)]))
 
             return jax.lax.map(one, moving)
 

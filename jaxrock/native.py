@@ -71,12 +71,20 @@ class _Machine:
         return self._engine.get_function_address(name)
 
 
-@functools.cache
+_one_at_a_time = threading.RLock()
+
+
 def _machine() -> _Machine:
+    with _one_at_a_time:  # of two machines one would be freed, with all that it has compiled
+        return _made()
+
+
+@functools.cache
+def _made() -> _Machine:
     return _Machine()
 
 
-_registered, _one_at_a_time = set(), threading.Lock()
+_registered = set()
 
 
 def registered(program, shared: list[bool]) -> str:

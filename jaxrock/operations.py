@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
@@ -58,6 +59,8 @@ def _compare(sign: str):
 
 def _extremum(sign: str):
     def operation(e, _, x, y):
+        if _is_flag(x):
+            return e.b.or_(x, y) if sign == ">" else e.b.and_(x, y)
         if not is_float(x):
             return e.b.select(e.b.icmp_signed(sign, x, y), x, y)
         # What is not a number goes through, from either side.
@@ -147,6 +150,11 @@ def _by(function: Callable):
     return operation
 
 
+def _logarithm_of_any(x):
+    inside = jnp.where(x > 0, jnp.where(x < jnp.inf, logarithm(x), jnp.inf), -jnp.inf)
+    return jnp.where(x >= 0, inside, jnp.nan)
+
+
 OPERATIONS: dict[str, Callable] = {
     "add": _arithmetic("fadd", "add"),
     "add_any": _arithmetic("fadd", "add"),
@@ -168,7 +176,7 @@ OPERATIONS: dict[str, Callable] = {
     "is_finite": _is_finite,
     "exp": _by(exponential),
     "expm1": _by(exponential_less_one),
-    "log": _by(logarithm),
+    "log": _by(_logarithm_of_any),
     "sin": _by(lambda x: sine_cosine_of_any(x)[0]),
     "cos": _by(lambda x: sine_cosine_of_any(x)[1]),
     "atan2": lambda e, _, x, y: e.each("atan2", x, y),

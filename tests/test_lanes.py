@@ -82,3 +82,10 @@ def test_more_axes(fast):
         nested((None, 0), (0, None))(x[0], samples), np.asarray(x[0])[:, None] * np.asarray(samples).sum(1)
     )
     np.testing.assert_array_equal(over(x[1, 2], samples[3]), x[1, 2] * samples[3].sum())
+    shape = 2, 3, 4
+    three = jax.vmap(jax.vmap(jax.vmap(over, (0, None)), (None, 0)), (0, None))
+    numbers = jnp.arange(8.0).reshape(2, 4) % 7
+    found = jax.jit(three)(numbers, samples[:3])
+    np.testing.assert_array_equal(
+        found, np.broadcast_to(np.asarray(numbers)[:, None] * np.asarray(samples[:3]).sum(1)[:, None], shape)
+    )

@@ -85,6 +85,22 @@ def test_operations_on_integers(function):
     agree(lambda k: [function(k)], WHOLE)
 
 
+def test_logarithms_at_the_ends():
+    agree(lambda x: [jnp.log(x)], np.array([0.0, -1.0, np.inf, np.nan, 1.0]))
+
+
+def test_flags():
+    flags = np.array([True, False, True, False])
+    agree(lambda a, b: [jnp.maximum(a, b), jnp.minimum(a, b), jnp.max(jnp.stack([a, b]))], flags, ~flags[::-1])
+
+
+def test_without_double_precision():
+    """Numbers in the program are as JAX takes them, not NumPy."""
+    with jax.enable_x64(False):
+        x = jnp.linspace(0, 2, 9)
+        agree(lambda x: [jnp.where(x > 0.5, 2 * x + 1, x * 3), jnp.round(x).astype(int) + 1], x)
+
+
 @pytest.mark.parametrize("function", [jnp.exp, jnp.sin, jnp.cos, jnp.log, lambda x: jnp.arctan2(x, 2.0)])
 def test_functions(function):
     """Our own: to a few units of rounding."""
@@ -176,6 +192,23 @@ def test_small_arrays():
 
     x = np.linspace(0, 2, 19)
     agree(function, x, np.stack([3 + x, 0.1 * x], 1), np.arange(20.0) / 20, shared=(2,), rtol=1e-14)
+
+
+def test_axes_of_one_are_repeated():
+    agree(lambda x, y: [(x[:, None] * y).sum()], np.arange(8.0).reshape(4, 2), np.arange(16.0).reshape(4, 2, 2))
+
+
+def test_arrays_of_what_two_loops_change():
+    def function(x):
+        def outer(a):
+            def inner(b):
+                return jnp.concatenate([a[None], b[None]]).sum() + 1
+
+            return jax.lax.while_loop(lambda b: b < 9, inner, a) + a * x
+
+        return [jax.lax.while_loop(lambda a: a < 50, outer, x)]
+
+    agree(function, np.linspace(1, 2, 11), rtol=1e-14)
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
