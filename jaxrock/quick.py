@@ -1,8 +1,8 @@
-"""The quick pass: Taylor steps in one flat loop without branches, for the many scenes that need no care.
+"""The quick pass: Taylor steps in one flat loop, for the many scenes that need no care.
 
-Every lane does the same work in every step: a series, a certificate of its shape, the turning point within it if
-there is one, and the first level that it meets (ground or saddle), where it is cut. What has no certificate is
-postponed: the series engine, which takes every care, does it afterwards.
+A step is a series, a certificate of its shape, the turning point within it if there is one, and the first level that
+it meets (ground or saddle), where it is cut. What has no certificate is postponed: the series engine, which takes every
+care, does it afterwards.
 """
 
 import functools
@@ -319,7 +319,7 @@ def glance(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> S
         return state.side == 0
 
     if has_many_pieces(pieces):
-        # Among many lanes under a record some rest at any time: all take both steps.
+        # Among many lanes under a record some rest at any time: each takes the step it needs.
         def step(s):
             return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))
 
