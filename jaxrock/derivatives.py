@@ -106,7 +106,7 @@ class _Along(NamedTuple):
         return both
 
     def passes(self, passes: Passes) -> Passes:
-        """The same in parts. Only the careful pass has derivatives, so the quick one postpones all."""
+        """The same in parts. Only the careful pass has derivatives, so there is no quick one."""
 
         def begin(leaves):
             moving, directions, tree = self._start(leaves)
