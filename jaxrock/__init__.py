@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 from jaxrock import closed_form as closed_form, similarity as similarity
 from jaxrock.arcs import Diffrax as Diffrax
+from jaxrock.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.block import Block as Block
+from jaxrock.contact import Contact as Contact, contact_forces as contact_forces
 from jaxrock.critical import (
     Critical as Critical,
     critical_amplitudes as critical_amplitudes,
@@ -35,7 +37,7 @@ from jaxrock.hazard import (
 )
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
-from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
+from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,
     ExponentialPulse as ExponentialPulse,

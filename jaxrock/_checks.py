@@ -12,7 +12,7 @@ import numpy as np
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Inexact
 
-Values = ArrayLike | Sequence[float]
+Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
 
 def as_real(name: str, value: Values) -> Inexact[Array, "..."]:

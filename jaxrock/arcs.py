@@ -15,6 +15,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.derivatives import differentiable
@@ -31,6 +32,7 @@ Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 _SHARE = 4  # usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace
 _MOST_STEPS = 4096  # of one solve
+_GAUSS = tuple(w / 2 for w in (np.polynomial.legendre.leggauss(12)[0] + 1, np.polynomial.legendre.leggauss(12)[1]))
 
 _ADJOINTS = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",
@@ -140,8 +142,8 @@ class ArcStepper(AbstractStepper):
         forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = self.wait(state, forcing.terms, forcing.unit, ORDER, eps, either)
-        rocked = self._rock(state, forcing, ~resting)
+        waited = self.wait(state, forcing.shaking, forcing.unit, ORDER, eps, either)
+        rocked = self.on(state.side)._rock(state, forcing, ~resting)
         after = self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
             return after
@@ -149,7 +151,27 @@ class ArcStepper(AbstractStepper):
         quiet = (state.piece >= scene.pieces) & (after.side != 0)
         turned = quiet & (state.velocity >= 0) & (after.velocity == 0) & ~after.beyond & (after.opening > 0)
         turned = turned & (after.impact_time > scene.motion.end)
+        if scene.far is not None:
+            turned = turned & self._outdone(after)
         return replace(after, done=after.done | turned | (after.status != Status.successful))
+
+    def _outdone(self, state: State) -> Flag:
+        """Whether an asymmetric block that turns back in the free stage will neither fall on the other side, nor come
+        higher or closer to its balance there than before: its energy would not take it to some angle below all that.
+        """
+        scene = self.scene.on(state.side)
+        nodes, weights = (jnp.asarray(values, state.opening.dtype) for values in _GAUSS)
+
+        def energy(table, opening):
+            return opening * jnp.sum(weights * jax.vmap(lambda x: table.restoring(Angle.of(x)))(opening * nodes))
+
+        left = scene.restitution**2 * energy(scene.table, state.opening)
+        outdone = jnp.zeros_like(state.done)
+        for share in (0.999, 0.7, 0.4, 0.1):
+            opening = share * jnp.minimum(state.peak, scene.far.saddle)
+            least = (scene.far.restoring(Angle.of(opening)) / scene.far.restoring_at_rest) ** 2
+            outdone = outdone | ((left < energy(scene.far, opening)) & (least >= state.closeness))
+        return outdone
 
     def finish(self, state: State) -> State:
         """Follow the free stage by the same arcs."""
@@ -163,7 +185,8 @@ class ArcStepper(AbstractStepper):
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
-        arc = Arc.of(self.scene, node, Forcing.of(self.scene, node), self.history)
+        scene = self.scene.on(node.side)
+        arc = Arc.of(scene, node, Forcing.of(scene, node), self.history)
 
         def run(scene):
             return self.engine.solve(*scene, event=None).ys[-1]
@@ -182,7 +205,9 @@ class ArcStepper(AbstractStepper):
         table, v = self.scene.table, state.velocity
         back = jnp.where(bend < 0, -bend, 1.0)
         flight, height = 4 * v / (back * self.scene.p), v * v / back
-        change = forcing.steepest * flight * table.arm_at_rest + 2 * height * (1 + table.restoring_at_rest + back)
+        weight = forcing.shaking.now[1]
+        pull = table.stiffness * (1.0 if weight is None else weight) + table.restoring_at_rest + back
+        change = table.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
         certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
         least = (table.restoring(Angle.of(jnp.minimum(height, table.saddle))) / table.restoring_at_rest) ** 2
         small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
@@ -220,9 +245,7 @@ class ArcStepper(AbstractStepper):
         piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
         steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
         off = 2.5 * engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
-        spread = self.spread_after(
-            state, Angle.of(state.opening), state.side * forcing.terms[0], elapsed, (off[0], off[1])
-        )
+        spread = self.spread_after(state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
         moved = time > 0
         after = replace(
             state,
@@ -249,7 +272,7 @@ class ArcStepper(AbstractStepper):
         quiet = before.piece >= scene.pieces
         forcing = Forcing.of(scene, after)
         reach = jnp.minimum(self.room(after), forcing.reach)
-        after = self.impact(after, ground, y[1], forcing.terms[0], forcing.steepest, reach)
+        after = self.impact(after, ground, y[1], forcing.shaking.now, forcing.steepest, reach)
         down = after.opening >= jnp.pi / 2
         escaped = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
         overturned = escaped | down if scene.falls_flat else escaped

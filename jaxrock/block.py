@@ -83,3 +83,11 @@ class Block(eqx.Module):
     def half_diagonal(self) -> Inexact[Array, "..."]:
         """Distance from pivot to centre of mass of the rectangle of this p under 9.81 m/s^2 [m]."""
         return 3 * GRAVITY / (4 * self.p**2)
+
+
+class Side(eqx.Module):
+    """One side of an asymmetric block, as a model sees it: like a `Block`, but its restitution may exceed 1."""
+
+    alpha: Inexact[Array, "..."]
+    p: Inexact[Array, "..."]
+    restitution: Inexact[Array, "..."]

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxrock._checks import positive
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
 from jaxrock.models import Housner, Model
 from jaxrock.motion import AbstractMotion, Scaled
 from jaxrock.parameters import named, rebuilt
 from jaxrock.response import outcome
-from jaxrock.scene import peak_bound
+from jaxrock.scene import peak_bound, uplift_threshold
 from jaxrock.status import Status
 from jaxrock.sweeps import surface
 
@@ -63,7 +64,7 @@ class Critical(eqx.Module):
 
 
 def critical_amplitudes(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: Model = Housner(),
     *,
@@ -98,7 +99,7 @@ def critical_amplitudes(
 
 
 def critical_durations(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: Model = Housner(),
     *,
@@ -135,7 +136,7 @@ def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
 class _Scenes(eqx.Module):
     """Many scenes: parameters of shape (scenes,), samples of a record as they are."""
 
-    block: Block
+    block: Block | AsymmetricBlock
     motion: AbstractMotion
     threshold: np.ndarray  # [g], (scenes,)
     peak: np.ndarray  # bound of the acceleration [g]
@@ -143,7 +144,7 @@ class _Scenes(eqx.Module):
     single: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, block: Block, motion: AbstractMotion, model: Model) -> "_Scenes":
+    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: Model) -> "_Scenes":
         """Broadcast all parameters against one another."""
         both = block, motion
         numbers = [jnp.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(both) if not _shared(path)]
@@ -160,7 +161,7 @@ class _Scenes(eqx.Module):
         def facts(index):
             block_, motion_ = _pick((block, motion), index)
             return (
-                model.table(block_).threshold,
+                uplift_threshold(block_, model),
                 peak_bound(motion_),
                 jnp.abs(named(block_, motion_)["amplitude"]),
             )
@@ -172,7 +173,9 @@ def _shared(path) -> bool:
     return jax.tree_util.keystr(path).endswith(".samples")
 
 
-def _pick(scenes: tuple[Block, AbstractMotion], index: Int[Array, ""]) -> tuple[Block, AbstractMotion]:
+def _pick(
+    scenes: tuple[Block | AsymmetricBlock, AbstractMotion], index: Int[Array, ""]
+) -> tuple[Block | AsymmetricBlock, AbstractMotion]:
     return jax.tree_util.tree_map_with_path(lambda path, leaf: leaf if _shared(path) else leaf[index], scenes)
 
 

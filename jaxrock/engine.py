@@ -5,6 +5,7 @@ the motion (`finish`), and to evaluate a history (`evaluate`).
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,7 +19,8 @@ from jaxrock._keep import keep, keep_flag
 from jaxrock._pick import pick
 from jaxrock._trigonometry import logarithm
 from jaxrock.models import Angle
-from jaxrock.polynomial import Watch, first_event, rescaled, step_length
+from jaxrock.motion import Shaking
+from jaxrock.polynomial import Watch, first_event, step_length
 from jaxrock.scene import Scene
 from jaxrock.spread import GRAZING, Spread
 from jaxrock.state import State, surpasses
@@ -93,6 +95,10 @@ class AbstractStepper(eqx.Module):
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
 
+    def on(self, side: Scalar) -> "AbstractStepper":
+        """The same for a block that stands on this side."""
+        return self if self.scene.far is None else replace(self, scene=self.scene.on(side))
+
     def time(self, state: State) -> Scalar:
         """Time of a state [s]."""
         return pick(self.scene.knots, state.piece) + state.local
@@ -126,50 +132,61 @@ class AbstractStepper(eqx.Module):
             done=after.done | ~good,
         )
 
-    def wait(self, state: State, forcing: list[Scalar], unit: Scalar, order: int, tolerance: float, branch) -> State:
-        """At rest: go on to the knot, or to where the acceleration exceeds the threshold (`branch`: see `when`)."""
-        scene, threshold = self.scene, self.scene.table.threshold
+    def wait(self, state: State, shaking: Shaking, unit: Scalar, order: int, tolerance: float, branch) -> State:
+        """At rest: go on to the knot, or to where the ground lifts the block (`branch`: see `when`)."""
+        scene, eps = self.scene, jnp.finfo(state.local.dtype).eps
         room = self.room(state) / unit
-        truncated = len(forcing) > order  # else a polynomial: exact
-        length = step_length(forcing, tolerance * threshold, room) if truncated else room
-        never = pick(scene.ceilings, state.piece) <= threshold
+        length = self.longest_wait(shaking, room, order, tolerance)
+        never = pick(scene.drives, state.piece) <= scene.threshold
         # How far a step goes changes nothing: it has no derivative.
         room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
-        scaled = rescaled(forcing, length)
-        fixed, level = jax.lax.stop_gradient((scaled, threshold))
-        slope = fixed[1] if len(fixed) > 1 else jnp.zeros_like(length)
-        gap = level - jnp.abs(fixed[0])
-        slack = 8 * jnp.finfo(gap.dtype).eps * level
-        touching = jnp.abs(gap) <= slack
-        lifts = (gap < -slack) | (touching & (jnp.sign(fixed[0]) * slope > 0))
-
-        def search(found, needed, inside):
-            series = [inside(c) for c in fixed] + [jnp.zeros_like(length)] * (2 - len(fixed))
+        zero = jnp.zeros_like(length)
+        lifted, found = [], []
+        for drive, level in scene.drives_of(shaking.rescaled(length)):
+            fixed, high = jax.lax.stop_gradient((drive, level))
+            slope = fixed[1] if len(fixed) > 1 else zero
+            slack = 8 * eps * high
+            touching = jnp.abs(high - fixed[0]) <= slack
+            lifts = (high - fixed[0] < -slack) | (touching & (slope > 0))
             # A threshold that is touched already counts as passed when it is left behind by more than rounding.
-            one, least = jnp.ones_like(gap), level + jnp.where(touching, 2 * slack, 0.0)
-            watches = [Watch(0, -one, least, True), Watch(0, one, -least, True)]
-            landing = first_event(series, watches, jnp.zeros_like(gap), needed)
-            value, rate = landing.jet[:2]
-            met = (landing.hits[0] | landing.hits[1]) & (jnp.sign(value) * rate > 0)
-            return landing.x, jnp.where(met, value, 0.0)
+            least = high + jnp.where(touching, 2 * slack, 0.0)
 
-        reachable = ~lifts & ~never & (state.side == 0)
-        reachable = reachable & (sum(jnp.abs(c) for c in fixed) >= level)
-        x, passed = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(length)))
-        met, early = passed != 0, x < 1
-        x = jnp.where(met, meet(x, scaled, jnp.sign(passed) * threshold), x)
+            def search(found, needed, inside, fixed=fixed, least=least):
+                series = [inside(c) for c in fixed] + [zero] * (2 - len(fixed))
+                watch = Watch(0, -jnp.ones_like(zero), least, True)
+                landing = first_event(series, [watch], zero, needed)
+                return landing.x, landing.hits[0] & (landing.jet[1] > 0)
+
+            reachable = ~lifts & ~never & (state.side == 0) & (sum(jnp.abs(c) for c in fixed) >= high)
+            x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
+            found.append((jnp.where(met, meet(x, drive, level), x), met, x))
+            lifted.append((lifts, touching))
+        (x, met, at), (x2, met2, at2) = found
+        second = met2 & (~met | (at2 < at))
+        met, early = met | met2, jnp.minimum(at, at2) < 1
+        x = jnp.where(second, x2, jnp.where(met, x, jnp.minimum(at, at2)))
         full = (length >= room) & ~early
         piece, local, over = self.move_on(state, x * length * unit, full)
         piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
-        waited = self.lift(replace(state, piece=piece, local=local, done=over | (never & ~early)), passed, met, met)
-        lifted = self.lift(state, fixed[0], lifts, touching)
-        return jax.tree.map(lambda a, b: jnp.where(lifts, a, b), lifted, waited)
+        waited = replace(state, piece=piece, local=local, done=over | (never & ~early))
+        waited = self.lift(waited, jnp.where(second, -1.0, 1.0), met, met)
+        (first, touching), (other, touching2) = lifted
+        at_once = self.lift(state, jnp.where(first, 1.0, -1.0), first | other, jnp.where(first, touching, touching2))
+        return jax.tree.map(lambda a, b: jnp.where(first | other, a, b), at_once, waited)
 
-    def lift(self, state: State, acceleration, lifts: Flag, continuous: Flag) -> State:
-        """Leave rest where `lifts`: positive acceleration drives negative rotation."""
+    def longest_wait(self, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:
+        """For how long the series tell what the ground does, at most `room`."""
+        length = room
+        for terms, scale in zip(shaking, (self.scene.threshold, 1.0)):
+            if terms is not None and len(terms) > order:  # else a polynomial: exact
+                length = jnp.minimum(length, step_length(terms, tolerance * scale, room))
+        return length
+
+    def lift(self, state: State, side: Scalar, lifts: Flag, continuous: Flag) -> State:
+        """Leave rest to a side where `lifts`; `continuous`: with zero acceleration."""
         return replace(
             state,
-            side=jnp.where(lifts, -jnp.sign(acceleration), state.side),
+            side=jnp.where(lifts, side, state.side),
             uplifting=jnp.where(lifts, continuous, state.uplifting),
             beyond=jnp.where(lifts, False, state.beyond),
             extremal=jnp.where(lifts, False, state.extremal),
@@ -182,21 +199,23 @@ class AbstractStepper(eqx.Module):
         stable manifold even then.
         """
         table = self.scene.table
-        ceiling = pick(self.scene.ceilings, state.piece)
-        hold = table.restoring(angle) + ceiling * table.arm(angle)
-        needed = jnp.where(hold > 0, table.held_manifold(angle, hold, ceiling), 0.0)
+        ceiling, weight = self.scene.most_helpful(state.piece)
+        hold = -table.acceleration(angle, state.velocity, ceiling, weight)
+        needed = jnp.where(hold > 0, table.held_manifold(angle, hold, ceiling, weight), 0.0)
         certain = state.velocity - needed > self.doubt * state.spread.along(1.0, 1.0)
         return state.beyond & (state.velocity >= 0) & certain
 
-    def spread_after(self, state: State, angle: Angle, push: Scalar, elapsed: Scalar, step: tuple) -> Spread:
-        """Errors after `elapsed` seconds of rocking; `push`: side times acceleration [g]; `step`: what the engine's
-        own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
-        stepper, state, angle, push, elapsed, step = jax.lax.stop_gradient((self, state, angle, push, elapsed, step))
+    def spread_after(self, state: State, angle: Angle, ground: tuple, elapsed: Scalar, step: tuple) -> Spread:
+        """Errors after `elapsed` seconds of rocking; `ground`: acceleration [g] and weight (`Shaking.at`); `step`: what
+        the engine's own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
+        given = self, state, angle, ground, elapsed, step
+        stepper, state, angle, (acceleration, weight), elapsed, step = jax.lax.stop_gradient(given)
+        push = state.side * acceleration
         table, p = stepper.scene.table, stepper.scene.p  # an error has no derivative
         eps, time, speed = 2 * jnp.finfo(p.dtype).eps, p * elapsed, jnp.abs(state.velocity)
         clock = eps * p * state.local  # the time of a state is rounded, too
         pull = eps * (table.restoring_at_rest + jnp.abs(push) * table.arm_at_rest)  # of what acceleration is left
-        spread = state.spread.after_flow(table.repulsion(angle, push), time)
+        spread = state.spread.after_flow(table.repulsion(angle, push, weight), time)
         return spread.plus(
             step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
             step[1] + eps * speed + pull * (time + p * state.local),
@@ -208,7 +227,7 @@ class AbstractStepper(eqx.Module):
         # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
         # instant, far from its saddle, is not in balance.
         pull = jnp.maximum(jnp.abs(bend), jnp.abs(table.restoring(Angle.of(opening))))
-        stillness = keep((speed**2 + pull**2) / table.restoring_at_rest**2, state.local)
+        stillness = keep((table.stiffness * speed**2 + pull**2) / table.restoring_at_rest**2, state.local)
         turn = turning & (outward | state.beyond)
         closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
@@ -241,41 +260,49 @@ class AbstractStepper(eqx.Module):
             status=Status.where(undecided, Status.undecided, state.status),
         )
 
-    def impact(self, state: State, hit: Flag, speed: Scalar, forcing: Scalar, steepest: Scalar, reach: Scalar) -> State:
+    def impact(self, state: State, hit: Flag, speed: Scalar, ground: tuple, steepest: tuple, reach: Scalar) -> State:
         """Change side with the restitution; come to rest where the impacts to come no longer matter.
 
-        `forcing`: the ground acceleration [g]; for `reach` seconds from now it changes by `steepest` [g/s] at most.
+        `ground`: acceleration [g] and weight (`Shaking.at`); for `reach` seconds from now horizontal and vertical
+        acceleration change by `steepest` [g/s] at most.
 
         After an impact at speed v the block hops for 2 v/a, a the deceleration on that side; the hops to come last
-        2 v (1/a + e/a')/(1 - e^2). They are replaced by rest where it is certain that they end before the forcing
-        has changed by half of the weaker deceleration (so all speeds stay below e^(1/2) those of constant forcing,
-        and all hops end within four times that time), and that none is higher, faster or closer to overturning than
-        what has been. Each is slower by e, so those above the rounding of alpha can be counted.
+        2 v (1/a + e'/a')/(1 - e e'), with a' and e' on the other side. They are replaced by rest where it is certain
+        that they end before the forcing has changed by half of the weaker deceleration (so all speeds stay below
+        e^(1/2) those of constant forcing, and all hops end within four times that time), and that none is higher,
+        faster or closer to overturning than what has been. Each is slower by e, so those above the rounding of alpha
+        can be counted.
         """
-        scene, table, e = self.scene, self.scene.table, self.scene.restitution
-        rebound = e * jnp.abs(speed)
-        side = -state.side
-        push = side * forcing * table.arm_at_rest
-        here, there = table.restoring_at_rest + push, table.restoring_at_rest - push
+        scene, (table, ahead), side = self.scene, self.scene.tables, -state.side
+        e, back = scene.restitution, scene.far_restitution
+        rebound, rest = e * jnp.abs(speed), Angle(jnp.zeros_like(speed), 0.0, 1.0)
+        # Decelerations on the side to come, and on the one before.
+        here = -ahead.acceleration(rest, rebound, side * ground[0], ground[1])
+        there = -table.acceleration(rest, speed, state.side * ground[0], ground[1])
         spread = jax.lax.stop_gradient(state.spread.after_impact(speed, -there, -here, e))
-        slowed = hit & (here < 0)  # by the forcing, before it hit the ground: without that it would have turned back
-        depth = speed**2 / (2 * jnp.where(slowed, -here, 1.0))
+        slowed = hit & (there < 0)  # by the forcing, before it hit the ground: without that it would have turned back
+        depth = speed**2 / (2 * jnp.where(slowed, -there, 1.0))
         weaker = jnp.minimum(here, there)
-        held = (weaker > 0) & (e < 1)
+        held = (weaker > 0) & (e * back < 1)
         here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
-        remaining = 2 * rebound * (1 / here + e / there) / jnp.where(held, 1 - e * e, 1.0)
+        remaining = 2 * rebound * (1 / here + back / there) / jnp.where(held, 1 - e * back, 1.0)
         window = 4 * remaining / scene.p
-        dies = held & (steepest * window * table.arm_at_rest <= weaker / 2) & (window <= reach)
+        change = functools.reduce(jnp.maximum, [t.change_at_rest(*steepest) for t in scene.own_tables])
+        dies = held & (change * window <= weaker / 2) & (window <= reach)
         # Speed of a hop of rounding height; a history shows the hops down to there.
         low = jnp.sqrt(100 * jnp.finfo(scene.p.dtype).eps * scene.alpha * jnp.minimum(here, there))
         if self.history:
             dies = dies & (rebound <= low)
         else:
-            highest = 3 * rebound**2 * jnp.maximum(1 / here, e * e / there)
-            least = (table.restoring(Angle.of(jnp.minimum(highest, table.saddle))) / table.restoring_at_rest) ** 2
-            dies = dies & (highest <= state.peak) & (2 * rebound <= state.fastest) & (least >= state.closeness)
+            highest = 3 * rebound**2 * jnp.maximum(1 / here, back * back / there)
+            fastest = 2 * rebound if scene.far is None else 2 * rebound * jnp.maximum(back, 1)
+            dies = dies & (highest <= state.peak) & (fastest <= state.fastest)
+            for t in scene.own_tables:
+                least = (t.restoring(Angle.of(jnp.minimum(highest, t.saddle))) / t.restoring_at_rest) ** 2
+                dies = dies & (least >= state.closeness)
         rests = keep_flag(hit & (dies | (rebound == 0)), state.local)
-        more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(e, 1e-3, 1 - 1e-9))
+        slower = e if scene.far is None else jnp.sqrt(e * back)  # from hop to hop, in the mean
+        more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
         more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
         wait = jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
         return replace(

@@ -5,13 +5,17 @@ equation is dx/dtau = sqrt(sin^2 x - k^2): its times are elliptic integrals of t
 in the linear model), its peaks and verdicts follow from the energy.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock.models import Table
+from jaxrock.models import Angle, Table
+from jaxrock.state import surpasses
 
 Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
 
 
 class FreeStage(eqx.Module):
@@ -21,6 +25,8 @@ class FreeStage(eqx.Module):
     impacts: Int[Array, ""]  # before overturning; a safe block's infinitely many are not counted
     peak: Scalar  # largest opening angle still to come
     peak_time: Scalar
+    peak_steepness: Scalar  # -2 (change of the energy with the peak)
+    peak_share: Scalar  # of an error of the present energy that is left in that of the peak
     fastest: Scalar  # largest speed still to come
     closeness: Scalar  # smallest squared distance from standing still in balance still to come
     deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
@@ -67,11 +73,21 @@ def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, 
     return jnp.where(speed > jnp.abs(manifold), above, below)
 
 
-def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Scalar, moving) -> FreeStage:
+class Visit(NamedTuple):
+    """A stay on one side, until the impact that ends it."""
+
+    table: Table
+    restitution: Scalar  # of that impact
+
+
+def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving) -> FreeStage:
     """Follow an unforced block to its end.
 
     **Arguments:**
 
+    - `visits`: the sides on which it stands, first the present one, as many as may decide: two for a symmetric block,
+      three for an asymmetric one. Of these the last decides nothing if the block moves outward now: it comes back to
+      the same side with less energy.
     - `opening`: opening angle [rad], 0 or more.
     - `velocity`: its derivative with respect to p t [rad], positive outward.
     - `moving`: whether the block rocks at all; if not, nothing comes.
@@ -80,67 +96,148 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
 
     **Source:** the energy argument of Housner (1963); D&D (2012), 4.12 corrected.
     """
-    rate = jnp.sqrt(table.stiffness)
-    weight = table.stiffness / table.restoring_at_rest**2  # velocity^2 to closeness
-    gap = table.saddle - opening
-    speed = velocity / rate
-    manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
-    deficit = (manifold - speed) * (manifold + speed)  # 2 (energy of the saddle - energy)
+    present = _present(visits[0].table, opening, velocity, moving)
+    outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
+    arrival, since = present.arrival, present.impact_time
+    found = [present]
+    shares = [share]
+    for i, visit in enumerate(visits[1:], 1):
+        happens = moving & ~lost & ~outward if i == len(visits) - 1 else moving & ~lost
+        rebound = visits[i - 1].restitution * arrival
+        share = share * visits[i - 1].restitution ** 2
+        stay = _after_impact(visit.table, rebound, since, happens)
+        lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
+        arrival, since = rebound, stay.impact_time
+        found.append(stay)
+        shares.append(share)
 
-    def turning_closeness(gap2):
-        """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
-        return weight * table.stiffness * (gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2)
-
-    def peak_of(deficit):
-        missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
-        return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
-
-    lost_at_once = moving & (speed > manifold)
-    outward = speed > 0
-    arrival2 = jnp.maximum(base**2 - deficit, 0.0)  # squared speed at the next impact
-    arrival = jnp.sqrt(arrival2)
-    rebound = restitution * arrival
-    lost_after_impact = moving & ~lost_at_once & ~outward & (rebound > base)
-
-    # Peak: of this excursion if it is outward, else of the one after the impact.
-    deficit_after = (base - rebound) * (base + rebound)
-    peak_deficit = jnp.where(outward, deficit, deficit_after)
-    swings = moving & ~lost_at_once & ~lost_after_impact
-    safe_speed = jnp.where(swings & outward, speed, 0.0)
-    safe_manifold = jnp.where(swings & outward, manifold, base)
-    time_out = _time_to_peak(table, gap, safe_manifold, safe_speed)
-    falling = swings & ~outward
-    inward = jnp.where(falling, -speed, 0.0)
-    time_in = _time_to_impact(
-        table,
-        jnp.where(falling, gap, table.saddle),
-        jnp.where(falling, manifold, base),
-        inward,
-        base,
-        jnp.where(falling, arrival, 0.0),
-    ) + _time_to_peak(table, table.saddle, base, jnp.where(falling, rebound, 0.0))
-
-    # Closeness: crossing the saddle at a speed, or turning at an acceleration.
-    crossing = -deficit * weight
-    turning = turning_closeness(jnp.abs(peak_deficit))
-    past_inward = (gap < 0) & (speed < 0)
-    lost_closeness = jnp.where(gap > 0, crossing, jnp.where(past_inward, turning_closeness(jnp.abs(deficit)), jnp.inf))
-    safe_closeness = jnp.where(past_inward, jnp.minimum(crossing, turning), turning)
-    closeness = jnp.where(
-        lost_at_once,
-        lost_closeness,
-        jnp.where(lost_after_impact, -deficit_after * weight, jnp.where(swings, safe_closeness, jnp.inf)),
-    )
-    impacts_first = ~lost_at_once & ~outward
-    turns_inside = past_inward & (jnp.abs(deficit) < jnp.abs(deficit_after))  # it has to pass the saddle first
-    decisive = jnp.where(impacts_first & ~turns_inside, deficit_after, deficit)
+    # Of several peaks the highest, of equal ones the first.
+    peak, peak_time, steepness, peak_share = jnp.zeros_like(opening), present.peak_time, jnp.ones_like(opening), share
+    closeness = deficit = narrowest = jnp.full_like(opening, jnp.inf)
+    decisive, fastest = share, jnp.zeros_like(opening)
+    for stay, share in zip(found, shares):
+        higher = stay.safe & surpasses(stay.peak, peak)
+        peak_time = jnp.where(higher, stay.peak_time, peak_time)
+        steepness = jnp.where(higher, stay.steepness, steepness)
+        peak_share = jnp.where(higher, share, peak_share)
+        peak = jnp.where(stay.safe & (stay.peak > peak), stay.peak, peak)
+        fastest = jnp.where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
+        closeness = jnp.where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
+        # In terms of the present energy.
+        missing = jnp.abs(stay.deficit) / jnp.where(share > 0, share, 1.0)
+        narrow = stay.decides & (missing < narrowest)
+        deficit, decisive = jnp.where(narrow, stay.deficit, deficit), jnp.where(narrow, share, decisive)
+        narrowest = jnp.where(narrow, missing, narrowest)
     return FreeStage(
-        overturned=lost_at_once | lost_after_impact,
-        impacts=lost_after_impact.astype(jnp.int32),
-        peak=jnp.where(swings, peak_of(peak_deficit), 0.0),
-        peak_time=jnp.where(outward, time_out, time_in) / rate,
-        fastest=jnp.where(swings, arrival * rate, 0.0),
+        overturned=lost,
+        impacts=impacts.astype(jnp.int32),
+        peak=jnp.where(lost, 0.0, peak),
+        peak_time=peak_time,
+        peak_steepness=steepness,
+        peak_share=peak_share,
+        fastest=jnp.where(lost, 0.0, fastest),
         closeness=closeness,
-        deficit=decisive * table.stiffness,
-        share=jnp.where(impacts_first & ~turns_inside, restitution**2, 1.0),
+        deficit=deficit,
+        share=decisive,
+    )
+
+
+class _Stay(NamedTuple):
+    """What a block does on one side in the free stage."""
+
+    lost: Flag  # it falls on this side
+    safe: Flag  # it moves there and comes back
+    decides: Flag  # whether it falls here is decided by its energy
+    deficit: Scalar  # 2 (energy of the saddle - energy)
+    peak: Scalar  # highest opening angle; zero if it only comes back
+    peak_time: Scalar
+    steepness: Scalar  # -2 (change of energy with the peak)
+    closeness: Scalar
+    arrival: Scalar  # speed at the impact that ends it
+    impact_time: Scalar
+
+
+def _peak_of(table: Table, deficit: Scalar) -> Scalar:
+    """Opening angle at which a block turns back; deficit: 4 sin^2(half the angle to the saddle), or its square."""
+    missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
+    return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
+
+
+def _weight(table: Table) -> Scalar:
+    """What makes squared velocities and accelerations, in units of the stiffness, a closeness."""
+    return (table.stiffness / table.restoring_at_rest) ** 2
+
+
+def _turning_closeness(table: Table, gap2: Scalar) -> Scalar:
+    """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+    shape = gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2
+    return _weight(table) * shape
+
+
+def _steepness(table: Table, peak: Scalar) -> Scalar:
+    return 2 * jnp.abs(table.restoring(Angle.of(peak)))
+
+
+def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag) -> _Stay:
+    """The stay on the side where the block is when the motion ends."""
+    rate = jnp.sqrt(table.stiffness)
+    gap, speed = table.saddle - opening, velocity / rate
+    manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
+    deficit = (manifold - speed) * (manifold + speed)
+    lost, outward = moving & (speed > manifold), speed > 0
+    safe = moving & ~lost
+    arrival = jnp.sqrt(jnp.maximum(base**2 - deficit, 0.0))
+    rises, falls = safe & outward, safe & ~outward
+    out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
+    back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0))
+    falling = _time_to_impact(
+        table,
+        jnp.where(falls, gap, table.saddle),
+        jnp.where(falls, manifold, base),
+        jnp.where(falls, -speed, 0.0),
+        base,
+        jnp.where(falls, arrival, 0.0),
+    )
+    # Closeness: crossing the saddle at a speed, or turning at an acceleration.
+    crossing, turning = -deficit * _weight(table), _turning_closeness(table, jnp.abs(deficit))
+    past_inward = (gap < 0) & (speed < 0)
+    lost_closeness = jnp.where(gap > 0, crossing, jnp.where(past_inward, turning, jnp.inf))
+    safe_closeness = jnp.where(outward, turning, jnp.where(past_inward, crossing, jnp.inf))
+    peak = _peak_of(table, jnp.where(rises, deficit, base**2))
+    return _Stay(
+        lost=lost,
+        safe=safe,
+        decides=moving & (outward | past_inward),
+        deficit=deficit * table.stiffness,
+        peak=jnp.where(rises, peak, 0.0),
+        peak_time=out / rate,
+        steepness=_steepness(table, peak),
+        closeness=jnp.where(lost, lost_closeness, jnp.where(safe, safe_closeness, jnp.inf)),
+        arrival=arrival * rate,
+        impact_time=jnp.where(outward, out + back, falling) / rate,
+    )
+
+
+def _after_impact(table: Table, rebound: Scalar, since: Scalar, happens: Flag) -> _Stay:
+    """The stay on a side on which the block comes to stand at time `since` with a velocity; if it happens at all."""
+    rate = jnp.sqrt(table.stiffness)
+    base, speed = table.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
+    deficit = (base - speed) * (base + speed)
+    lost = happens & (speed > base)
+    safe = happens & ~lost
+    out = _time_to_peak(table, table.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+    peak = _peak_of(table, jnp.where(safe, deficit, base**2))
+    turning = _turning_closeness(table, jnp.abs(deficit))
+    crossing = -deficit * _weight(table)
+    return _Stay(
+        lost=lost,
+        safe=safe,
+        decides=happens,
+        deficit=deficit * table.stiffness,
+        peak=peak,
+        peak_time=since + out,
+        steepness=_steepness(table, peak),
+        closeness=jnp.where(lost, crossing, jnp.where(safe, turning, jnp.inf)),
+        arrival=rebound,
+        impact_time=since + 2 * out,
     )

@@ -9,8 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.models import Angle, EquationTable, Table
-from jaxrock.motion import AbstractMotion
-from jaxrock.polynomial import horner
+from jaxrock.motion import AbstractMotion, Shaking
 from jaxrock.scene import Scene
 from jaxrock.state import State
 
@@ -23,11 +22,11 @@ ORDER = 12  # of the motion's series: for waiting, for coming to rest, and of pi
 
 
 class Forcing(eqx.Module):
-    """The ground acceleration [g] along an arc. A piece that is a polynomial (of a record) is taken as that, so that
+    """The ground's acceleration [g] along an arc. A piece that is a polynomial (of a record) is taken as that, so that
     a right-hand side does not look into the record."""
 
     motion: AbstractMotion | None  # None: the terms are all
-    terms: list[Scalar]  # Taylor coefficients in time/unit
+    shaking: Shaking  # Taylor coefficients in time/unit
     unit: Scalar  # [s]
     piece: Int[Array, ""]
     local: Scalar
@@ -37,17 +36,19 @@ class Forcing(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, state: State) -> "Forcing":
         """The forcing from a state on."""
-        terms, unit = scene.forcing(state.piece, state.local, ORDER)
+        shaking, unit = scene.shaking(state.piece, state.local, ORDER)
         piece = jnp.minimum(state.piece, scene.pieces - 1)
-        motion = scene.motion if len(terms) > ORDER else None
-        return cls(motion, terms, unit, piece, state.local, state.piece < scene.pieces, scene.p)
+        polynomial = all(terms is None or len(terms) <= ORDER for terms in shaking)
+        motion = None if polynomial else scene.motion
+        return cls(motion, shaking, unit, piece, state.local, state.piece < scene.pieces, scene.p)
 
-    def __call__(self, time: Scalar) -> Scalar:
-        """Acceleration [g] at p t since the state."""
+    def __call__(self, time: Scalar) -> tuple[Scalar, Scalar | None]:
+        """Acceleration [g] and weight (`Shaking.at`) at p t since the state."""
         if self.motion is None:
-            return horner(self.terms, time / (self.p * self.unit))
-        value = self.motion.series(self.piece, self.local + time / self.p, 1 / self.p, 0)[0]
-        return jnp.where(self.during, value, 0.0)
+            return self.shaking.at(time / (self.p * self.unit))
+        here = self.piece, self.local + time / self.p, 1 / self.p, 0
+        values = Shaking(self.motion.series(*here), self.motion.vertical_series(*here))
+        return values.each(lambda terms: [jnp.where(self.during, u, 0.0) for u in terms]).now
 
     @property
     def reach(self) -> Scalar:
@@ -55,10 +56,9 @@ class Forcing(eqx.Module):
         return 0.25 * self.unit
 
     @property
-    def steepest(self) -> Scalar:
-        """Bound of how fast the acceleration changes within `reach` [g/s]."""
-        rates = (k * jnp.abs(c) * 0.25 ** (k - 1) for k, c in enumerate(self.terms) if k > 0)
-        return sum(rates, start=jnp.zeros_like(self.unit)) / self.unit
+    def steepest(self) -> tuple[Scalar, Scalar | None]:
+        """Bounds of how fast the acceleration changes within `reach`, horizontal and vertical [g/s]."""
+        return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
 
 
 class Arc(eqx.Module):
@@ -72,7 +72,7 @@ class Arc(eqx.Module):
     bend: Scalar  # acceleration at the start
     jerk: Scalar  # its derivative
     noise: Scalar  # what rounding may make of an acceleration that is zero
-    ceiling: Scalar  # bound of the acceleration from here to the end [g]
+    helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
     hop: Flag  # too small for its turning point to matter, and certain to come back
     flat: Flag  # whether a rotation of pi/2 ends it
 
@@ -82,11 +82,11 @@ class Arc(eqx.Module):
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
         state = start.side, start.opening, start.velocity
-        arc = cls(scene.table, forcing, *state, zero, zero, zero, scene.ceilings[start.piece], no, flat)
+        arc = cls(scene.table, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
         y = jnp.stack([start.opening, start.velocity])
         bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
-        pull = scene.table.restoring_at_rest + jnp.abs(forcing(zero)) * scene.table.arm_at_rest
+        pull = scene.table.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.table.arm_at_rest
         noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
         leaving = (start.opening == 0) & (start.velocity == 0)
         bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
@@ -95,7 +95,8 @@ class Arc(eqx.Module):
 
     def acceleration(self, time: Scalar, y: Pair) -> Scalar:
         """Acceleration of the opening angle per (p t)^2."""
-        return self.table.acceleration(Angle.of(y[0]), y[1], self.side * self.forcing(time))
+        acceleration, weight = self.forcing(time)
+        return self.table.acceleration(Angle.of(y[0]), y[1], self.side * acceleration, weight)
 
     def flow(self, time: Scalar, y: Pair) -> Pair:
         """The right-hand side."""
@@ -132,14 +133,16 @@ class Arc(eqx.Module):
         extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
         saddle = _guard(time, y[0] - self.table.saddle, [self.gap(self.opening), self.velocity], True)
         held = self._hold(self.opening)
-        escape = _guard(time, self._hold(y[0]), [held], (self.ceiling > 0) & (held > 0))
+        forced = self.helpful[0] > 0
+        if self.helpful[1] is not None:
+            forced = forced | (self.helpful[1] != 1)
+        escape = _guard(time, self._hold(y[0]), [held], forced & (held > 0))
         flat = _guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat)
         return jnp.stack([ground, turn, extremum, saddle, escape, flat])
 
     def _hold(self, opening: Scalar) -> Scalar:
         """What the restoring moment and the most helpful forcing do against overturning."""
-        angle = Angle.of(opening)
-        return self.table.restoring(angle) + self.ceiling * self.table.arm(angle)
+        return -self.table.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag) -> Scalar:

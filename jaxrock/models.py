@@ -10,6 +10,7 @@ A coefficient that a model does not have is None, so that nothing is computed fo
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
 from jaxrock._trigonometry import sine_cosine
-from jaxrock.block import Block
+from jaxrock.block import Block, Side
 
 Scalar = Inexact[ArrayLike, ""]
 
@@ -26,6 +27,10 @@ Scalar = Inexact[ArrayLike, ""]
 def _sum_of(*products: tuple[Scalar | None, Scalar | float]) -> Scalar | float:
     """Add coefficient times function for the coefficients that exist."""
     return sum((c * f for c, f in products if c is not None), start=0.0)
+
+
+def _weighed(weight: Scalar | None, moment: Scalar) -> Scalar:
+    return moment if weight is None else weight * moment
 
 
 class Angle(NamedTuple):
@@ -51,6 +56,16 @@ class Table(eqx.Module):
     m0: Scalar | None = None
     ms: Scalar | None = None
     mc: Scalar | None = None
+    known_saddle: Scalar | None = None  # where it is known beforehand, because the coefficients change on the way
+
+    @property
+    def bare(self) -> "Table":
+        """The coefficients alone."""
+        return self if self.known_saddle is None else replace(self, known_saddle=None)
+
+    def times(self, factor: Scalar) -> "Table":
+        """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
+        return replace(jax.tree.map(lambda c: factor * c, self.bare), known_saddle=self.saddle)
 
     @property
     def trigonometric(self) -> bool:
@@ -65,14 +80,14 @@ class Table(eqx.Module):
         """Overturning moment over m R u g at an opening angle."""
         return _sum_of((self.m0, 1.0), (self.ms, angle.sine), (self.mc, angle.cosine))
 
-    def repulsion(self, angle: Angle, push: Scalar) -> Scalar:
-        """How fast nearby angles part, per angle: minus the derivative of restoring + push arm (push = side u)."""
-        restoring = _sum_of((self.r1, 1.0), (self.rs, angle.cosine), (self.rc, -angle.sine))
+    def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """How fast nearby angles part, per angle: minus the derivative of weight restoring + push arm."""
+        restoring = _weighed(weight, _sum_of((self.r1, 1.0), (self.rs, angle.cosine), (self.rc, -angle.sine)))
         return -restoring - push * _sum_of((self.ms, angle.cosine), (self.mc, -angle.sine))
 
-    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2; push = side u."""
-        return -(self.restoring(angle) + push * self.arm(angle))
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        return -(_weighed(weight, self.restoring(angle)) + push * self.arm(angle))
 
     @property
     def restoring_at_rest(self) -> Scalar:
@@ -89,6 +104,11 @@ class Table(eqx.Module):
         """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
         return self.restoring_at_rest / self.arm_at_rest
 
+    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
+        """By how much the acceleration just after uplift changes with that of the ground, at most."""
+        change = horizontal * self.arm_at_rest
+        return change if vertical is None else change + vertical * self.restoring_at_rest
+
     @property
     def sinusoidal(self) -> bool:
         """Whether the restoring moment is one sinusoid (else it is one straight line)."""
@@ -102,6 +122,8 @@ class Table(eqx.Module):
     @property
     def saddle(self) -> Scalar:
         """Opening angle of the unstable equilibrium: the block balances on its corner [rad]."""
+        if self.known_saddle is not None:
+            return self.known_saddle
         return jnp.arctan2(self.rc, -self.rs) if self.sinusoidal else -self.r0 / self.r1
 
     def manifold(self, x: Scalar) -> Scalar:
@@ -111,21 +133,25 @@ class Table(eqx.Module):
         distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
-    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar) -> Scalar:
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Outward velocity over p that just reaches the unstable equilibrium under a constant forcing.
 
-        `push`: the forcing against it [g]; `hold`: restoring moment and forcing at the angle, positive.
+        `push`: the forcing against it [g]; `weight`: 1 + vertical acceleration (None: 1); `hold`: restoring moment and
+        forcing at the angle, positive.
         """
+        factor = 1.0 if weight is None else weight
         if not self.sinusoidal:
-            return hold / jnp.sqrt(-self.r1)
-        stiffness = jnp.hypot(_sum_of((self.rs, 1.0), (self.ms, push)), _sum_of((self.rc, 1.0), (self.mc, push)))
-        return jnp.sqrt(2 * jnp.maximum(stiffness - self.repulsion(angle, push), 0.0))
+            slope = -_weighed(weight, self.r1)
+            # Without weight the forcing alone brings it back.
+            return jnp.where(slope > 0, hold / jnp.sqrt(jnp.where(slope > 0, slope, 1.0)), jnp.inf)
+        across, along = _sum_of((self.rs, factor), (self.ms, push)), _sum_of((self.rc, factor), (self.mc, push))
+        return jnp.sqrt(2 * jnp.maximum(jnp.hypot(across, along) - self.repulsion(angle, push, weight), 0.0))
 
 
 class Housner(eqx.Module):
     """The rigid rectangular block with its exact nonlinear equation (Housner 1963; D&D 2012, 2.1-2.2)."""
 
-    def table(self, block: Block) -> Table:
+    def table(self, block: Block | Side) -> Table:
         """sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x; its arm is cos(alpha - x)."""
         sine, cosine = sine_cosine(block.alpha)  # a quotient of XLA's own becomes a tangent, which LLVM may lack
         return Table(rs=-cosine, rc=sine, ms=sine, mc=cosine)
@@ -139,7 +165,7 @@ class Housner(eqx.Module):
 class Linear(eqx.Module):
     """The slender block linearised about its corner (D&D 2012, 3.1-3.2; Voyagaki et al. 2012, 2.3)."""
 
-    def table(self, block: Block) -> Table:
+    def table(self, block: Block | Side) -> Table:
         """Restoring moment alpha - x, arm 1."""
         one = jnp.ones_like(block.alpha)
         return Table(r0=block.alpha, r1=-one, m0=one)
@@ -190,7 +216,7 @@ class Equation(eqx.Module):
         self._acceleration = _Function(parts)
         self.falls_flat = falls_flat
 
-    def table(self, block: Block) -> "EquationTable":
+    def table(self, block: Block | Side) -> "EquationTable":
         """What the engine asks of the equation, for one block."""
         return EquationTable(self._acceleration, block)
 
@@ -205,7 +231,7 @@ class _Function(eqx.Module):
         self.modules = tuple(f if isinstance(f, eqx.Module) else None for f in parts)
         self.plain = tuple(None if isinstance(f, eqx.Module) else f for f in parts)
 
-    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block) -> Scalar:
+    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block | Side) -> Scalar:
         parts = [m if m is not None else f for m, f in zip(self.modules, self.plain)]
         if len(parts) == 1:
             return parts[0](x, v, push, block)
@@ -218,13 +244,14 @@ class EquationTable(eqx.Module):
     """What a `Table` tells, for a model that is given as functions."""
 
     function: _Function
-    block: Block
+    block: Block | Side
+    factor: Scalar | None  # of all accelerations (see `Table.times`)
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
 
-    def __init__(self, function: _Function, block: Block):
-        self.function, self.block = function, block
+    def __init__(self, function: _Function, block: Block | Side, factor: Scalar | None = None):
+        self.function, self.block, self.factor = function, block, factor
         zero = Angle.of(jnp.zeros_like(block.alpha))
         self.restoring_at_rest = eqx.error_if(
             self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."
@@ -234,31 +261,49 @@ class EquationTable(eqx.Module):
         )
         self.saddle = self._first_zero()
 
-    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
-        """Acceleration of the opening angle per (p t)^2; push = side u."""
-        return jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        value = self._value(angle, velocity, push)
+        return value if weight is None else value - (weight - 1) * self.restoring(angle)
+
+    def _value(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
+        value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
+        return value if self.factor is None else self.factor * value
+
+    def times(self, factor: Scalar) -> "EquationTable":
+        """As in `Table`."""
+        return EquationTable(self.function, self.block, factor)
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
         zero = jnp.zeros_like(angle.value)
-        return -self.acceleration(angle, zero, zero)
+        return -self._value(angle, zero, zero)
 
     def arm(self, angle: Angle) -> Scalar:
         """Overturning moment over m R u g at an opening angle."""
         zero = jnp.zeros_like(angle.value)
-        return self.acceleration(angle, zero, zero) - self.acceleration(angle, zero, zero + 1)
+        return self._value(angle, zero, zero) - self._value(angle, zero, zero + 1)
 
-    def repulsion(self, angle: Angle, push: Scalar) -> Scalar:
+    def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """How fast nearby angles part, per angle."""
         zero = jnp.zeros_like(angle.value)
-        return jax.grad(lambda x: self.acceleration(Angle.of(x), zero, push))(angle.value)
+        return jax.grad(lambda x: self.acceleration(Angle.of(x), zero, push, weight))(angle.value)
+
+    @property
+    def stiffness(self) -> Scalar:
+        """One, or the factor: nothing else is known of the shape of the function."""
+        return jnp.ones_like(self.saddle) if self.factor is None else self.factor
 
     @property
     def threshold(self) -> Scalar:
         """Ground acceleration at which the block uplifts [g]."""
         return self.restoring_at_rest / self.arm_at_rest
 
-    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar) -> Scalar:
+    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
+        """As in `Table`."""
+        return Table.change_at_rest(self, horizontal, vertical)
+
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As in `Table`; infinite, because nothing is known of the function beyond this angle."""
         return jnp.full_like(hold, jnp.inf)
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.motion import AbstractMotion, Scaled
 from jaxrock.scene import peak_bound
@@ -12,32 +13,38 @@ from jaxrock.scene import peak_bound
 Real = Inexact[Array, "..."]
 
 
-def named(block: Block, motion: AbstractMotion) -> dict[str, Real]:
+_FREE = {Block: ("alpha", "p"), AsymmetricBlock: ("alpha1", "alpha2", "p1", "inertia_ratio")}
+# What may follow from the others where it is not given.
+_FOLLOWING = {Block: ("restitution",), AsymmetricBlock: ("radius_ratio", "restitution1", "restitution2")}
+
+
+def named(block: Block | AsymmetricBlock, motion: AbstractMotion) -> dict[str, Real]:
     """Parameters and their values.
 
-    `alpha`, `p`, `restitution`, and those of the motion as it names them; `amplitude` [g] also of a motion that does
-    not (a record): its peak, which scales all of it.
+    Those of the block (`alpha`, `p`, `restitution`; of an asymmetric one `alpha1`, `alpha2`, `p1`, `inertia_ratio`,
+    `radius_ratio`, `restitution1`, `restitution2`), and those of the motion as it names them; `amplitude` [g] also of a
+    motion that does not (a record): its peak, which scales all of it.
     """
-    found = {"alpha": block.alpha, "p": block.p, "restitution": block.restitution}
+    found = {name: getattr(block, name) for name in (*_FREE[type(block)], *_FOLLOWING[type(block)])}
     found |= _numbers(motion)
     return found if "amplitude" in found else found | {"amplitude": peak_bound(motion)}
 
 
-def rebuilt(block: Block, motion: AbstractMotion, values: dict[str, Real]) -> tuple[Block, AbstractMotion]:
+def rebuilt(
+    block: Block | AsymmetricBlock, motion: AbstractMotion, values: dict[str, Real]
+) -> tuple[Block | AsymmetricBlock, AbstractMotion]:
     """The scene with other values of its parameters, and derivatives by them.
 
-    A restitution that follows alpha goes on doing so: `restitution` then is what is added to a restitution of its own.
+    What follows from other parameters goes on doing so (a restitution, from alpha): its value then is what is added to
+    one of its own.
     """
-    restitution = values["restitution"]
-    if block.given_restitution is None:
-        follows = eqx.tree_at(lambda b: b.alpha, block, values["alpha"]).restitution
-        restitution = follows + (restitution - jax.lax.stop_gradient(block.restitution))
-    new = eqx.tree_at(
-        lambda b: (b.alpha, b.p, b.given_restitution),
-        block,
-        (values["alpha"], values["p"], restitution),
-        is_leaf=lambda x: x is None,
-    )
+    free = _FREE[type(block)]
+    new = eqx.tree_at(lambda b: [getattr(b, name) for name in free], block, [values[name] for name in free])
+    for name in _FOLLOWING[type(block)]:
+        value, given = values[name], f"given_{name}"
+        if getattr(block, given) is None:
+            value = getattr(new, name) + (value - jax.lax.stop_gradient(getattr(block, name)))
+        new = eqx.tree_at(lambda b, given=given: getattr(b, given), new, value, is_leaf=lambda x: x is None)
     names = list(_numbers(motion))
     changed = eqx.tree_at(lambda m: [_at(m, name) for name in names], motion, [values[name] for name in names])
     if "amplitude" not in names:

@@ -194,9 +194,10 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
 
 def advance(stepper: TaylorStepper, state: State) -> State:
     """One step of a lane that rocks."""
+    stepper = stepper.on(state.side)
     scene, order = stepper.scene, stepper.order
-    forcing, unit = stepper.forcing(state.piece, state.local)
-    start = stepper.start(state, forcing, unit)
+    shaking, unit = stepper.shaking(state.piece, state.local)
+    start = stepper.start(state, shaking, unit)
     stretch, one = start.stretch, start.one
     terms = expand(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
@@ -213,7 +214,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     full = part.full & ~(crossing | impact | meeting.stops)
     piece, local, over = stepper.move_on(state, elapsed, full)
     errors = 2 * least, 2 * least * jnp.maximum(order / (at * stretch), 1.0)
-    spread = stepper.spread_after(state, start.angle, state.side * forcing[0], elapsed, errors)
+    spread = stepper.spread_after(state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
         spread=jax.tree.map(lambda x: keep_by(x, one), spread),
@@ -240,9 +241,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     noted = replace(_if(meeting.turned | crossing, note, passed), piece=piece, local=local)
 
     def strike():
-        slopes = [k * jnp.abs(c) for k, c in enumerate(forcing)][1:] or [jnp.zeros_like(at)]
-        steepest = horner(slopes, part.length) / unit
-        return stepper.impact(noted, impact, velocity, horner(forcing, at), steepest, (part.length - at) * unit)
+        steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(part.length))
+        return stepper.impact(noted, impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
 
     hit = _if(impact, strike, noted)
     escaped = stepper.escaped(state, start.angle)
@@ -258,34 +258,40 @@ def advance(stepper: TaylorStepper, state: State) -> State:
 
 def wait(stepper: TaylorStepper, state: State) -> State:
     """At rest: go on to where the acceleration exceeds the threshold, or as far as that is certain not to happen."""
-    scene, threshold, order = stepper.scene, stepper.scene.table.threshold, stepper.order
-    forcing, unit = stepper.forcing(state.piece, state.local)
+    scene, order = stepper.scene, stepper.order
+    shaking, unit = stepper.shaking(state.piece, state.local)
     room = jnp.minimum(stepper.room(state), 32 * unit) / unit
-    length = room
-    if len(forcing) > order:
-        length = jnp.minimum(room, step_length(forcing, stepper.tolerance * threshold, room))
-    slope = derivative(forcing) or [jnp.zeros_like(length)]
-    rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
-    share = jnp.zeros_like(length)
-    for part in (*reversed(_SHORTER), 1.0):
-        share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
-    share = jnp.where((slope[0] == 0) & (len(forcing) <= 2), 1.0, share)
+    length = stepper.longest_wait(shaking, room, order, stepper.tolerance)
+    drives = scene.drives_of(shaking)
+    share = jnp.ones_like(length)
+    for drive, _ in drives if shaking.vertical is not None else drives[:1]:
+        share = jnp.minimum(share, _monotone(drive, length))
     full = (length >= room * (1 - 1e-9)) & (share == 1)
     length = keep(share * length, state.local)
-    end = horner(forcing, length)
-    slack = 8 * jnp.finfo(end.dtype).eps * threshold
-    lifts = jnp.abs(forcing[0]) > threshold + slack
-    touching = ~lifts & (jnp.abs(forcing[0]) >= threshold - slack)
-    meets = ~lifts & (jnp.abs(end) > threshold + slack)
-    level = jnp.sign(end) * threshold
-    missing = [forcing[0] - level, *forcing[1:]]
-    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, missing[0], slope[0], end - level)
+
+    def of(drive, level):
+        """Whether this drive lifts the block at once, touches the threshold, or passes it in the step."""
+        end, slack = horner(drive, length), 8 * jnp.finfo(length.dtype).eps * level
+        lifts = drive[0] > level + slack
+        touching = ~lifts & (drive[0] >= level - slack)
+        return lifts, touching, ~lifts & (end > level + slack), end
+
+    (drive, level), (drive2, level2) = drives
+    (lifts, touching, meets, end), (lifts2, touching2, meets2, end2) = of(drive, level), of(drive2, level2)
+    second = lifts2 | meets2
+    missing = [jnp.where(second, b, a) for a, b in zip(drive, drive2)]
+    missing[0] = jnp.where(second, drive2[0] - level2, drive[0] - level)
+    slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
+    ending = jnp.where(second, end2 - level2, end - level)
+    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, missing[0], slope, ending)
+    both = (lifts | meets) & second
+    lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
     elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit
     full = full & ~meets & ~lifts
     piece, local, over = stepper.move_on(state, elapsed, full)
     piece = jnp.where(full & ~over, scene.after_quiet(piece), piece)
-    never = pick(scene.ceilings, state.piece) <= threshold
-    unclear = ~never & ((share == 0) | touching | (meets & (last > 1e-7 * x)))
+    never = pick(scene.drives, state.piece) <= scene.threshold
+    unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & (last > 1e-7 * x)))
     rested = replace(
         state,
         piece=piece,
@@ -294,7 +300,18 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         steps=state.steps + 1,
         status=Status.where(unclear, Status.undecided, state.status),
     )
-    return stepper.lift(rested, jnp.where(lifts, forcing[0], level), (lifts | meets) & ~unclear & ~never, meets)
+    side = jnp.where(second, -1.0, 1.0)
+    return stepper.lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
+
+
+def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
+    """The share of a step within which a series is certain to keep growing or falling."""
+    slope = derivative(terms) or [jnp.zeros_like(length)]
+    rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
+    share = jnp.zeros_like(length)
+    for part in (*reversed(_SHORTER), 1.0):
+        share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
+    return jnp.where((slope[0] == 0) & (len(terms) <= 2), 1.0, share)
 
 
 def most_steps(pieces: int) -> int:

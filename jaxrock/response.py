@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import Values, as_real, checked, scalar
 from jaxrock.arcs import Diffrax
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.derivatives import differentiable
 from jaxrock.engine import AbstractEngine, AbstractStepper
@@ -52,7 +53,9 @@ class Outcome(eqx.Module):
     alpha stands for sin alpha.)
     Its sign is the verdict's; it passes through zero smoothly where a block comes to balance on its corner, and
     jumps where the shaking itself throws a stocky block flat, or where an impact or a turning point is only just
-    grazed. Long after the start of a record the passage through zero can be narrower than the last digit.
+    grazed. Of an asymmetric block it is the smaller of both sides'; where a block that just stands on its stronger
+    side comes back to fall on the other, it touches zero from below and jumps. Long after the start of a record the
+    passage through zero can be narrower than the last digit.
     """
 
     max_rotation: Scalar
@@ -169,7 +172,7 @@ def _traced(value) -> bool:
 
 
 def outcome(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: Model = Housner(),
     *,
@@ -180,8 +183,8 @@ def outcome(
 
     **Arguments:**
 
-    - `block`: a `Block` of scalars (use `jax.vmap` for many).
-    - `motion`: any motion; the ground rests after its end.
+    - `block`: a `Block` or `AsymmetricBlock` of scalars (use `jax.vmap` for many).
+    - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
     - `model`: `Housner()` (nonlinear), `Linear()`, or an `Equation` of your own.
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
     - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
@@ -194,7 +197,7 @@ def outcome(
 
 
 def simulate(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: Model = Housner(),
     *,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._checks import Values, as_real, not_nan
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
 from jaxrock.models import Housner, Model
@@ -16,6 +17,7 @@ from jaxrock.motion import AbstractMotion
 from jaxrock.parameters import named, rebuilt
 from jaxrock.pulses import ExponentialPulse
 from jaxrock.response import Outcome, outcome
+from jaxrock.scene import uplift_threshold
 from jaxrock.spectra import axis
 from jaxrock.status import Status
 from jaxrock.sweeps import surface
@@ -67,7 +69,7 @@ _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 
 
 def sensitivity(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: Model = Housner(),
     *,
@@ -97,7 +99,7 @@ def sensitivity(
     valid = (found.status == Status.successful) & found.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]
-    strength = model.table(block).threshold / jnp.abs(amplitude)
+    strength = uplift_threshold(block, model) / jnp.abs(amplitude)
     rows = jnp.concatenate([rows, -rows[:, [names.index("amplitude")]] * amplitude / strength], axis=1)
     independent = len(names)
     values = jnp.append(values, strength)

@@ -19,14 +19,14 @@ from jaxtyping import ArrayLike, Bool, Inexact, Int
 from jaxrock._keep import keep, unseen_one
 from jaxrock.derivatives import differentiable, with_derivatives_of
 from jaxrock.engine import AbstractEngine, AbstractStepper, either, when
-from jaxrock.free import free_stage
+from jaxrock.free import Visit, free_stage
 from jaxrock.models import Angle, Table
+from jaxrock.motion import Shaking
 from jaxrock.polynomial import (
     Watch,
     derivative,
     fall_bound,
     first_event,
-    horner,
     jet,
     keeps_sign,
     last_size,
@@ -103,41 +103,46 @@ class TaylorStepper(AbstractStepper):
     doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
     taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through
 
-    def forcing(self, piece: Int[ArrayLike, ""], local: Scalar) -> tuple[list[Scalar], Scalar]:
+    def shaking(self, piece: Int[ArrayLike, ""], local: Scalar) -> tuple[Shaking, Scalar]:
         """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
-        terms, unit = self.scene.forcing(piece, local, self.order)
-        return [keep(u, local) for u in terms], keep(unit, local)
+        shaking, unit = self.scene.shaking(piece, local, self.order)
+        return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
 
     def advance(self, state: State) -> State:
         """One step of a lane."""
-        return self.step(state, *self.forcing(state.piece, state.local))
+        return self.step(state, *self.shaking(state.piece, state.local))
 
-    def step(self, state: State, forcing: list[Scalar], unit: Scalar) -> State:
+    def step(self, state: State, shaking: Shaking, unit: Scalar) -> State:
         """One step of a lane: waiting at rest, or rocking."""
         resting = state.side == 0
-        waited = self.wait(state, forcing, unit, self.order, self.tolerance, when)
-        rocked = self._rock(state, forcing, unit, ~resting)
+        waited = self.wait(state, shaking, unit, self.order, self.tolerance, when)
+        rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
         return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
-        return on_tape(self.step, self.forcing, state, budget)
+        return on_tape(self.step, self.shaking, state, budget)
 
     def finish(self, state: State) -> State:
         """The free stage by energy."""
-        scene, table = self.scene, self.scene.table
+        scene = self.scene.on(state.side)
+        table = scene.table
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
         # In reverse mode what is not taken (roots of zero) would spoil what is.
         follow = differentiable(lambda scene: free_stage(*scene)) if self.taped else lambda scene: free_stage(*scene)
-        stage = follow((table, scene.restitution, state.opening, state.velocity, moving))
+        here, there = Visit(table, scene.restitution), Visit(scene.tables[1], scene.far_restitution)
+        visits = (here, there) if scene.far is None else (here, there, here)
+        stage = follow((visits, state.opening, state.velocity, moving))
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
         beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
         # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
         slope = -2 * table.restoring(Angle.of(state.opening))
-        off = state.spread.along(slope, -2 * state.velocity) * stage.share
-        toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off) & (state.status == Status.successful)
-        steepness = 2 * jnp.abs(table.restoring(Angle.of(stage.peak)))
+        off = state.spread.along(slope, -2 * state.velocity)
+        toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
+        toss_up = toss_up & (state.status == Status.successful)
+        flat = stage.peak_steepness <= 0
+        error = jnp.where(flat, off, off * stage.peak_share / jnp.where(flat, 1.0, stage.peak_steepness))
         return replace(
             state,
             overturned=state.overturned | stage.overturned,
@@ -147,7 +152,7 @@ class TaylorStepper(AbstractStepper):
             second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
             peak_clearance=jnp.where(stage.peak > state.peak, state.clearance, state.peak_clearance),
             peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
-            error=jax.lax.stop_gradient(jnp.where(higher, off / jnp.where(steepness > 0, steepness, 1.0), state.error)),
+            error=jax.lax.stop_gradient(jnp.where(higher, error, state.error)),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
@@ -155,29 +160,29 @@ class TaylorStepper(AbstractStepper):
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Expand the series again about the node."""
-        forcing, unit = self.forcing(node.piece, node.local)
-        coefficients = expand(self.start(node, forcing, unit), self.order).opening
+        shaking, unit = self.shaking(node.piece, node.local)
+        coefficients = expand(self.on(node.side).start(node, shaking, unit), self.order).opening
         opening, speed = jet(coefficients, elapsed / unit, 1)
         return opening, speed / unit
 
-    def start(self, state: State, forcing: list[Scalar], unit: Scalar) -> Start:
+    def start(self, state: State, shaking: Shaking, unit: Scalar) -> Start:
         """Where a step starts, with time in `unit`."""
         stretch = keep(self.scene.p * unit, state.local)
         return Start(
-            self.scene.table,
+            self.scene.table.bare,
             stretch,
             state.side,
             state.uplifting,
             state.opening,
             state.velocity * stretch,
-            forcing,
+            shaking,
             unseen_one(state.local),
         )
 
-    def _rock(self, state: State, forcing, unit, rocking: Flag) -> State:
+    def _rock(self, state: State, shaking: Shaking, unit: Scalar, rocking: Flag) -> State:
         """Rocking: a Taylor step, cut at the first event."""
         # More room than a step can take is as good as endless, and finite.
-        start, room = self.start(state, forcing, unit), jnp.minimum(self.room(state), 32 * unit) / unit
+        start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
         # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
         stepper, before, *rest = jax.lax.stop_gradient((self, state, start, room))
         step = _Step.of(stepper, before, *rest, rocking)
@@ -205,7 +210,7 @@ class TaylorStepper(AbstractStepper):
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
         passed = replace(
             state,
-            spread=self.spread_after(state, start.angle, state.side * forcing[0], elapsed, missed),
+            spread=self.spread_after(state, start.angle, shaking.now, elapsed, missed),
             piece=piece,
             local=local,
             opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
@@ -250,19 +255,18 @@ class TaylorStepper(AbstractStepper):
     def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
         """Let the event at the end of a step happen."""
         length, opening, velocity = (inside(value) for value in end)
-        forcing = [inside(u) for u in start.forcing]
-        acceleration = horner(forcing, length)
+        shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
+        acceleration, weight = shaking.at(length)
         # The value of the series, with the derivatives of the equation.
-        law = self.scene.table.acceleration(Angle.of(opening), velocity, state.side * acceleration)
+        law = self.scene.table.acceleration(Angle.of(opening), velocity, state.side * acceleration, weight)
         bend = with_derivatives_of(cut.bend / start.stretch**2, law)
         impact, turning, _, crossing, _ = cut.hits
         noted = self.note(passed, step.signs[0] > 0, turning, crossing, opening, velocity, bend)
-        scaled = rescaled(forcing, step.length)
         unit = start.stretch / self.scene.p
-        lasts = jnp.where(step.length > 0, step.length * unit, 1.0)
-        steepest = sum(k * jnp.abs(c) for k, c in enumerate(scaled)) / lasts
+        steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(step.length))
         reach = (step.length - length) * unit
-        return self.impact(noted, impact, velocity, acceleration, *jax.lax.stop_gradient((steepest, reach)))
+        ground = acceleration, weight
+        return self.impact(noted, impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
         """Whether a turning point in this step could be a new peak, or closer to overturning than before."""

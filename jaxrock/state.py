@@ -51,11 +51,13 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     opening, outward = jnp.abs(rotation), side * velocity
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
-    beyond = opening >= scene.table.saddle
+    table = scene.on(side).table
+    beyond = opening >= table.saddle
     # Squared distance from standing still in balance, for a block that starts beyond it.
-    stillness = (outward**2 + scene.table.restoring(Angle.of(opening)) ** 2) / scene.table.restoring_at_rest**2
+    pull = table.restoring(Angle.of(opening))
+    stillness = (table.stiffness * outward**2 + pull**2) / table.restoring_at_rest**2
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
-    unlifted = jnp.maximum(2 - scene.ceilings[0] / scene.table.threshold, 1)
+    unlifted = jnp.maximum(2 - scene.drives[0] / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
     finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
     return State(

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
-from jaxrock.polynomial import shifted
 from jaxrock.state import State
 
 Scalar = Inexact[ArrayLike, ""]
@@ -19,21 +18,21 @@ Scalar = Inexact[ArrayLike, ""]
 _BETWEEN = 64  # steps between checkpoints
 
 
-def on_tape(advance: Callable, forcing: Callable, state: State, budget: int) -> tuple[State, State]:
-    """Repeat `state = advance(state, *forcing(piece, local))` until done, at most `budget` times.
+def on_tape(advance: Callable, shaking: Callable, state: State, budget: int) -> tuple[State, State]:
+    """Repeat `state = advance(state, *shaking(piece, local))` until done, at most `budget` times.
 
-    `forcing` gives the motion's series at a time `local` after the start of a piece, and their unit of time.
+    `shaking` gives the motion's series at a time `local` after the start of a piece, and their unit of time.
 
     **Returns:** the last state, and the states before every step (past the end the last one, again and again).
     """
     stretches = -(-budget // _BETWEEN)
-    pieces, locals_ = _starts(lambda s: advance(s, *forcing(s.piece, s.local)), state, stretches * _BETWEEN)
-    terms, units = jax.vmap(forcing)(pieces, locals_)
+    pieces, locals_ = _starts(lambda s: advance(s, *shaking(s.piece, s.local)), state, stretches * _BETWEEN)
+    terms, units = jax.vmap(shaking)(pieces, locals_)
 
     def step(state, here):
         local, terms, unit = here
         # The same numbers; but the start of the step moves with what came before.
-        moved = shifted(terms, (state.local - local) / unit)
+        moved = terms.shifted((state.local - local) / unit)
         after = advance(state, moved, unit)
         return jax.tree.map(lambda a, b: jnp.where(state.done, a, b), state, after), state
 

@@ -15,6 +15,7 @@ from jaxtyping import ArrayLike, Bool, Inexact
 
 from jaxrock._keep import keep, keep_by
 from jaxrock.models import Angle, Table
+from jaxrock.motion import Shaking
 from jaxrock.polynomial import derivative, horner
 
 Scalar = Inexact[ArrayLike, ""]
@@ -30,7 +31,7 @@ class Start(NamedTuple):
     uplifting: Flag  # leaves rest with zero acceleration
     opening: Scalar
     speed: Scalar  # of the opening, per unit
-    forcing: list[Scalar]  # Taylor coefficients of the ground acceleration [g]
+    shaking: Shaking  # Taylor coefficients of the ground acceleration [g]
     one: Scalar  # see `keep_by`
 
     @property
@@ -54,12 +55,13 @@ class End(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """Taylor coefficients about a start: the opening angle, its sine and cosine, and the arm."""
+    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and the restoring moment."""
 
     opening: list[Scalar]
     sine: list[Scalar]
     cosine: list[Scalar]
     arm: list[Scalar | None]
+    restoring: list[Scalar | None]
 
 
 def _total(terms: list):
@@ -75,13 +77,13 @@ def _product(first: list, second: list, k: int):
 
 
 def expand(start: Start, order: int) -> Expansion:
-    """Series of x'' = -stretch^2 [restoring(x) + side u arm(x)].
+    """Series of x'' = -stretch^2 [(1 + v) restoring(x) + side u arm(x)].
 
     The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
     """
     table, angle, one = start.table, start.angle, start.one
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
-    sine, cosine, arms = [angle.sine], [angle.cosine], []
+    sine, cosine, arms, restorings = [angle.sine], [angle.cosine], [], []
     scale = keep_by(-(start.stretch**2), one)
     for k in range(order - 1):
         if table.trigonometric and k > 0:
@@ -97,15 +99,18 @@ def expand(start: Start, order: int) -> Expansion:
 
         arm = combine(table.m0, None, table.ms, table.mc, k)
         arms.append(arm if arm is None else keep_by(arm, one))
-        moment = _product(start.forcing, arms, k) * start.side
+        moment = _product(start.shaking.horizontal, arms, k) * start.side
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
+        restorings.append(restoring)
         moment = moment if restoring is None else moment + restoring
+        if start.shaking.vertical is not None:
+            moment = moment + _product(start.shaking.vertical, restorings, k)
         term = keep_by(scale * moment * (1 / ((k + 1) * (k + 2))), one)
         if k == 0:
             term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)
         slopes.append((k + 2) * term)
-    return Expansion(x, sine, cosine, arms)
+    return Expansion(x, sine, cosine, arms, restorings)
 
 
 class _Weights(NamedTuple):
@@ -123,6 +128,13 @@ def _is_zero(tangent) -> bool:
     return isinstance(tangent, SymbolicZero)
 
 
+def _weighed(terms: list, vertical: list[Scalar] | None, order: int, like: Scalar) -> list:
+    """A series times 1 + v."""
+    if vertical is None:
+        return terms
+    return [terms[k] + keep(_product(vertical, terms, k), like) for k in range(order - 1)]
+
+
 def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weights]:
     """Weights of the angle and of the velocity at the end.
 
@@ -134,18 +146,24 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     series = expand(start, order)
     moments = range(order - 1)
     trigonometric = table.ms is not None or table.mc is not None
-    pushed_sine = [keep(_product(start.forcing, series.sine, k), stretch) for k in moments if trigonometric]
-    pushed_cosine = [keep(_product(start.forcing, series.cosine, k), stretch) for k in moments if trigonometric]
+    horizontal, vertical = start.shaking
+    pushed_sine = [keep(_product(horizontal, series.sine, k), stretch) for k in moments if trigonometric]
+    pushed_cosine = [keep(_product(horizontal, series.cosine, k), stretch) for k in moments if trigonometric]
+    constant = [jnp.ones_like(length)] + [None if vertical is None else jnp.zeros_like(length)] * (order - 2)
+    # What multiplies r0, r1, rs and rc.
+    unity, line, sine, cosine = (
+        _weighed(terms, vertical, order, stretch) for terms in (constant, series.opening, series.sine, series.cosine)
+    )
 
     def pull(k):
-        terms = [] if table.r1 is None or k > 0 else [table.r1]
-        terms += [] if table.rs is None else [table.rs * series.cosine[k]]
-        terms += [] if table.rc is None else [-table.rc * series.sine[k]]
+        terms = [] if table.r1 is None or unity[k] is None else [table.r1 * unity[k]]
+        terms += [] if table.rs is None else [table.rs * cosine[k]]
+        terms += [] if table.rc is None else [-table.rc * sine[k]]
         terms += [] if table.ms is None else [side * table.ms * pushed_cosine[k]]
         terms += [] if table.mc is None else [-side * table.mc * pushed_sine[k]]
         return keep(sum(terms), stretch)
 
-    pulls = [pull(k) for k in (moments if table.trigonometric else range(1))]
+    pulls = [pull(k) for k in (moments if table.trigonometric or vertical is not None else range(1))]
     powers = [jnp.ones_like(length)]
     for _ in range(order):
         powers.append(keep(powers[-1] * length, stretch))
@@ -167,22 +185,29 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
             pairs = [(of_source[k], series.arm[k - j]) for k in range(j, order - 1)]
             return side * sum((w * arm for w, arm in pairs if arm is not None), start=jnp.zeros_like(length))
 
+        def of_weight(j):
+            pairs = [(of_source[k], series.restoring[k - j]) for k in range(j, order - 1)]
+            return sum((w * moment for w, moment in pairs if moment is not None), start=jnp.zeros_like(length))
+
         def coefficient(present, terms):
             return None if present is None else along(terms)
 
         weights = Table(
-            r0=coefficient(table.r0, powers[:1]),
-            r1=coefficient(table.r1, series.opening),
-            rs=coefficient(table.rs, series.sine),
-            rc=coefficient(table.rc, series.cosine),
-            m0=coefficient(table.m0, [side * u for u in start.forcing]),
+            r0=coefficient(table.r0, [term for term in unity if term is not None]),
+            r1=coefficient(table.r1, line),
+            rs=coefficient(table.rs, sine),
+            rc=coefficient(table.rc, cosine),
+            m0=coefficient(table.m0, [side * u for u in horizontal]),
             ms=coefficient(table.ms, [side * u for u in pushed_sine]),
             mc=coefficient(table.mc, [side * u for u in pushed_cosine]),
         )
         zero = jnp.zeros_like(length)
         of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
-        of_forcing = [of_push(j) for j in range(len(start.forcing))]
-        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_forcing, zero))
+        of_shaking = Shaking(
+            [of_push(j) for j in range(len(horizontal))],
+            None if vertical is None else [of_weight(j) for j in range(len(vertical))],
+        )
+        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_shaking, zero))
 
     return of(powers), of([jnp.zeros_like(length)] + [k * power for k, power in enumerate(powers[:-1], 1)])
 
@@ -201,8 +226,9 @@ def _(order, primals, tangents):
     (start, end), (d_start, d_end) = primals, tangents
     length, opening, speed = arrive(order, start, end)  # with derivatives of their own, for those of higher order
     d_opening, d_speed = (weights.times(d_start) for weights in _weights(order, start, length))
-    angle, push = Angle.of(opening), start.side * horner(start.forcing, length)
-    bend = -(start.stretch**2) * (start.table.restoring(angle) + push * start.table.arm(angle))
+    acceleration, weight = start.shaking.at(length)
+    law = start.table.acceleration(Angle.of(opening), speed, start.side * acceleration, weight)
+    bend = start.stretch**2 * law
     d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinite, for the status to tell.
     d_length = jnp.where(end.full, d_room, 0.0)

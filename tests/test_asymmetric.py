@@ -1,0 +1,269 @@
+"""Asymmetric blocks and vertical motion, against references in 25 digits and against symmetric blocks."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+
+FOLDER = Path(__file__).parents[1] / "benchmarks" / "asymmetric_references"
+CASES = json.loads((FOLDER / "asymmetric.json").read_text())["cases"] if FOLDER.exists() else []
+
+
+def motion_of(kind, *n):
+    """A motion of the references."""
+    if kind == "record":
+        return n[2] * rk.Record(n[0], n[1])
+    return {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "rectangle": rk.RectangularPulse}[kind](*n)
+
+
+def scene(case):
+    """Block, motion, model and initial state of a case."""
+    b = case["block"]
+    kappa = b["p"][0] ** 2 * b["R"][0] / b["gravity"]
+    block = rk.AsymmetricBlock.from_frequencies(*b["alpha"], *b["p"], kappa, tuple(b["restitution"]))
+    motion = motion_of(*case["horizontal"])
+    if case["vertical"] is not None:
+        motion = motion.with_vertical(case["vertical"]["factor"] * motion_of(*case["vertical"]["motion"]))
+    return block, motion, rk.Linear() if case["model"] == "linear" else rk.Housner(), tuple(case["initial"])
+
+
+def check(case, found):
+    """Compare an outcome with the reference, within its conditioning."""
+    r, name = case["result"], case["name"]
+    assert int(found.status._value) == 0, name
+    assert bool(found.overturned) == bool(r["overturned"]), name
+    assert (float(found.margin) < 0) == bool(r["overturned"]), name
+    if not r["overturned"]:
+        within = 2e-14 * max(r["condition"]["max_rotation"], 10)
+        assert abs(float(found.max_rotation) - float(r["max_rotation"])) <= within, name
+        assert abs(float(found.max_velocity) / float(r["max_velocity"]) - 1) <= 1e-11, name
+
+
+SINES = [case for case in CASES if case["horizontal"][0] == "sine" and not case["vertical"]]
+SINES = [case for case in SINES if case["model"] == "housner" and case["initial"] == [0, 0]]
+OTHERS = [case for case in CASES if case not in SINES]
+needs_references = pytest.mark.skipif(not CASES, reason="the references lie in the repository")
+
+
+@jax.jit
+def under_sine(block, motion, initial=(0.0, 0.0)):
+    """Outcomes of many asymmetric blocks, each under a sine pulse: one program for most of this file."""
+    return jax.vmap(lambda block, motion: rk.outcome(block, motion, initial=initial))(block, motion)
+
+
+def stack(scenes, size=64):
+    """Scenes as arrays, the last one repeated."""
+    scenes = list(scenes) + [scenes[-1]] * (size - len(scenes))
+    return jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *scenes)
+
+
+def stack_columns(numbers, size=64):
+    """Scenes from columns of parameters, the last one repeated."""
+    x = jnp.asarray(np.pad(numbers, ((0, 0), (0, size - numbers.shape[1])), mode="edge"))
+    return rk.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:])
+
+
+def drawn(size=64):
+    """Random blocks and pulses of even difficulty."""
+    draw = np.random.default_rng(1).uniform
+    alpha1, alpha2 = draw(0.1, 0.5, (2, size))
+    block = rk.AsymmetricBlock(alpha1, alpha2, draw(1.5, 4, size), draw(0.6, 0.9, size))
+    return block, rk.SinePulse(draw(0.1, 1.2, size), draw(0.4, 2.0, size))
+
+
+@needs_references
+def test_sine_pulses():
+    """Safe and overturned on either side, at once, after impacts, in the free stage; restitutions above 1."""
+    found = under_sine(*stack([scene(case)[:2] for case in SINES]))
+    for i, case in enumerate(SINES):
+        check(case, jax.tree.map(lambda x, i=i: x[i], found))
+
+
+@needs_references
+@pytest.mark.slow
+@pytest.mark.parametrize("case", OTHERS, ids=lambda case: case["name"])
+def test_other_motions(case):
+    """Exponential and rectangular pulses, records, vertical motion, free rocking, the linear model, near boundaries."""
+    block, motion, model, initial = scene(case)
+    check(case, rk.outcome(block, motion, model, initial=initial))
+
+
+@needs_references
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SINES + OTHERS, ids=lambda case: case["name"])
+def test_diffrax_engine(case):
+    """The other engine agrees to its tolerance, or says that it cannot tell."""
+    block, motion, model, initial = scene(case)
+    found = rk.outcome(block, motion, model, initial=initial, engine=rk.Diffrax(rtol=1e-10))
+    if int(found.status._value) != 0:
+        assert "1e-6" in case["name"]  # the scenes beside a boundary
+        return
+    assert bool(found.overturned) == bool(case["result"]["overturned"])
+    if not found.overturned:
+        np.testing.assert_allclose(found.max_rotation, float(case["result"]["max_rotation"]), rtol=1e-6)
+
+
+def test_equal_sides_are_a_block():
+    """With equal sides an asymmetric block is Housner's, also in its restitution; every number to rounding."""
+    block, motion = drawn()
+    p = block.p1
+    equal = rk.AsymmetricBlock(block.alpha1, block.alpha1, p, jnp.full_like(p, 0.75))
+    found, wanted = (
+        under_sine(equal, motion),
+        jax.vmap(lambda b, m: rk.outcome(b, m))(rk.Block(block.alpha1, p), motion),
+    )
+    np.testing.assert_array_equal(found.status._value, wanted.status._value)
+    for name in ("overturned", "impact_count"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    for name in ("max_rotation", "max_velocity", "time_of_max", "margin"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-10, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(equal.restitution1, rk.Block(block.alpha1, p).restitution, rtol=1e-14)
+
+
+def test_mirrored():
+    """A block seen from behind does the same under the reversed motion."""
+    block, motion = drawn()
+    found = under_sine(block, motion)
+    behind = under_sine(jax.vmap(lambda b: b.mirrored)(block), rk.SinePulse(-motion.amplitude, motion.period))
+    assert 0.2 < np.mean(found.overturned) < 0.8
+    np.testing.assert_array_equal(found.overturned, behind.overturned)
+    for name in ("max_rotation", "max_velocity", "margin"):
+        np.testing.assert_allclose(getattr(found, name), getattr(behind, name), rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_derivatives():
+    """By every parameter of block and pulse, against central differences of the values."""
+    block, motion = jax.tree.map(lambda x: x[:4], drawn())
+    numbers = [block.alpha1, block.alpha2, block.p1, block.inertia_ratio, 0.4 * motion.amplitude, motion.period]
+
+    def margin(x):
+        return rk.outcome(rk.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:])).margin
+
+    found = jax.vmap(jax.jacfwd(margin), in_axes=1)(jnp.stack(numbers))
+    steps = 1e-5 * np.concatenate([np.eye(6), -np.eye(6)])
+    moved = (np.stack(numbers)[:, :, None] + steps.T[:, None, :]).reshape(6, 48)
+    values = under_sine(*stack_columns(moved)).margin[:48].reshape(4, 2, 6)
+    np.testing.assert_allclose(found, (values[:, 0] - values[:, 1]) / 2e-5, rtol=2e-6, atol=2e-7)
+    assert np.abs(found).max() > 0.1
+
+
+@needs_references
+def test_vertical_motion_and_contact_forces():
+    """A sine with a vertical sine: history, forces of the ground, what friction it needs."""
+    case = next(case for case in CASES if case["name"] == "sine and vertical sine")
+    (block, motion, model, initial), result = scene(case), case["result"]
+    check(case, rk.outcome(block, motion, model, initial=initial))
+    response = rk.simulate(block, motion, model, initial=initial, duration=float(motion.end))
+    assert response.impact_times.size == result["impacts_in_motion"]
+    time, rotation, velocity = np.array(result["states"], float).T
+    np.testing.assert_allclose(response(time), [rotation, velocity], rtol=0, atol=1e-14)
+    found = rk.contact_forces(response, block)
+    times, horizontal, normal, friction = np.array(result["forces"], float).T
+    for name, values in {"horizontal": horizontal, "normal": normal, "friction": friction}.items():
+        np.testing.assert_allclose(np.interp(times, found.time, getattr(found, name)), values, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(found.largest_friction, float(result["friction_max"][0]), rtol=1e-6)
+    np.testing.assert_allclose(found.least_normal, float(result["normal_min"][0]), rtol=1e-6)
+    np.testing.assert_allclose(found.friction_at_impact, [float(x) for x in result["impact_friction"]], rtol=1e-12)
+    assert found.keeps_contact and found.sticks(0.3) and not found.sticks(0.2)
+
+
+def test_housner_friction():
+    """A rectangle needs 3 tan(alpha)/(4 + tan^2(alpha)) at an impact; one that never moves, the motion's peak."""
+    block, motion = (
+        rk.AsymmetricBlock(0.3, 0.3, 2.0),
+        rk.SinePulse(0.2, 1.0).with_vertical(0.0 * rk.SinePulse(1.0, 1.0)),
+    )
+    found = rk.contact_forces(rk.simulate(block, motion, duration=1.0), block)
+    tangent = np.tan(0.3)
+    np.testing.assert_allclose(found.friction_at_impact, 3 * tangent / (4 + tangent**2), rtol=1e-14)
+    np.testing.assert_allclose(found.largest_friction, 0.2, rtol=1e-3)
+    assert found.least_normal == 1
+
+
+@needs_references
+@pytest.mark.slow
+def test_critical_amplitudes():
+    """Boundaries between safe and overturned; those between the sides are none."""
+    for entry in json.loads((FOLDER / "asymmetric.json").read_text())["critical_amplitudes"]:
+        if not entry["name"].startswith("safe") or entry["model"] != "housner" or entry["motion"][0] != "sine":
+            continue
+        case = {**entry, "horizontal": ["sine", 1.0, entry["motion"][2]], "vertical": None, "initial": [0, 0]}
+        block, motion, model, _ = scene(case)
+        low, high = sorted(entry["bracket"])
+        sign = np.sign(low)
+        found = rk.critical_amplitudes(
+            block, sign * motion, model, low=min(abs(low), abs(high)), high=max(abs(low), abs(high))
+        )
+        ends = np.asarray(found.amplitudes)
+        assert np.min(np.abs(sign * ends[np.isfinite(ends)] - float(entry["amplitude"]))) < 1e-10
+
+
+OUTLINES = json.loads((FOLDER / "geometry.json").read_text()) if CASES else {}
+
+
+@needs_references
+@pytest.mark.parametrize("name", OUTLINES)
+def test_outlines(name):
+    """Corners, slenderness, frequency parameters and restitutions of polygons, against exact fractions."""
+    wanted = OUTLINES[name]
+    vertices = np.array(wanted["vertices"])
+    supports = tuple(
+        int(np.flatnonzero((vertices == wanted[corner]).all(1))[0]) for corner in ("right_corner", "left_corner")
+    )
+    rolls = min(contact - float(a) for contact, a in zip(wanted["next_contact"], wanted["alpha"])) < 0
+    if rolls:
+        with pytest.raises(ValueError, match="rolls onto that face"):
+            rk.AsymmetricBlock.from_outline(vertices, supports=supports)
+        return
+    for points in (vertices, vertices[::-1]):
+        positions = supports if points is vertices else tuple(len(vertices) - 1 - i for i in supports)
+        block = rk.AsymmetricBlock.from_outline(points, supports=positions, gravity=wanted["gravity"])
+        # Far from the origin the coordinates themselves hold fewer digits of the shape.
+        digits = 3e-15 * max(1, np.abs(vertices).max() / np.ptp(vertices, axis=0).min())
+        found = {name: [getattr(block, f"{name}{side}") for side in (1, 2)] for name in ("alpha", "p", "restitution")}
+        for key, values in found.items():
+            np.testing.assert_allclose(values, np.array(wanted[key], float), rtol=digits, err_msg=key)
+    if len({wanted["right_corner"][1], wanted["left_corner"][1], vertices[:, 1].min()}) == 1:
+        flat = rk.AsymmetricBlock.from_outline(vertices, gravity=wanted["gravity"])
+        np.testing.assert_allclose(flat.alpha1, block.alpha1, rtol=1e-15)
+
+
+def test_constructors_agree():
+    """From radii, frequencies and corners; a flat base without its ratio of radii."""
+    block = rk.AsymmetricBlock.from_corners((0.25, 0.0), (-0.15, 0.0), (0.0, 1.0), np.sqrt(0.35))
+    flat = rk.AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio)
+    other = rk.AsymmetricBlock.from_frequencies(block.alpha1, block.alpha2, block.p1, block.p2, block.inertia_ratio)
+    for same in (flat, other, block.mirrored.mirrored):
+        for name in ("p2", "radius_ratio", "restitution1", "restitution2"):
+            np.testing.assert_allclose(getattr(same, name), getattr(block, name), rtol=1e-13)
+
+
+BAD = {
+    "slenderness": (lambda: rk.AsymmetricBlock(0.2, 1.6, 2.0), "Argument `alpha2` must be in"),
+    "inertia": (lambda: rk.AsymmetricBlock(0.2, 0.2, 2.0, 1.2), "Argument `inertia_ratio` must be in"),
+    "energy": (lambda: rk.AsymmetricBlock(0.2, 0.2, 2.0, restitution=(1.1, 0.95)), "energy kept by two impacts"),
+    "frequency": (lambda: rk.AsymmetricBlock.from_frequencies(0.2, 0.2, 2.0, 3.0), "the largest about any corner"),
+    "falls by itself": (
+        lambda: rk.AsymmetricBlock.from_corners((0.1, 0), (-0.3, 0), (0.2, 1), 0.3),
+        "must be positive",
+    ),
+    "crossing": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (1, 0), (0, 1.2)]), "must not cross itself"),
+    "a line": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (2, 2)]), "must enclose an area"),
+    "a tip": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (-1, 1)]), "must have a flat base"),
+    "position": (
+        lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 0), (1, 2), (0, 2)], supports=(1, 4)),
+        "must be positions in the outline",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name):
+    make, message = BAD[name]
+    with pytest.raises(ValueError, match=message):
+        make()
