@@ -62,7 +62,7 @@ def compare(quick: rk.Outcome, careful: rk.Outcome, alpha):
     np.testing.assert_allclose(quick.clearance, careful.clearance, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("pulse, model", rows())
+@pytest.mark.parametrize("pulse, model", list(rows()))
 def test_many_scenes_are_as_each_alone(pulse, model):
     points = scenes(400)
     one = under(PULSES[pulse], MODELS[model])
