@@ -1,12 +1,37 @@
-"""All tests run in double precision, on two devices, so that surfaces are shared out."""
+"""All tests run in double precision, on two devices, so that surfaces are shared out.
+
+Shapes in annotations are checked on every call, where a module states any, and but for the innermost arithmetic: its
+functions are called thousands of times while a program is traced, and a check takes longer than what it checks. With
+JAXROCK_CHECK_ALL=1 they are checked everywhere.
+"""
 
 import gc
+import importlib.util
 import json
+import os
 from pathlib import Path
 
 import jax
 import matplotlib
 import pytest
+from jaxtyping import install_import_hook
+
+INNERMOST = {"polynomial", "taylor", "_pick", "_trigonometry"}
+
+
+def checked_modules():
+    """Modules of the package (not imported yet) whose annotations are checked."""
+    package = Path(importlib.util.find_spec("jaxrock").origin).parent
+    for path in sorted(package.rglob("*.py")):
+        shapes = "from jaxtyping import" in path.read_text()
+        if os.environ.get("JAXROCK_CHECK_ALL") == "1" or (shapes and path.stem not in INNERMOST):
+            yield ".".join(["jaxrock", *path.relative_to(package).with_suffix("").parts])
+
+
+install_import_hook(list(checked_modules()), "beartype.beartype")
+
+# Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
+gc.set_threshold(200_000, 10, 10)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)

@@ -98,7 +98,7 @@ def alone(tmp_path_factory):
     return bits(job(1, "-", tmp_path_factory.mktemp("job") / "alone")[0])
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_processes_share_a_sweep(tmp_path, alone, count):
     found = job(count, "-", tmp_path / "out")
     assert [int(results["processes"]) for results in found] == [count] * count
@@ -106,7 +106,7 @@ def test_processes_share_a_sweep(tmp_path, alone, count):
         assert bits(results) == alone
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_killed_job_goes_on(tmp_path, alone, count):
     """The last process dies in the middle of its second block; started again, the job computes only what is missing."""
     pytest.importorskip("zarr")

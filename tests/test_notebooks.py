@@ -8,10 +8,17 @@ nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient 
 nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+# Minutes of compilation, of what `test_derivatives` and `test_critical` judge.
+SLOW = {"07_sensitivity"}
+
+
+def rows():
+    for path in NOTEBOOKS:
+        yield pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem in SLOW else ())
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", list(rows()))
 def test_notebook(path, monkeypatch):
     monkeypatch.setenv("JAXROCK_NOTEBOOK_POINTS", "24")
     notebook = nbformat.read(path, as_version=4)

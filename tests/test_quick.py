@@ -1,5 +1,7 @@
 """The quick pass that many scenes go through: the same results as the careful engine, one scene after the other."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,14 @@ PULSES = {
     "Ricker (quiet at first)": rk.RickerPulse,
     "two pulses, overlapping": lambda a, d: rk.SinePulse(a, d) + rk.SinePulse(-0.7 * a, 0.6 * d).shifted(0.5 * d),
 }
-SLOW = set(PULSES) - {"sine", "rectangle (ends with a jump)", "two pulses, overlapping"}
+QUICK = {("sine", "nonlinear"), ("rectangle (ends with a jump)", "linear"), ("two pulses, overlapping", "linear")}
+MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
+
+
+def rows():
+    """Pulses and models: the slow ones only compile more of the same."""
+    for pair in itertools.product(PULSES, MODELS):
+        yield pytest.param(*pair, id="-".join(pair), marks=() if pair in QUICK else pytest.mark.slow)
 
 
 def scenes(count, seed=1):
@@ -53,11 +62,10 @@ def compare(quick: rk.Outcome, careful: rk.Outcome, alpha):
     np.testing.assert_allclose(quick.clearance, careful.clearance, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
-@pytest.mark.parametrize("pulse", [pytest.param(p, marks=pytest.mark.slow) if p in SLOW else p for p in PULSES])
+@pytest.mark.parametrize("pulse, model", list(rows()))
 def test_many_scenes_are_as_each_alone(pulse, model):
     points = scenes(400)
-    one = under(PULSES[pulse], model)
+    one = under(PULSES[pulse], MODELS[model])
     compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), points[0])
 
 
@@ -73,9 +81,10 @@ def test_many_blocks_in_an_earthquake_are_as_each_alone():
     compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), alpha)
 
 
-@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
+@pytest.mark.parametrize("model", ["nonlinear", pytest.param("linear", marks=pytest.mark.slow)])
 def test_few_scenes_are_postponed(model):
     """Otherwise the quick pass would be right, and slow."""
+    model = MODELS[model]
     passes = _passes(rk.Series(), False)
 
     def one(alpha, p, restitution, intensity, ratio):

@@ -1,5 +1,7 @@
 """Scale laws: blocks and motions with equal groups respond alike."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,19 +39,21 @@ def test_rigid_blocks_of_one_slenderness_collapse():
     np.testing.assert_allclose(curves[0], curves[1], atol=1e-13)
 
 
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None, None))
+def peak_of_sine(alpha, strength, ratio):
+    """In both scales."""
+    block, amplitude = rk.Block(alpha, 1.0, 0.85), jnp.tan(alpha) / strength
+    found = rk.outcome(block, rk.SinePulse(amplitude, 2 * jnp.pi / ratio)).max_rotation
+    return [found / similarity.scales(block, amplitude, kind).rotation for kind in ("rigid", "slender")]
+
+
 @pytest.mark.parametrize("ratio, most", [(8.0, 0.004), (5.0, 0.009), (3.0, 0.019)])
 @pytest.mark.parametrize("strength", [0.75, 0.9])
 def test_small_rotations_nearly_collapse(ratio, strength, most):
     """D&D equation 6.1: the spread of peaks over slenderness angles of 0.02 to 0.35, restitution 0.85."""
-
-    @jax.jit
-    @jax.vmap
-    def peak(alpha):
-        block, amplitude = rk.Block(alpha, 1.0, 0.85), jnp.tan(alpha) / strength
-        found = rk.outcome(block, rk.SinePulse(amplitude, 2 * jnp.pi / ratio)).max_rotation
-        return [found / similarity.scales(block, amplitude, kind).rotation for kind in ("rigid", "slender")]
-
-    rigid, slender = (np.ptp(found) / np.mean(found) for found in map(np.asarray, peak(np.linspace(0.02, 0.35, 8))))
+    peaks = peak_of_sine(np.linspace(0.02, 0.35, 8), strength, ratio)
+    rigid, slender = (np.ptp(found) / np.mean(found) for found in map(np.asarray, peaks))
     assert rigid < most < 0.04 < slender
 
 

@@ -154,8 +154,13 @@ def test_history_and_outcome_agree(scene):
         np.testing.assert_allclose(np.abs(rotation), result.max_rotation, rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", [6, 12, pytest.param(24, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("scene", ["sine, one impact", "record"])
+ORDERS = [("sine, one impact", 6), ("record", 12)]
+MORE_ORDERS = [(scene, order) for scene in ("sine, one impact", "record") for order in (6, 12, 24)]
+
+
+@pytest.mark.parametrize(
+    "scene, order", ORDERS + [pytest.param(*row, marks=pytest.mark.slow) for row in MORE_ORDERS if row not in ORDERS]
+)
 def test_order_of_the_series(scene, order):
     block, motion = SCENES[scene]
     again = outcome(block, motion, engine=rk.Series(order=order))
@@ -178,7 +183,7 @@ def test_triangle_as_a_record():
     np.testing.assert_allclose(a.margin, b.margin, rtol=1e-12)
 
 
-@model
+@pytest.mark.parametrize("model", ["nonlinear", pytest.param("linear", marks=pytest.mark.slow)])
 def test_eager_jit_vmap_and_loop_agree(model):
     amplitudes = jnp.linspace(0.15, 1.7, 23)
 
