@@ -2,13 +2,15 @@
 
 Velocities are per dimensionless time p t. With x half the angle that is missing to the saddle, the free
 equation is dx/dtau = sqrt(sin^2 x - k^2): its times are elliptic integrals of the first kind (logarithms
-in the linear model), its peaks and verdicts follow from the energy.
+in the linear model; quadrature in `skewed` where a constant adds to the sinusoid), its peaks and verdicts follow
+from the energy.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock import skewed
 from jaxrock.models import Table
 
 Scalar = Inexact[ArrayLike, ""]
@@ -44,6 +46,9 @@ def _time_to_peak(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar) ->
     """Time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
     if not table.sinusoidal:
         return jnp.arctanh(speed / manifold)
+    if table.skew is not None:
+        turn = skewed.turning_gap((manifold - speed) * (manifold + speed), table.skew, table.saddle)
+        return skewed.time_to_turning(gap, speed, turn, table.skew)
     k = jnp.sqrt(jnp.maximum((manifold - speed) * (manifold + speed), 1e-280)) / 2
     tangent = speed / (2 * jnp.cos(gap / 2))
     ratio = tangent / k
@@ -59,6 +64,8 @@ def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, 
     kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
 
     def from_saddle(angle):
+        if table.skew is not None:
+            return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
         tangent = jnp.tan(angle / 2)
         ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
         return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
@@ -87,11 +94,16 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
     manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
     deficit = (manifold - speed) * (manifold + speed)  # 2 (energy of the saddle - energy)
 
-    def turning_closeness(gap2):
+    def turning_closeness(gap2, beyond=False):
         """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+        if table.skew is not None:
+            skew, reach = (-table.skew, jnp.pi / 2 - table.saddle) if beyond else (table.skew, table.saddle)
+            return weight * table.stiffness * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
         return weight * table.stiffness * (gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2)
 
     def peak_of(deficit):
+        if table.skew is not None:
+            return table.saddle - skewed.turning_gap(deficit, table.skew, table.saddle)
         missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
         return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
 
@@ -124,7 +136,8 @@ def free_stage(table: Table, restitution: Scalar, opening: Scalar, velocity: Sca
     crossing = -deficit * weight
     turning = turning_closeness(jnp.abs(peak_deficit))
     past_inward = (gap < 0) & (speed < 0)
-    lost_closeness = jnp.where(gap > 0, crossing, jnp.where(past_inward, turning_closeness(jnp.abs(deficit)), jnp.inf))
+    turns_beyond = jnp.where(past_inward, turning_closeness(jnp.abs(deficit), beyond=True), jnp.inf)
+    lost_closeness = jnp.where(gap > 0, crossing, turns_beyond)
     safe_closeness = jnp.where(past_inward, jnp.minimum(crossing, turning), turning)
     closeness = jnp.where(
         lost_at_once,

@@ -26,7 +26,8 @@ BOTTOM = {"status"} | {name for name in MODULES if re.match("_[^_]", name)}
 BELOW = dict.fromkeys(BOTTOM, set()) | {
     "polynomial": set(),
     "block": set(),
-    "models": {"block"},
+    "skewed": set(),
+    "models": {"block", "skewed"},
     "motion": {"models"},
     "pulses": {"motion"},
     "records": {"pulses"},
