@@ -13,6 +13,7 @@ from jaxrock._roots import bracketed_root
 from jaxrock._trigonometry import exponential, sine_cosine, sine_lag, sine_ratio
 
 Scalar = Inexact[ArrayLike, ""]
+Real = Inexact[ArrayLike, "..."]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # of [0, 1]
@@ -25,7 +26,7 @@ def moment(gap: Scalar, skew: Scalar) -> Scalar:
     return 2 * half * (cosine + skew * half)
 
 
-def distance(gap: Scalar, skew: Scalar) -> Scalar:
+def distance(gap: Real, skew: Scalar) -> Real:
     """Speed that just reaches the balance, with the sign of the gap: the root of twice the work up to there."""
     # 4 sin^2(gap/2) + 2 skew (gap - sin(gap)), without cancellation.
     return gap * jnp.sqrt(sine_ratio(gap / 2) ** 2 + 2 * skew * gap * sine_lag(gap))
