@@ -17,7 +17,6 @@ Real = Inexact[ArrayLike, "..."]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # of [0, 1]
-_LEAST = 1e-280  # of a squared speed: its root has a derivative
 
 
 def moment(gap: Scalar, skew: Scalar) -> Scalar:
@@ -37,7 +36,7 @@ def turning_gap(deficit: Scalar, skew: Scalar, reach: Scalar) -> Scalar:
 
     Beyond the balance the same holds with the negative skew.
     """
-    missing = jnp.sqrt(jnp.maximum(deficit, _LEAST))
+    missing = jnp.sqrt(jnp.maximum(deficit, _least(deficit)))
     return bracketed_root(_lacking, jnp.zeros_like(missing), reach, missing, skew)
 
 
@@ -62,13 +61,18 @@ def time_to_turning(gap: Scalar, speed: Scalar, turn: Scalar, skew: Scalar) -> S
 
 def time_from_balance(gap: Scalar, excess: Scalar, skew: Scalar) -> Scalar:
     """Time from the balance to a gap, negative before it; `excess`: squared speed at the balance."""
-    kappa = jnp.sqrt(jnp.maximum(excess, _LEAST))
+    kappa = jnp.sqrt(jnp.maximum(excess, _least(excess)))
     length = jnp.arcsinh(gap / kappa)
     up, down = _exponentials(length)
     gaps = kappa * (up - down) / 2
     squares = gaps * gaps
     speed2 = distance(gaps, skew) ** 2 + kappa**2
     return length * _mean(jnp.sqrt((squares + kappa**2) / speed2))
+
+
+def _least(like: Scalar) -> float:
+    """Of a squared speed: its root has a derivative, and a square."""
+    return 4 * float(jnp.finfo(like.dtype).tiny)
 
 
 def _exponentials(length: Scalar) -> tuple[Inexact[Array, " nodes"], Inexact[Array, " nodes"]]:
