@@ -192,6 +192,9 @@ class Spring(eqx.Module):
     differ by the law "plastic" alone. It balances at x = alpha (SM1), or where sin(x) = tan(alpha) (SM2, SM3): there
     alpha must be below pi/4, for a stouter block on this spring never overturns.
 
+    Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
+    SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.
+
     The rigid multi-mass model (mmSM) of n lumped masses is "SM1" of a block with p/sqrt(1 + 1/(2 (n - 1)^2)).
 
     **Raises:** ValueError for other words; at use, for a block of alpha >= pi/4 where that is not allowed.
