@@ -36,7 +36,7 @@ from jaxrock.hazard import (
     toppling_rate as toppling_rate,
 )
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
-from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
+from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear, Spring as Spring
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,

@@ -57,6 +57,16 @@ def sine_cosine(x: Real) -> tuple[Real, Real]:
     return x * _horner(_SINE, square), _horner(_COSINE, square)
 
 
+def sine_ratio(x: Real) -> Real:
+    """sin(x)/x to rounding for |x| <= 1.78."""
+    return _horner(_SINE, x * x)
+
+
+def sine_lag(x: Real) -> Real:
+    """(x - sin(x))/x^3 to rounding for |x| <= 1.78."""
+    return -_horner(_SINE[1:], x * x)
+
+
 def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     """Sine and cosine of any angle, as exact as the angle itself is rounded."""
     half_turns = jnp.round(x * (1 / math.pi))

@@ -2,7 +2,8 @@
 
 Velocities are per dimensionless time p t. With x half the angle that is missing to the saddle, the free
 equation is dx/dtau = sqrt(sin^2 x - k^2): its times are elliptic integrals of the first kind (logarithms
-in the linear model), its peaks and verdicts follow from the energy.
+in the linear model; quadrature in `skewed` where a constant adds to the sinusoid), its peaks and verdicts follow
+from the energy.
 """
 
 from typing import NamedTuple
@@ -11,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock import skewed
 from jaxrock.models import Angle, Table
 from jaxrock.state import surpasses
 
@@ -50,6 +52,9 @@ def _time_to_peak(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar) ->
     """Time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
     if not table.sinusoidal:
         return jnp.arctanh(speed / manifold)
+    if table.skew is not None:
+        turn = skewed.turning_gap((manifold - speed) * (manifold + speed), table.skew, table.saddle)
+        return skewed.time_to_turning(gap, speed, turn, table.skew)
     k = jnp.sqrt(jnp.maximum((manifold - speed) * (manifold + speed), 1e-280)) / 2
     tangent = speed / (2 * jnp.cos(gap / 2))
     ratio = tangent / k
@@ -65,6 +70,8 @@ def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, 
     kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
 
     def from_saddle(angle):
+        if table.skew is not None:
+            return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
         tangent = jnp.tan(angle / 2)
         ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
         return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
@@ -96,7 +103,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
 
     **Source:** the energy argument of Housner (1963); D&D (2012), 4.12 corrected.
     """
-    present = _present(visits[0].table, opening, velocity, moving)
+    present = _present(visits[0].table, opening, velocity, moving, comes_back=len(visits) > 2)
     outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
     arrival, since = present.arrival, present.impact_time
     found = [present]
@@ -159,6 +166,8 @@ class _Stay(NamedTuple):
 
 def _peak_of(table: Table, deficit: Scalar) -> Scalar:
     """Opening angle at which a block turns back; deficit: 4 sin^2(half the angle to the saddle), or its square."""
+    if table.skew is not None:
+        return table.saddle - skewed.turning_gap(deficit, table.skew, table.saddle)
     missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
     return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
 
@@ -168,8 +177,11 @@ def _weight(table: Table) -> Scalar:
     return (table.stiffness / table.restoring_at_rest) ** 2
 
 
-def _turning_closeness(table: Table, gap2: Scalar) -> Scalar:
+def _turning_closeness(table: Table, gap2: Scalar, beyond: bool = False) -> Scalar:
     """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+    if table.skew is not None:
+        skew, reach = (-table.skew, jnp.pi / 2 - table.saddle) if beyond else (table.skew, table.saddle)
+        return _weight(table) * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
     shape = gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2
     return _weight(table) * shape
 
@@ -178,8 +190,8 @@ def _steepness(table: Table, peak: Scalar) -> Scalar:
     return 2 * jnp.abs(table.restoring(Angle.of(peak)))
 
 
-def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag) -> _Stay:
-    """The stay on the side where the block is when the motion ends."""
+def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, comes_back: bool) -> _Stay:
+    """The stay on the side where the block is when the motion ends; `comes_back`: whether it matters when it does."""
     rate = jnp.sqrt(table.stiffness)
     gap, speed = table.saddle - opening, velocity / rate
     manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
@@ -189,7 +201,7 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag) -> _
     arrival = jnp.sqrt(jnp.maximum(base**2 - deficit, 0.0))
     rises, falls = safe & outward, safe & ~outward
     out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
-    back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0))
+    back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
     falling = _time_to_impact(
         table,
         jnp.where(falls, gap, table.saddle),
@@ -201,7 +213,8 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag) -> _
     # Closeness: crossing the saddle at a speed, or turning at an acceleration.
     crossing, turning = -deficit * _weight(table), _turning_closeness(table, jnp.abs(deficit))
     past_inward = (gap < 0) & (speed < 0)
-    lost_closeness = jnp.where(gap > 0, crossing, jnp.where(past_inward, turning, jnp.inf))
+    beyond = jnp.where(past_inward, _turning_closeness(table, jnp.abs(deficit), beyond=True), jnp.inf)
+    lost_closeness = jnp.where(gap > 0, crossing, beyond)
     safe_closeness = jnp.where(outward, turning, jnp.where(past_inward, crossing, jnp.inf))
     peak = _peak_of(table, jnp.where(rises, deficit, base**2))
     return _Stay(

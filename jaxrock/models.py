@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
+from jaxrock import skewed
+from jaxrock._checks import checked, one_of
 from jaxrock._trigonometry import sine_cosine
 from jaxrock.block import Block, Side
 
@@ -111,41 +113,68 @@ class Table(eqx.Module):
 
     @property
     def sinusoidal(self) -> bool:
-        """Whether the restoring moment is one sinusoid (else it is one straight line)."""
+        """Whether the restoring moment is a sinusoid, perhaps with a constant (else it is one straight line)."""
         return self.rs is not None
 
     @property
+    def _wave(self) -> tuple[Scalar, Scalar]:
+        """Factors of sin x and cos x, of a restoring moment that is a sinusoid."""
+        return self.rs, 0.0 if self.rc is None else self.rc
+
+    @property
     def stiffness(self) -> Scalar:
-        """k in restoring(x) = k sin(saddle - x), or k (saddle - x)."""
-        return jnp.hypot(self.rs, self.rc) if self.sinusoidal else -self.r1
+        """How fast the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
+        if not self.sinusoidal:
+            return -self.r1
+        height = jnp.hypot(*self._wave)
+        return height if self.r0 is None else jnp.sqrt((height - self.r0) * (height + self.r0))
+
+    @property
+    def skew(self) -> Scalar | None:
+        """c in restoring(x) = k [sin(saddle - x) + c (1 - cos(saddle - x))]; None where there is no such part."""
+        return self.r0 / self.stiffness if self.sinusoidal and self.r0 is not None else None
 
     @property
     def saddle(self) -> Scalar:
         """Opening angle of the unstable equilibrium: the block balances on its corner [rad]."""
         if self.known_saddle is not None:
             return self.known_saddle
-        return jnp.arctan2(self.rc, -self.rs) if self.sinusoidal else -self.r0 / self.r1
+        if not self.sinusoidal:
+            return -self.r0 / self.r1
+        of_sine, of_cosine = self._wave
+        middle = jnp.arctan2(of_cosine, -of_sine)
+        return middle if self.r0 is None else middle + jnp.arctan2(self.r0, self.stiffness)
 
     def manifold(self, x: Scalar) -> Scalar:
         """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
         gap = self.saddle - x
+        if self.skew is not None:
+            return jnp.sqrt(self.stiffness) * skewed.distance(gap, self.skew)
         # In half the angle: no cancellation near the saddle.
         distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Outward velocity over p that just reaches the unstable equilibrium under a constant forcing.
+        """Outward velocity over p that reaches the unstable equilibrium under a constant forcing.
 
         `push`: the forcing against it [g]; `weight`: 1 + vertical acceleration (None: 1); `hold`: restoring moment and
-        forcing at the angle, positive.
+        forcing at the angle, positive. For a spring with a line or a constant it is more than enough: what holds stays
+        below a line from `hold` to zero.
         """
         factor = 1.0 if weight is None else weight
-        if not self.sinusoidal:
-            slope = -_weighed(weight, self.r1)
-            # Without weight the forcing alone brings it back.
-            return jnp.where(slope > 0, hold / jnp.sqrt(jnp.where(slope > 0, slope, 1.0)), jnp.inf)
-        across, along = _sum_of((self.rs, factor), (self.ms, push)), _sum_of((self.rc, factor), (self.mc, push))
-        return jnp.sqrt(2 * jnp.maximum(jnp.hypot(across, along) - self.repulsion(angle, push, weight), 0.0))
+        if self.sinusoidal and self.skew is None:
+            across, along = _sum_of((self.rs, factor), (self.ms, push)), _sum_of((self.rc, factor), (self.mc, push))
+            return jnp.sqrt(2 * jnp.maximum(jnp.hypot(across, along) - self.repulsion(angle, push, weight), 0.0))
+        if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent
+            slope = self.repulsion(angle, push, weight)
+        else:  # convex up to pi/2: the chord; the arm, a cosine, is concave
+            flat = Angle(jnp.pi / 2, 1.0, 0.0)
+            fall = factor * (self.restoring(angle) - self.restoring(flat))
+            slope = fall / jnp.maximum(jnp.pi / 2 - angle.value, jnp.finfo(hold.dtype).eps)
+            slope = slope + push * self.mc * angle.sine
+        # Without weight the forcing alone brings it back.
+        light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
+        return jnp.where(light, jnp.inf, hold / jnp.sqrt(jnp.where(light, 1.0, slope)))
 
 
 class Housner(eqx.Module):
@@ -176,6 +205,60 @@ class Linear(eqx.Module):
         return False
 
 
+class Spring(eqx.Module):
+    """A rigid column on a rotational spring without play: the spring models of a rigid block.
+
+    **Arguments:**
+
+    - `kind`: `"SM1"` (the mass at a distance R above the spring), `"SM2"` (the mass at the pivot, shaken by a moment)
+      or `"SM3"` (the mass at the height R cos(alpha) above the spring); all with the block's moment of inertia.
+    - `law`: moment of the spring over m g R at the opening angle x: `"sine"`: sin(alpha - x), the block's own;
+      `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight
+      of the leaning column pulls by sin(x) (SM1) or cos(alpha) sin(x) (SM2, SM3).
+
+    All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
+    differ by the law "plastic" alone. It balances at x = alpha (SM1), or where sin(x) = tan(alpha) (SM2, SM3): there
+    alpha must be below pi/4, for a stouter block on this spring never overturns.
+
+    Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
+    SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.
+
+    Under vertical motion a spring is not a block: its moment does not change with the weight. That raises ValueError.
+
+    The rigid multi-mass model (mmSM) of n lumped masses is "SM1" of a block with p/sqrt(1 + 1/(2 (n - 1)^2)).
+
+    **Raises:** ValueError for other words; at use, for a block of alpha >= pi/4 where that is not allowed.
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), equations 4-6 (SM1), 7-9 (SM2), 10-12 (SM3), 13-15 (mmSM).
+    """
+
+    kind: str = eqx.field(static=True)
+    law: str = eqx.field(static=True)
+
+    def __init__(self, kind: str = "SM1", law: str = "linear"):
+        self.kind = one_of("kind", kind, ("SM1", "SM2", "SM3"))
+        self.law = one_of("law", law, ("sine", "linear", "plastic"))
+
+    def table(self, block: Block | Side) -> Table:
+        """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""
+        alpha = block.alpha
+        if self.law == "plastic" and self.kind != "SM1":
+            message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
+            alpha = checked("block.alpha", alpha, message, lambda angle: angle < jnp.pi / 4)
+        sine, cosine = sine_cosine(alpha)
+        if self.law == "sine":
+            return Table(rs=-cosine, rc=sine, mc=cosine)  # D&F 2017, 4, 7, 10
+        if self.law == "linear":
+            return Table(r0=sine, r1=-sine / alpha, mc=cosine)  # D&F 2017, 5, 8, 11
+        weight = jnp.ones_like(alpha) if self.kind == "SM1" else cosine
+        return Table(r0=sine, rs=-weight, mc=cosine)  # D&F 2017, 6; 9, 12
+
+    @property
+    def falls_flat(self) -> bool:
+        """Whether a rotation of pi/2 means that the column lies on the ground."""
+        return True
+
+
 class Equation(eqx.Module):
     """A model of your own, written as functions; the diffrax engine solves it.
 
@@ -190,6 +273,8 @@ class Equation(eqx.Module):
     - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
     - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
     - `falls_flat`: whether a rotation of pi/2 means that the block lies on its side.
+
+    A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
     The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
     Equinox modules may carry parameters to differentiate. A block that has stopped below its unstable equilibrium
@@ -329,4 +414,4 @@ class EquationTable(eqx.Module):
         return jnp.where(jnp.any(falls), root, jnp.pi / 2)
 
 
-Model = Housner | Linear | Equation
+Model = Housner | Linear | Spring | Equation

@@ -84,7 +84,7 @@ def phase(response: Response, axis=None):
         label = "stable manifold" if side > 0 else None
         axis.plot(side * opening, side * manifold, color=_RED, linewidth=1, label=label)
         axis.plot(side * opening, -side * manifold, color=_RED, linewidth=0.7, linestyle=":")
-        axis.plot([side], [0], "o", color=_RED, markersize=4)
+        axis.plot([side * float(scene.table.saddle) / alpha], [0], "o", color=_RED, markersize=4)
     axis.axvline(0, color=_GREY, linewidth=0.5)
     reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
     axis.set_xlim(-reach, reach)

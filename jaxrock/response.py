@@ -185,7 +185,7 @@ def outcome(
 
     - `block`: a `Block` or `AsymmetricBlock` of scalars (use `jax.vmap` for many).
     - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
-    - `model`: `Housner()` (nonlinear), `Linear()`, or an `Equation` of your own.
+    - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, or an `Equation` of your own.
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
     - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
 

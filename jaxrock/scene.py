@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 from jaxrock._pick import pick
 from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
-from jaxrock.models import EquationTable, Model, Table
+from jaxrock.models import EquationTable, Model, Spring, Table
 from jaxrock.motion import AbstractMotion, Shaking, sum_of_series
 
 Scalar = Inexact[ArrayLike, ""]
@@ -93,6 +93,10 @@ class Scene(eqx.Module):
         knots, bounds, scales = motion.knots, motion.bounds, motion.scales
         infinity = jnp.full(1, jnp.inf, dtype)
         bounds, vertical = jnp.pad(bounds, (0, 1)), motion.vertical_bounds
+        if vertical is not None and isinstance(model, Spring):
+            raise ValueError(
+                "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
+            )
         skips = bounds.size > _NEAR
         table, far = _tables(block, model)
         if isinstance(block, Block):

@@ -246,7 +246,8 @@ def _compiled(kind, model, engine):
 
     import jaxrock as rk
 
-    equation = {"nonlinear": rk.Housner(), "linear": rk.Linear()}[model]
+    springs = {f"{law} spring": rk.Spring("SM1", law) for law in ("sine", "linear", "plastic")}
+    equation = ({"nonlinear": rk.Housner(), "linear": rk.Linear()} | springs)[model]
 
     def outcome(block, numbers, initial):
         start = (initial[0], initial[1])

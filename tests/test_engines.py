@@ -124,6 +124,9 @@ MORE = [
     ("sine", "linear"),
     ("exponential", "linear"),
     ("record", "linear"),
+    ("sine", "sine spring"),
+    ("sine", "linear spring"),
+    ("sum", "plastic spring"),
 ]
 
 

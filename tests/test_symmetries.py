@@ -22,7 +22,7 @@ SCENES = {
     "exponential": (BLOCK, rk.ExponentialPulse(0.8, 0.4, 3.0)),
     "record": (rk.Block(0.2, 1.3), SHAKING),
 }
-MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
+MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear(), "plastic spring": rk.Spring("SM3", "plastic")}
 
 outcome = jax.jit(rk.outcome)
 simulate = jax.jit(lambda block, motion, model, initial: rk.simulate(block, motion, model, initial=initial))
@@ -31,7 +31,9 @@ RARE = {"ricker, antisymmetric", "near-fault", "exponential"}  # other motions, 
 scene = pytest.mark.parametrize(
     "scene", [pytest.param(name, marks=pytest.mark.slow) if name in RARE else name for name in SCENES]
 )
-model = pytest.mark.parametrize("model", MODELS)
+model = pytest.mark.parametrize(
+    "model", ["nonlinear", "linear", pytest.param("plastic spring", marks=pytest.mark.slow)]
+)
 
 
 def staged(motion, factor=1.0, delay=0.0, silence=0.0):

@@ -1,9 +1,12 @@
-"""What holds a rigid block without any motion: force, energy, and the blow and the free swing that they allow."""
+"""What holds a rigid block without any motion: force, energy, and the blow and the free swing that they allow.
+
+And what holds the column on a spring that stands for it, and what overturns that.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, checked, elementwise, finite, share
+from jaxrock._checks import acute, checked, elementwise, finite, one_of, share
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
@@ -30,6 +33,64 @@ def force(rotation: Real, alpha: Real) -> Result:
     **Source:** Diamantopoulos & Fragiadakis (2017), equation 16: tan(alpha - rotation).
     """
     return jnp.tan(alpha - rotation)
+
+
+@_elementwise
+def _force_sine(rotation, alpha):
+    return jnp.tan(alpha) - jnp.tan(rotation)  # D&F 2017, 17
+
+
+@_elementwise
+def _force_linear(rotation, alpha):
+    return jnp.tan(alpha) * (1 - rotation / alpha) / jnp.cos(rotation)  # as 17, with the moment of 5, 8, 11
+
+
+@_elementwise
+def _force_plastic_diagonal(rotation, alpha):
+    return jnp.tan(alpha) / jnp.cos(rotation) - jnp.tan(rotation) / jnp.cos(alpha)  # D&F 2017, 18
+
+
+@_elementwise
+def _force_plastic_height(rotation, alpha):
+    return jnp.tan(alpha) / jnp.cos(rotation) - jnp.tan(rotation)  # D&F 2017, 19
+
+
+def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "linear") -> Result:
+    """Horizontal force at the mass, over the weight, that holds a spring model at a rotation: its pushover curve.
+
+    **Arguments:**
+
+    - `rotation`: [rad], in [0, pi/2). `alpha`: slenderness angle [rad], in (0, pi/2).
+    - `kind`, `law`: as in `jaxrock.Spring`. The mass of "SM2" is at the pivot: there it is the moment over the weight
+      and the arm R cos(alpha) cos(rotation) of the others.
+
+    **Returns:** the force; tan(alpha) at rotation 0 in all of them, as `force`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), equations 17 (law "sine"), 18 ("plastic", SM1 and mmSM) and 19
+    ("plastic", SM3); for the law "linear" the moment of equations 5, 8 and 11 over the same arm.
+    """
+    one_of("kind", kind, ("SM1", "SM2", "SM3"))
+    one_of("law", law, ("sine", "linear", "plastic"))
+    plastic = _force_plastic_diagonal if kind == "SM1" else _force_plastic_height
+    return {"sine": _force_sine, "linear": _force_linear, "plastic": plastic}[law](rotation, alpha)
+
+
+@_elementwise
+def overturning_moment_ratio(rotation: Real, alpha: Real) -> Result:
+    """Overturning moment of the spring models over that of the block, under one ground acceleration.
+
+    **Arguments:**
+
+    - `rotation`: [rad], in [0, pi/2). `alpha`: slenderness angle [rad], in (0, pi/2).
+
+    **Returns:** cos(alpha) cos(rotation)/cos(alpha - rotation) = 1/(1 + tan(alpha) tan(rotation)): one at rotation 0,
+    less beyond.
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), figure 15.
+    """
+    return 1 / (1 + jnp.tan(alpha) * jnp.tan(rotation))
 
 
 @_elementwise
