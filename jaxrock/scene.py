@@ -24,6 +24,11 @@ def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array,
     return values
 
 
+def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
+    return jax.lax.associative_scan(jnp.maximum, values, reverse=True)
+
+
 def peak_bound(motion: AbstractMotion) -> Scalar:
     """A bound of the motion's acceleration [g]: its peak, for records and most pulses."""
     return jnp.max(motion.bounds)
@@ -76,7 +81,7 @@ class Scene(eqx.Module):
             knots=knots,
             lengths=jnp.concatenate([jnp.diff(knots), infinity]),
             scales=jnp.concatenate([scales, infinity]),
-            ceilings=jax.lax.cummax(bounds, reverse=True),
+            ceilings=_running_maximum(bounds),
             quiet_near=_sliding_maximum(bounds, _NEAR) if skips else bounds,
             quiet_far=_sliding_maximum(bounds, _FAR) if skips else bounds,
             falls_flat=model.falls_flat,
