@@ -26,6 +26,12 @@ class FreeStage(eqx.Module):
     deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
     share: Scalar  # of an error of the present energy that is left in it
 
+    @classmethod
+    def none(cls, like: Scalar) -> "FreeStage":
+        """Of a block that does not move."""
+        zero, one, no = jnp.zeros_like(like), jnp.ones_like(like), jnp.zeros_like(like, bool)
+        return cls(no, jnp.zeros_like(like, jnp.int32), zero, zero, zero, jnp.full_like(like, jnp.inf), zero, one)
+
 
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""

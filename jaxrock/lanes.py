@@ -132,24 +132,23 @@ class _Batch:
         return _again(function, scenes.own, *ready.each(self.passes.conclude, ready.own, followed))
 
     def _natively(self, scenes: "_Lanes"):
-        """Both passes in machine code of our own."""
-        ready, begun = scenes.begin(self.passes.begin)
+        """From beginning to end in machine code of our own."""
+        passes, refilled = self.passes, self.passes.round is not None
 
-        def function(part):
-            own, states = part
-            return ready.each(self.passes.conclude, own, ready.each_natively(self.passes.carefully, own, states))[0]
+        def with_all(follow):
+            def function(tree):
+                scene, state = passes.begin(tree)
+                return passes.conclude(scene, follow(scene, state))
 
-        if self.passes.quickly is None or self.size <= _FEW:
-            return function((ready.own, begun))
+            return function
 
-        def quickly(limit, own, states):
-            return ready.each_natively(self.passes.quickly, own, states, limit)
+        def carefully(own):
+            return scenes.each_natively(with_all(passes.carefully), own, refilled)[0]
 
-        if self.passes.round is not None:
-            followed = self._in_rounds(quickly, ready, begun)
-        else:
-            followed = quickly(jnp.int32(_ENDLESS), ready.own, begun)
-        return _again(function, (ready.own, begun), *ready.each(self.passes.conclude, ready.own, followed))
+        if passes.quickly is None or self.size <= _FEW:
+            return carefully(scenes.own)
+        quickly = with_all(lambda scene, state: passes.quickly(scene, state, _ENDLESS))
+        return _again(carefully, scenes.own, *scenes.each_natively(quickly, scenes.own, refilled))
 
     def _in_rounds(self, quickly: Callable, ready: "_Lanes", states):
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
@@ -185,18 +184,18 @@ class _Lanes:
         """`function(tree, *more)` of lanes with these leaves of their own."""
         return jax.vmap(lambda own, *more: function(self._tree(own), *more))(own, *more)
 
-    def each_natively(self, function: Callable, own: list, states, *limits):
-        """`function(tree, state, *limits)` in machine code of our own; all share the limits."""
-        states, structure = jax.tree.flatten(states)
-        count, end, rest = len(self.leaves), len(self.leaves) + len(states), iter(own)
+    def each_natively(self, function: Callable, own: list, refilled: bool):
+        """`function(tree)` in machine code of our own; `refilled`: see `native.run`."""
+        rest, structures = iter(own), []
         leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
 
         def flat(leaves):
-            tree, state = self.structure.unflatten(leaves[:count]), structure.unflatten(leaves[count:end])
-            return jax.tree.leaves(function(tree, state, *leaves[end:]))
+            found, structure = jax.tree.flatten(function(self.structure.unflatten(leaves)))
+            structures.append(structure)
+            return found
 
-        shared = [not flag for flag in self.flags] + [False] * len(states) + [True] * len(limits)
-        return structure.unflatten(native.run(flat, [*leaves, *states, *limits], shared))
+        found = native.run(flat, leaves, [not flag for flag in self.flags], refilled)
+        return structures[0].unflatten(found)
 
     def begin(self, function: Callable) -> tuple["_Lanes", Any]:
         """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of

@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike, Bool, Inexact, Int
 from jaxrock._keep import keep, unseen_one
 from jaxrock.derivatives import differentiable, with_derivatives_of
 from jaxrock.engine import AbstractEngine, AbstractStepper, either, when
-from jaxrock.free import free_stage
+from jaxrock.free import FreeStage, free_stage
 from jaxrock.models import Angle, Table
 from jaxrock.polynomial import (
     Watch,
@@ -127,9 +127,13 @@ class TaylorStepper(AbstractStepper):
         """The free stage by energy."""
         scene, table = self.scene, self.scene.table
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        # In reverse mode what is not taken (roots of zero) would spoil what is.
-        follow = differentiable(lambda scene: free_stage(*scene)) if self.taped else lambda scene: free_stage(*scene)
-        stage = follow((table, scene.restitution, state.opening, state.velocity, moving))
+        start = table, scene.restitution, state.opening, state.velocity, moving
+        if self.taped:
+            # In reverse mode what is not taken (roots of zero) would spoil what is.
+            stage = differentiable(lambda start: free_stage(*start))(start)
+        else:
+            none = FreeStage.none(state.opening)
+            stage = jax.lax.cond(moving, lambda: free_stage(*start), lambda: none)
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
         beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)

@@ -118,10 +118,13 @@ def surface(
     label: str,
     progress: bool | None,
     outer: bool = True,
+    turned: bool = False,
 ):
-    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front."""
+    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front
+    (`turned`: with its axes the other way round)."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
-    return jax.tree.map(jnp.asarray, compute(function, plan, scene, label, progress)[0])
+    found = compute(function, plan, scene, label, progress)[0]
+    return jax.tree.map(lambda x: jnp.asarray(x.T if turned else x), found)
 
 
 class Plan(NamedTuple):
@@ -203,9 +206,8 @@ def compute(
     for number in mine:
         place = plan.place(number)
         shape = tuple(p.stop - p.start for p in place)
-        order = _tiles(shape)
+        order, back = _tiles(shape)
         found = run([x[order] for x in plan.points(number)], bar.add)
-        back = np.argsort(order)
         found = [leaf[back].reshape(*shape, *leaf.shape[1:]) for leaf in found]
         if store:
             store.write(place, found)
@@ -245,7 +247,9 @@ def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
     each of which is compiled."""
     share = -(-points // devices)
     least, most = (64, 16384) if platform == "cpu" else (1024, 65536)
-    return _ROWS, devices, 2 ** (min(max(share, least), most) - 1).bit_length()
+    lanes = 2 ** (min(max(share, least), most) - 1).bit_length()
+    rows = min(_ROWS, 2 ** (-(-share // lanes) - 1).bit_length())
+    return rows, devices, lanes
 
 
 def _deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
@@ -262,12 +266,14 @@ def _collect(dealt: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=16)
-def _tiles(shape: tuple[int, ...]) -> np.ndarray:
-    """The order of a block's flat points in which neighbours along both of its last axes are near each other."""
-    if len(shape) < 2:
-        return np.arange(math.prod(shape))
-    *rest, i, j = (x.ravel() for x in np.indices(shape))
-    return np.lexsort((j, i, j // _TILE, i // _TILE, *reversed(rest)))
+def _tiles(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """The order of a block's flat points in which neighbours along both of its last axes are near each other, and the
+    way back."""
+    order = np.arange(math.prod(shape))
+    if len(shape) > 1:
+        *rest, i, j = (x.ravel() for x in np.indices(shape))
+        order = np.lexsort((j, i, j // _TILE, i // _TILE, *reversed(rest)))
+    return order, np.argsort(order)
 
 
 class Runner:
