@@ -23,7 +23,8 @@ def is_long(shape: tuple[int, ...]) -> bool:
 
 
 class _Frame:
-    """A function `void name(void **outputs, void **inputs)`; the first input is the number of lanes (int32)."""
+    """A function `void name(void **outputs, void **inputs)`; the first input tells for how many lanes there is room in
+    the arrays, and how many are wanted (int32 both)."""
 
     def __init__(self, jaxpr, lanes: int, name: str):
         self.module = ir.Module(name)
@@ -37,7 +38,8 @@ class _Frame:
         self.e = Emitter(self.b, lanes)
         self.sources = [self._array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
         self.targets = [self._array(outputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.outvars)]
-        self.count = self.b.sext(self.b.load(self._array(inputs, 0, np.int32)), _I64)
+        sizes = self._array(inputs, 0, np.int32)
+        self.width, self.count = (self.b.sext(self.b.load(self.b.gep(sizes, [_I32(i)])), _I64) for i in (0, 1))
 
     def _array(self, of, index: int, dtype):
         kind = _I8 if dtype == np.bool_ else self.e.kind(dtype)
@@ -45,7 +47,7 @@ class _Frame:
 
     def place(self, number: int, lane):
         """Where the number of a lane lies in an array."""
-        return self.b.add(self.b.mul(self.count, _I64(number)), lane)
+        return self.b.add(self.b.mul(self.width, _I64(number)), lane)
 
     def vector(self, pointer, at):
         """A place of as many numbers as there are lanes in a vector."""
@@ -83,8 +85,8 @@ class _Frame:
 def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """A function `void name(void **outputs, void **inputs)` that runs a program over arrays of many lanes.
 
-    The first input is the number of lanes (int32, a multiple of `lanes`), then follow those of the program. What is
-    not `shared` has an axis of lanes.
+    Before the inputs of the program stands how many lanes there are (a multiple of `lanes`), and how many are wanted
+    (at least 1). What is not `shared` has an axis of lanes.
     """
     jaxpr = program.jaxpr
     f = _Frame(jaxpr, lanes, name)

@@ -14,7 +14,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import Literal
 from llvmlite import binding, ir
 
@@ -26,10 +25,11 @@ from jaxrock.programs import ahead, around_loop, computed
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
-def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = False) -> list:
+def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = False, count=None) -> list:
     """`function(leaves)` (a list) for many lanes: leaves that are not `shared` have a leading axis, and so do results.
 
-    `refilled`: in the function's one loop a lane that is done does not wait for others.
+    `refilled`: in the function's one loop a lane that is done does not wait for others. `count`: of how many lanes, the
+    first, there have to be results (at least 1; known at run time only).
     Raises `Unsupported` if the function does what is not known in `operations`.
     """
     shapes = [x.shape if same else x.shape[1:] for x, same in zip(leaves, shared)]
@@ -43,6 +43,7 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
 
     size = next(x.shape[0] for x, same in zip(leaves, shared) if not same)
     more = -size % _machine().lanes
+    sizes = jnp.stack([jnp.int32(size + more), jnp.asarray(size if count is None else count, jnp.int32)])
     own = {v for v, same in zip(program.jaxpr.invars, shared) if not same} | set(each.outputs)
     for v in own.intersection(rest.inputs):
         x = values[v]
@@ -53,7 +54,7 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
         name = registered(part.program, [v not in own for v in part.inputs], emit_loop if is_loop else emit)
         shapes = [(*v.aval.shape, size + more) for v in part.outputs]
         results = [jax.ShapeDtypeStruct(shape, v.aval.dtype) for shape, v in zip(shapes, part.outputs)]
-        found = jax.ffi.ffi_call(name, results)(np.int32(size + more), *(values[v] for v in part.inputs))
+        found = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
         values.update((v, x) for v, x in zip(part.outputs, found) if not isinstance(v, Literal))
         own.update(v for v in part.outputs if not isinstance(v, Literal))
     return [jnp.moveaxis(x, -1, 0)[:size] for x in found]
