@@ -45,7 +45,7 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
     more = -size % _machine().lanes
     sizes = jnp.stack([jnp.int32(size + more), jnp.asarray(size if count is None else count, jnp.int32)])
     own = {v for v, same in zip(program.jaxpr.invars, shared) if not same} | set(each.outputs)
-    for v in own.intersection(rest.inputs):
+    for v in [v for v in rest.inputs if v in own]:
         x = values[v]
         x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
         values[v] = x if is_long(v.aval.shape) else jnp.moveaxis(x, 0, -1)
