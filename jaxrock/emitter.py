@@ -162,7 +162,8 @@ class Emitter:
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
-            return [unboxed(MOVES[name](parameters, *map(boxed, inputs)))]
+            found = MOVES[name](parameters, *map(boxed, inputs))
+            return [unboxed(x) for x in (found if isinstance(found, list) else [found])]
         if name in SUMS and inputs[0].size:
             array = inputs[0]
             for axis in sorted(parameters["axes"], reverse=True):

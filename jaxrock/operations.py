@@ -188,6 +188,7 @@ OPERATIONS: dict[str, Callable] = {
     "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
     "integer_pow": _power,
     "sqrt": lambda e, _, x: e.intrinsic("sqrt", x),
+    "rsqrt": lambda e, q, x: e.b.fdiv(e.constant(1, q.invars[0].aval.dtype), e.intrinsic("sqrt", x)),
     "floor": lambda e, _, x: e.intrinsic("floor", x),
     "ceil": lambda e, _, x: e.intrinsic("ceil", x),
     "round": _round,
@@ -258,6 +259,7 @@ MOVES: dict[str, Callable] = {
     "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
     "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
     "pad": _pad,
+    "split": lambda parameters, x: np.split(x, np.cumsum(parameters["sizes"])[:-1], parameters["axis"]),
     "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
     "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
 }
