@@ -20,7 +20,7 @@ from jaxrock.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
-_WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
+WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
 
 
 class Memory(NamedTuple):
@@ -36,7 +36,7 @@ class Emitter:
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
         self.b, self.lanes = builder, lanes
-        self._before = []  # the blocks before the loops that are being written
+        self.before = []  # the blocks before the loops that are being written
         self._depths = {}  # in how many of them a value is made anew, by the identity of the value
         self._alive = []  # so that identities are not used again
 
@@ -72,7 +72,7 @@ class Emitter:
         """A function of the mathematical library, lane by lane."""
         kind = values[0].type.element
         function = self._declared(name if isinstance(kind, ir.DoubleType) else name + "f", kind, len(values))
-        return self._gather([self.b.call(function, [self._lane(v, i) for v in values]) for i in range(self.lanes)])
+        return self.gather([self.b.call(function, [self.lane(v, i) for v in values]) for i in range(self.lanes)])
 
     def _declared(self, name: str, kind, count: int) -> ir.Function:
         module = self.b.module
@@ -85,16 +85,19 @@ class Emitter:
         zeros = ir.Constant(ir.VectorType(_I32, self.lanes), [_I32(0)] * self.lanes)
         return self.b.shuffle_vector(first, ir.Constant(kind, ir.Undefined), zeros)
 
-    def _lane(self, vector, i: int):
+    def lane(self, vector, i: int):
+        """The number of one lane."""
         return self.b.extract_element(vector, _I32(i))
 
-    def _gather(self, scalars: list):
+    def gather(self, scalars: list):
+        """One vector of a number for each lane."""
         total = ir.Constant(ir.VectorType(scalars[0].type, self.lanes), ir.Undefined)
         for i, scalar in enumerate(scalars):
             total = self.b.insert_element(total, scalar, _I32(i))
         return total
 
-    def _any(self, mask):
+    def any(self, mask):
+        """Whether any lane is set."""
         bits = ir.IntType(self.lanes)
         return self.b.icmp_unsigned("!=", self.b.bitcast(mask, bits), bits(0))
 
@@ -105,17 +108,18 @@ class Emitter:
         jaxpr = getattr(program, "jaxpr", program)
         values = dict(zip(jaxpr.invars, arguments))
         for variable, value in zip(jaxpr.constvars, getattr(program, "consts", ())):
-            values[variable] = self._known(value, variable.aval.dtype)
+            values[variable] = self.known(value, variable.aval.dtype)
 
         def read(atom):
-            return self._known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+            return self.known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
             found = self._place(equation, [read(x) for x in equation.invars], active)
             values.update(zip(equation.outvars, found))
         return [read(x) for x in jaxpr.outvars]
 
-    def _known(self, value, dtype):
+    def known(self, value, dtype):
+        """A number or an array that is known beforehand."""
         if isinstance(value, jax.core.Tracer):
             raise Unsupported("a number from outside")
         value = np.asarray(value, dtype)
@@ -127,19 +131,20 @@ class Emitter:
 
     def _place(self, equation, inputs: list, active) -> list:
         """Apply an operation, before the loops that do not change its operands."""
-        if equation.primitive.name in _WITH_PROGRAMS:
+        if equation.primitive.name in WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
-        vectors = _flat([x for x in inputs if not isinstance(x, Memory)])
+        vectors = flat([x for x in inputs if not isinstance(x, Memory)])
         depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
-        if depth == len(self._before):
+        if depth == len(self.before):
             found = self._apply(equation, inputs, active)
         else:
-            with self.b.goto_block(self._before[depth]):
+            with self.b.goto_block(self.before[depth]):
                 found = self._apply(equation, inputs, active)
-        self._remember(_flat([x for x in found if not isinstance(x, Memory)]), depth)
+        self.remember(flat([x for x in found if not isinstance(x, Memory)]), depth)
         return found
 
-    def _remember(self, values: list, depth: int) -> None:
+    def remember(self, values: list, depth: int) -> None:
+        """That values are made anew in so many of the loops that are being written."""
         self._alive += values
         # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
         self._depths.update((id(x), min(depth, self._depths.get(id(x), depth))) for x in values)
@@ -147,23 +152,24 @@ class Emitter:
     def _apply(self, equation, inputs: list, active) -> list:
         name, parameters = equation.primitive.name, equation.params
         if name == "while":
-            return self._loop(parameters, inputs, active)
+            return self.loop(parameters, inputs, active)[0]
         if name == "cond":
             return self._branch(parameters["branches"], inputs, active)
-        if name in _WITH_PROGRAMS:
+        if name in WITH_PROGRAMS:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
             return [self._of_memory(name, parameters, *inputs)]
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
-            return [_unboxed(MOVES[name](parameters, *map(_boxed, inputs)))]
+            found = MOVES[name](parameters, *map(boxed, inputs))
+            return [unboxed(x) for x in (found if isinstance(found, list) else [found])]
         if name in SUMS and inputs[0].size:
             array = inputs[0]
             for axis in sorted(parameters["axes"], reverse=True):
                 parts = list(np.moveaxis(array, axis, 0))
                 array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)
-            return [_unboxed(array)]
+            return [unboxed(array)]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
@@ -175,7 +181,7 @@ class Emitter:
         if name == "squeeze":
             return self._look_up(memory, self.constant(0, np.int32))
         if name == "dynamic_slice" and parameters["slice_sizes"] == (1,):
-            return _boxed([self._look_up(memory, *more)])
+            return boxed([self._look_up(memory, *more)])
         if name in NOTHING:
             return memory
         raise Unsupported(f"{name} of a long list")
@@ -187,37 +193,41 @@ class Emitter:
         index = self.b.select(self.b.icmp_signed(">", index, last), last, index)
         found = []
         for i in range(self.lanes):
-            place = self._lane(index, i)
+            place = self.lane(index, i)
             place = self.b.sext(place, _I64) if place.type != _I64 else place
             place = place if memory.starts is None else self.b.add(place, memory.starts[i])
             found.append(self.b.load(self.b.gep(memory.pointer, [place])))
-        return self._gather(found)
+        return self.gather(found)
 
-    def _loop(self, parameters: dict, inputs: list, active) -> list:
+    def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
+        """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""
         n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
         of_cond, of_body, carry = inputs[:n_cond], inputs[n_cond : n_cond + n_body], inputs[n_cond + n_body :]
-        before, firsts = self.b.block, _flat(carry)
+        before, firsts = self.b.block, flat(carry)
         head, inside, after = (self.b.append_basic_block(name) for name in ("head", "body", "after"))
         self.b.branch(head)
         self.b.position_at_end(head)
         phis = [self.b.phi(x.type) for x in firsts]
-        state = _like(carry, phis)
-        self._before.append(before)
-        self._remember(phis, len(self._before))
+        state = like(carry, phis)
+        self.before.append(before)
+        self.remember(phis, len(self.before))
         (going,) = self.run(parameters["cond_jaxpr"], [*of_cond, *state], active)
         going = self.b.and_(going, active)
-        self.b.cbranch(self._any(going), inside, after)
+        goes = self.any(going)
+        if leaves is not None:
+            goes = self.b.and_(goes, self.b.not_(leaves(going)))
+        self.b.cbranch(goes, inside, after)
         self.b.position_at_end(inside)
-        found = _flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
+        found = flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
         kept = [phi if new is phi else self.b.select(going, new, phi) for new, phi in zip(found, phis)]
         for phi, first, later in zip(phis, firsts, kept):
             phi.add_incoming(first, before)
             phi.add_incoming(later, self.b.block)
         self.b.branch(head)
         self.b.position_at_end(after)
-        self._before.pop()
-        self._remember(phis, len(self._before))  # they change no more
-        return state
+        self.before.pop()
+        self.remember(phis, len(self.before))  # they change no more
+        return state, going
 
     def _branch(self, branches, inputs: list, active) -> list:
         which, *inputs = inputs
@@ -236,12 +246,12 @@ class Emitter:
         """The results of a case in the lanes of `mask`, `others` in the rest (None: whatever it is)."""
         before = self.b.block
         inside, after = self.b.append_basic_block("case"), self.b.append_basic_block("join")
-        self.b.cbranch(self._any(mask), inside, after)
+        self.b.cbranch(self.any(mask), inside, after)
         self.b.position_at_end(inside)
         # What only depends on values from outside the loops goes before them, even if it is not needed there.
         found = self.run(program, inputs, mask)
-        results = _flat(found)
-        others = [ir.Constant(x.type, ir.Undefined) for x in results] if others is None else _flat(others)
+        results = flat(found)
+        others = [ir.Constant(x.type, ir.Undefined) for x in results] if others is None else flat(others)
         chosen = [new if new is old else self.b.select(mask, new, old) for new, old in zip(results, others)]
         end = self.b.block
         self.b.branch(after)
@@ -250,11 +260,11 @@ class Emitter:
         for phi, new, old in zip(joined, chosen, others):
             phi.add_incoming(new, end)
             phi.add_incoming(old, before)
-        self._remember(joined, len(self._before))
-        return _like(found, joined)
+        self.remember(joined, len(self.before))
+        return like(found, joined)
 
 
-def _boxed(x) -> np.ndarray:
+def boxed(x) -> np.ndarray:
     """An array of vectors of what may be one vector; NumPy would look into them."""
     if isinstance(x, np.ndarray):
         return x
@@ -263,7 +273,7 @@ def _boxed(x) -> np.ndarray:
     return box
 
 
-def _unboxed(x):
+def unboxed(x):
     return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
 
 
@@ -271,21 +281,21 @@ def _each(function: Callable, *inputs):
     """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
     if not any(isinstance(x, np.ndarray) for x in inputs):
         return function(*inputs)
-    inputs = np.broadcast_arrays(*map(_boxed, inputs))
+    inputs = np.broadcast_arrays(*map(boxed, inputs))
     found = np.empty(inputs[0].shape, object)
     for place in np.ndindex(found.shape):
         found[place] = function(*(x[place] for x in inputs))
     return found
 
 
-def _flat(values: list) -> list:
+def flat(values: list) -> list:
     """The single vectors in vectors and arrays."""
     if any(isinstance(value, Memory) for value in values):
         raise Unsupported("a long list that changes")
     return [x for value in values for x in (value.ravel() if isinstance(value, np.ndarray) else [value])]
 
 
-def _like(values: list, vectors: list) -> list:
+def like(values: list, vectors: list) -> list:
     """Vectors and arrays like `values`, of other vectors."""
     rest, found = iter(vectors), []
     for value in values:
@@ -298,69 +308,13 @@ def _like(values: list, vectors: list) -> list:
     return found
 
 
-def is_long(shape: tuple[int, ...]) -> bool:
-    """Whether an array stays in memory, where single numbers of it are looked up."""
-    if len(shape) > 1 and math.prod(shape) > SMALL**2:
-        raise Unsupported(f"an array of shape {shape}")
-    return len(shape) == 1 and shape[0] > SMALL
+def is_known(equation) -> bool:
+    """Whether an operation may be written; in the end only writing it tells."""
+    if equation.primitive.name not in WITH_PROGRAMS:
+        return equation.primitive.name in OPERATIONS | MOVES | SUMS or equation.primitive.name == "dynamic_slice"
+    programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
+    return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
 
 
-def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
-    """A function `void name(void **outputs, void **inputs)` that runs a program over arrays of many lanes.
-
-    The first input is the number of lanes (int32, a multiple of `lanes`), then follow those of the program. What is
-    not `shared` has an axis of lanes: for long lists the first, for others the last. Results have it last.
-    """
-    module, byte = ir.Module(name), ir.IntType(8)
-    table = byte.as_pointer().as_pointer()
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [table, table]), name)
-    outputs, inputs = function.args
-    b = ir.IRBuilder(function.append_basic_block("entry"))
-    e = Emitter(b, lanes)
-
-    def array(of, index, dtype):
-        kind = byte if dtype == np.bool_ else e.kind(dtype)
-        return b.bitcast(b.load(b.gep(of, [_I32(index)])), kind.as_pointer())
-
-    jaxpr = program.jaxpr
-    sources = [array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
-    targets = [array(outputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.outvars)]
-    count = b.sext(b.load(array(inputs, 0, np.int32)), _I64)
-    entry, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("lanes", "program", "end"))
-    b.branch(head)
-    b.position_at_end(head)
-    first = b.phi(_I64)
-    b.cbranch(b.icmp_signed("<", first, count), inside, after)
-    b.position_at_end(inside)
-
-    def vector(pointer, at):
-        return b.bitcast(b.gep(pointer, [at]), ir.VectorType(pointer.type.pointee, lanes).as_pointer())
-
-    def load(source, at, is_shared):
-        value = e.splat(b.load(b.gep(source, [at]))) if is_shared else b.load(vector(source, at), align=1)
-        return b.icmp_unsigned("!=", value, e.constant_of(0, value.type)) if source.type.pointee == byte else value
-
-    def place(number, is_shared=False):
-        return _I64(number) if is_shared else b.add(b.mul(count, _I64(number)), first)
-
-    def argument(variable, source, is_shared):
-        shape = variable.aval.shape
-        if is_long(shape):
-            rows = [b.mul(b.add(first, _I64(i)), _I64(shape[0])) for i in range(lanes)]
-            return Memory(source, shape[0], None if is_shared else rows)
-        numbers = _boxed([load(source, place(k, is_shared), is_shared) for k in range(math.prod(shape))])
-        return _unboxed(numbers.reshape(shape))
-
-    arguments = [argument(*each) for each in zip(jaxpr.invars, sources, shared, strict=True)]
-    found = e.run(program, arguments, e.constant(True, bool))
-    for values, target in zip(found, targets):
-        for number, value in enumerate(_flat([values])):
-            if target.type.pointee == byte:
-                value = b.zext(value, ir.VectorType(byte, lanes))
-            b.store(value, vector(target, place(number)), align=1)
-    first.add_incoming(_I64(0), entry)
-    first.add_incoming(b.add(first, _I64(lanes)), b.block)
-    b.branch(head)
-    b.position_at_end(after)
-    b.ret_void()
-    return module
+def _listed(value) -> tuple | list:
+    return value if isinstance(value, (tuple, list)) else (value,)

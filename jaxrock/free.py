@@ -34,6 +34,23 @@ class FreeStage(eqx.Module):
     deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
     share: Scalar  # of an error of the present energy that is left in it
 
+    @classmethod
+    def none(cls, like: Scalar) -> "FreeStage":
+        """Of a block that does not move."""
+        zero, one, no = jnp.zeros_like(like), jnp.ones_like(like), jnp.zeros_like(like, bool)
+        return cls(
+            overturned=no,
+            impacts=jnp.zeros_like(like, jnp.int32),
+            peak=zero,
+            peak_time=zero,
+            peak_steepness=one,
+            peak_share=one,
+            fastest=zero,
+            closeness=jnp.full_like(like, jnp.inf),
+            deficit=jnp.full_like(like, jnp.inf),
+            share=one,
+        )
+
 
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""

@@ -19,6 +19,7 @@ except (ImportError, OSError):
     native, Unsupported = None, ()
 
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
+_NATIVE_LANES = 256  # of a chunk of the postponed in machine code, which leaves out what is not wanted
 _WIDE = 1 << 16  # on accelerators
 _FEW = 64  # scenes for which it is not worth compiling the quick version
 _ENDLESS = jnp.iinfo(jnp.int32).max
@@ -129,27 +130,26 @@ class _Batch:
         else:
             followed = _chunked(lambda part: quickly(_ENDLESS, *part), (ready.own, begun), self.size, _QUICK_LANES)
         # Outside the chunks, so that what nobody asks for is not computed.
-        return _again(function, scenes.own, *ready.each(self.passes.conclude, ready.own, followed))
+        return _again(lambda own, _: function(own), scenes.own, *ready.each(self.passes.conclude, ready.own, followed))
 
     def _natively(self, scenes: "_Lanes"):
-        """Both passes in machine code of our own."""
-        ready, begun = scenes.begin(self.passes.begin)
+        """From beginning to end in machine code of our own."""
+        passes, refilled = self.passes, self.passes.round is not None
 
-        def function(part):
-            own, states = part
-            return ready.each(self.passes.conclude, own, ready.each_natively(self.passes.carefully, own, states))[0]
+        def with_all(follow):
+            def function(tree):
+                scene, state = passes.begin(tree)
+                return passes.conclude(scene, follow(scene, state))
 
-        if self.passes.quickly is None or self.size <= _FEW:
-            return function((ready.own, begun))
+            return function
 
-        def quickly(limit, own, states):
-            return ready.each_natively(self.passes.quickly, own, states, limit)
+        def carefully(own, count=None):
+            return scenes.each_natively(with_all(passes.carefully), own, refilled, count)[0]
 
-        if self.passes.round is not None:
-            followed = self._in_rounds(quickly, ready, begun)
-        else:
-            followed = quickly(jnp.int32(_ENDLESS), ready.own, begun)
-        return _again(function, (ready.own, begun), *ready.each(self.passes.conclude, ready.own, followed))
+        if passes.quickly is None or self.size <= _FEW:
+            return carefully(scenes.own)
+        quickly = with_all(lambda scene, state: passes.quickly(scene, state, _ENDLESS))
+        return _again(carefully, scenes.own, *scenes.each_natively(quickly, scenes.own, refilled), _NATIVE_LANES)
 
     def _in_rounds(self, quickly: Callable, ready: "_Lanes", states):
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
@@ -159,7 +159,7 @@ class _Batch:
 
         def body(carry):
             limit, states, left = carry
-            states = _again(lambda part: quickly(limit, *part), (ready.own, states), states, left)
+            states = _again(lambda part, _: quickly(limit, *part), (ready.own, states), states, left)
             return limit + self.passes.round, states, unfinished(states)
 
         carry = jnp.int32(self.passes.round), states, unfinished(states)
@@ -185,18 +185,18 @@ class _Lanes:
         """`function(tree, *more)` of lanes with these leaves of their own."""
         return jax.vmap(lambda own, *more: function(self._tree(own), *more))(own, *more)
 
-    def each_natively(self, function: Callable, own: list, states, *limits):
-        """`function(tree, state, *limits)` in machine code of our own; all share the limits."""
-        states, structure = jax.tree.flatten(states)
-        count, end, rest = len(self.leaves), len(self.leaves) + len(states), iter(own)
+    def each_natively(self, function: Callable, own: list, refilled: bool, count=None):
+        """`function(tree)` in machine code of our own; `refilled` and `count`: see `native.run`."""
+        rest, structures = iter(own), []
         leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
 
         def flat(leaves):
-            tree, state = self.structure.unflatten(leaves[:count]), structure.unflatten(leaves[count:end])
-            return jax.tree.leaves(function(tree, state, *leaves[end:]))
+            found, structure = jax.tree.flatten(function(self.structure.unflatten(leaves)))
+            structures.append(structure)
+            return found
 
-        shared = [not flag for flag in self.flags] + [False] * len(states) + [True] * len(limits)
-        return structure.unflatten(native.run(flat, [*leaves, *states, *limits], shared))
+        found = native.run(flat, leaves, [not flag for flag in self.flags], refilled, count)
+        return structures[0].unflatten(found)
 
     def begin(self, function: Callable) -> tuple["_Lanes", Any]:
         """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of
@@ -237,9 +237,10 @@ def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
     return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
 
 
-def _again(function: Callable, leaves, found, which):
-    """`found`, with the results of `function(leaves)` in the places `which`, in chunks."""
-    lanes = _lanes(_LANES, which.size)
+def _again(function: Callable, leaves, found, which, most: int = _LANES):
+    """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first
+    `count` are wanted."""
+    lanes = _lanes(most, which.size)
     count = which.sum()
     order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
     order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
@@ -247,9 +248,9 @@ def _again(function: Callable, leaves, found, which):
     def body(carry):
         done, found = carry
         places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
-        # What is past the last is done again, with the same result.
-        places = jnp.where(done + jnp.arange(lanes) < count, places, places[0])
-        more = function(jax.tree.map(lambda x: x[places], leaves))
-        return done + lanes, jax.tree.map(lambda x, new: x.at[places].set(new), found, more)
+        wanted = done + jnp.arange(lanes) < count
+        more = function(jax.tree.map(lambda x: x[places], leaves), jnp.minimum(count - done, lanes))
+        targets = jnp.where(wanted, places, which.size)  # nowhere
+        return done + lanes, jax.tree.map(lambda x, new: x.at[targets].set(new, mode="drop"), found, more)
 
     return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]

@@ -8,41 +8,55 @@ vector register, and then for the next few. XLA calls it as a foreign function.
 import ctypes
 import functools
 import hashlib
+import math
 import threading
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.extend.core import Literal
 from llvmlite import binding, ir
 
 from jaxrock._keep import nothing_kept
-from jaxrock.emitter import emit, is_long
+from jaxrock.emitter import SMALL, is_known
+from jaxrock.kernels import emit, emit_loop, is_long
+from jaxrock.programs import ahead, around_loop, computed
 
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
-def run(function: Callable, leaves: list, shared: list[bool]) -> list:
+def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = False, count=None) -> list:
     """`function(leaves)` (a list) for many lanes: leaves that are not `shared` have a leading axis, and so do results.
 
+    `refilled`: in the function's one loop a lane that is done does not wait for others. `count`: of how many lanes, the
+    first, there have to be results (at least 1; known at run time only).
     Raises `Unsupported` if the function does what is not known in `operations`.
     """
     shapes = [x.shape if same else x.shape[1:] for x, same in zip(leaves, shared)]
     like = [jax.ShapeDtypeStruct(shape, x.dtype) for shape, x in zip(shapes, leaves)]
     with nothing_kept():
         program = jax.make_jaxpr(lambda leaves: function(leaves))(like)
-    name = registered(program, shared)
+    values = dict(zip(program.jaxpr.invars, leaves))
+    once, each, rest = ahead(program, shared, is_known, lambda v: math.prod(v.aval.shape) > SMALL)
+    computed(once, values, batched=False)
+    computed(each, values, batched=True)
+
     size = next(x.shape[0] for x, same in zip(leaves, shared) if not same)
     more = -size % _machine().lanes
-
-    def laid_out(x, same):
-        if same:
-            return x
+    sizes = jnp.stack([jnp.int32(size + more), jnp.asarray(size if count is None else count, jnp.int32)])
+    own = {v for v, same in zip(program.jaxpr.invars, shared) if not same} | set(each.outputs)
+    for v in [v for v in rest.inputs if v in own]:
+        x = values[v]
         x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
-        return x if is_long(x.shape[1:]) else jnp.moveaxis(x, 0, -1)
-
-    results = [jax.ShapeDtypeStruct((*v.aval.shape, size + more), v.aval.dtype) for v in program.jaxpr.outvars]
-    found = jax.ffi.ffi_call(name, results)(np.int32(size + more), *map(laid_out, leaves, shared))
+        values[v] = x if is_long(v.aval.shape) else jnp.moveaxis(x, 0, -1)
+    for part in around_loop(rest) if refilled else [rest]:
+        is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
+        name = registered(part.program, [v not in own for v in part.inputs], emit_loop if is_loop else emit)
+        shapes = [(*v.aval.shape, size + more) for v in part.outputs]
+        results = [jax.ShapeDtypeStruct(shape, v.aval.dtype) for shape, v in zip(shapes, part.outputs)]
+        found = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
+        values.update((v, x) for v, x in zip(part.outputs, found) if not isinstance(v, Literal))
+        own.update(v for v in part.outputs if not isinstance(v, Literal))
     return [jnp.moveaxis(x, -1, 0)[:size] for x in found]
 
 
@@ -53,7 +67,7 @@ class _Machine:
         binding.initialize_native_target()
         binding.initialize_native_asmprinter()
         features = binding.get_host_cpu_features()
-        self.lanes = 8 if features.get("avx512f") else 4
+        self.lanes = 16 if features.get("avx512f") else 8  # two registers: one computes while the other waits
         self._target = binding.Target.from_default_triple().create_target_machine(
             cpu=binding.get_host_cpu_name(), features=features.flatten(), opt=3
         )
@@ -87,7 +101,7 @@ def _made() -> _Machine:
 _registered = set()
 
 
-def registered(program, shared: list[bool]) -> str:
+def registered(program, shared: list[bool], emit: Callable = emit) -> str:
     """The name under which XLA finds the machine code of a program: made of its text, so that compiled programs that a
     cache keeps find it again."""
     module = emit(program, shared, _machine().lanes, "program")

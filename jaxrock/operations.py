@@ -12,7 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from jaxrock._trigonometry import exponential, exponential_less_one, logarithm, sine_cosine_of_any
+from jaxrock._trigonometry import (
+    arcsine,
+    arctangent_of,
+    exponential,
+    exponential_less_one,
+    hyperbolic_arctangent,
+    hyperbolic_tangent,
+    logarithm,
+    sine_cosine_of_any,
+    tangent,
+)
 
 _BOOL = np.dtype(bool)
 _CONTRACT = ("contract",)  # a product and a sum may be rounded once
@@ -38,12 +48,20 @@ def _arithmetic(of_floats: str, of_integers: str):
     return operation
 
 
-def _of_floats(function: Callable):
-    def operation(e, _, x, y):
-        if not is_float(x):
-            # A divisor of zero, if only in a lane that is done, would stop the process.
-            raise Unsupported("a division of integers")
-        return function(e, x, y)
+def _quotient(of_rest: bool):
+    """Quotient or remainder, of integers as JAX has it where the divisor is zero or the result is too large."""
+
+    def operation(e, equation, x, y):
+        if is_float(x):
+            return e.each("fmod", x, y) if of_rest else e.b.fdiv(x, y)
+        limits = np.iinfo(equation.invars[0].aval.dtype)
+        zero, one, least = (e.constant_of(k, x.type) for k in (0, 1, limits.min))
+        none = e.b.icmp_signed("==", y, zero)
+        huge = e.b.and_(e.b.icmp_signed("==", x, least), e.b.icmp_signed("==", y, e.b.neg(one)))
+        # The processor would stop there, if only in a lane that is done.
+        divisor = e.b.select(e.b.or_(none, huge), one, y)
+        found = e.b.srem(x, divisor) if of_rest else e.b.sdiv(x, divisor)
+        return e.b.select(none, x if of_rest else e.b.neg(one), found)
 
     return operation
 
@@ -142,9 +160,9 @@ def _is_finite(e, equation, x):
 def _by(function: Callable):
     """An operation that consists of others: a call of a scalar function would be slow."""
 
-    def operation(e, equation, x):
-        like = jax.ShapeDtypeStruct((), equation.invars[0].aval.dtype)
-        (found,) = e.run(jax.make_jaxpr(function)(like), [x], None)
+    def operation(e, equation, *values):
+        like = [jax.ShapeDtypeStruct((), v.aval.dtype) for v in equation.invars]
+        (found,) = e.run(jax.make_jaxpr(function)(*like), list(values), None)
         return found
 
     return operation
@@ -160,8 +178,8 @@ OPERATIONS: dict[str, Callable] = {
     "add_any": _arithmetic("fadd", "add"),
     "sub": _arithmetic("fsub", "sub"),
     "mul": _arithmetic("fmul", "mul"),
-    "div": _of_floats(lambda e, x, y: e.b.fdiv(x, y)),
-    "rem": _of_floats(lambda e, x, y: e.each("fmod", x, y)),
+    "div": _quotient(of_rest=False),
+    "rem": _quotient(of_rest=True),
     "min": _extremum("<"),
     "max": _extremum(">"),
     "neg": _negative,
@@ -170,6 +188,7 @@ OPERATIONS: dict[str, Callable] = {
     "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
     "integer_pow": _power,
     "sqrt": lambda e, _, x: e.intrinsic("sqrt", x),
+    "rsqrt": lambda e, q, x: e.b.fdiv(e.constant(1, q.invars[0].aval.dtype), e.intrinsic("sqrt", x)),
     "floor": lambda e, _, x: e.intrinsic("floor", x),
     "ceil": lambda e, _, x: e.intrinsic("ceil", x),
     "round": _round,
@@ -179,7 +198,12 @@ OPERATIONS: dict[str, Callable] = {
     "log": _by(_logarithm_of_any),
     "sin": _by(lambda x: sine_cosine_of_any(x)[0]),
     "cos": _by(lambda x: sine_cosine_of_any(x)[1]),
-    "atan2": lambda e, _, x, y: e.each("atan2", x, y),
+    "tan": _by(tangent),
+    "asin": _by(arcsine),
+    "atan": _by(lambda x: arctangent_of(x, jnp.ones_like(x))),
+    "atan2": _by(arctangent_of),
+    "tanh": _by(hyperbolic_tangent),
+    "atanh": _by(hyperbolic_arctangent),
     "lt": _compare("<"),
     "le": _compare("<="),
     "gt": _compare(">"),
@@ -215,6 +239,17 @@ def _slice(parameters, x):
     return x[tuple(slice(*each) for each in zip(*ends))]
 
 
+def _pad(parameters, x, filling):
+    config = parameters["padding_config"]
+    if any(min(each) < 0 for each in config):
+        raise Unsupported("padding that takes away")
+    inner = [n + max(n - 1, 0) * between for n, (_, _, between) in zip(x.shape, config)]
+    found = np.full([low + n + high for n, (low, high, _) in zip(inner, config)], filling[()], object)
+    places = zip(inner, config)
+    found[tuple(slice(low, low + n, between + 1) for n, (low, _, between) in places)] = x
+    return found
+
+
 # What moves the elements of small arrays about: functions of the parameters and NumPy arrays of vectors.
 MOVES: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast,
@@ -223,6 +258,8 @@ MOVES: dict[str, Callable] = {
     "reshape": lambda parameters, x: x.reshape(parameters["new_sizes"]),
     "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
     "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
+    "pad": _pad,
+    "split": lambda parameters, x: np.split(x, np.cumsum(parameters["sizes"])[:-1], parameters["axis"]),
     "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
     "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
 }

@@ -213,7 +213,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(crossing | impact | meeting.stops)
     piece, local, over = stepper.move_on(state, elapsed, full)
-    errors = 2 * least, 2 * least * jnp.maximum(order / (at * stretch), 1.0)
+    time = jnp.where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
+    errors = 2 * least, 2 * least * jnp.maximum(order / time, 1.0)
     spread = stepper.spread_after(state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
@@ -311,7 +312,8 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
     share = jnp.zeros_like(length)
     for part in (*reversed(_SHORTER), 1.0):
         share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
-    return jnp.where((slope[0] == 0) & (len(terms) <= 2), 1.0, share)
+    steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
+    return jnp.where(steady, 1.0, share)
 
 
 def most_steps(pieces: int) -> int:

@@ -27,6 +27,11 @@ def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array,
     return values
 
 
+def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
+    return jax.lax.associative_scan(jnp.maximum, values, reverse=True)
+
+
 def peak_bound(motion: AbstractMotion) -> Scalar:
     """A bound of the motion's acceleration [g]: its peak, for records and most pulses."""
     return jnp.max(motion.bounds)
@@ -117,9 +122,9 @@ class Scene(eqx.Module):
             knots=knots,
             lengths=jnp.concatenate([jnp.diff(knots), infinity]),
             scales=jnp.concatenate([scales, infinity]),
-            ceilings=jax.lax.cummax(bounds, reverse=True),
-            vertical_ceilings=None if vertical is None else jax.lax.cummax(jnp.pad(vertical, (0, 1)), reverse=True),
-            drives=jax.lax.cummax(drive, reverse=True),
+            ceilings=_running_maximum(bounds),
+            vertical_ceilings=None if vertical is None else _running_maximum(jnp.pad(vertical, (0, 1))),
+            drives=_running_maximum(drive),
             quiet_near=_sliding_maximum(drive, _NEAR) if skips else drive,
             quiet_far=_sliding_maximum(drive, _FAR) if skips else drive,
             falls_flat=model.falls_flat,

@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike, Bool, Inexact, Int
 from jaxrock._keep import keep, unseen_one
 from jaxrock.derivatives import differentiable, with_derivatives_of
 from jaxrock.engine import AbstractEngine, AbstractStepper, either, when
-from jaxrock.free import Visit, free_stage
+from jaxrock.free import FreeStage, Visit, free_stage
 from jaxrock.models import Angle, Table
 from jaxrock.motion import Shaking
 from jaxrock.polynomial import (
@@ -128,11 +128,15 @@ class TaylorStepper(AbstractStepper):
         scene = self.scene.on(state.side)
         table = scene.table
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        # In reverse mode what is not taken (roots of zero) would spoil what is.
-        follow = differentiable(lambda scene: free_stage(*scene)) if self.taped else lambda scene: free_stage(*scene)
         here, there = Visit(table, scene.restitution), Visit(scene.tables[1], scene.far_restitution)
         visits = (here, there) if scene.far is None else (here, there, here)
-        stage = follow((visits, state.opening, state.velocity, moving))
+        start = visits, state.opening, state.velocity, moving
+        if self.taped:
+            # In reverse mode what is not taken (roots of zero) would spoil what is.
+            stage = differentiable(lambda start: free_stage(*start))(start)
+        else:
+            none = FreeStage.none(state.opening)
+            stage = jax.lax.cond(moving, lambda: free_stage(*start), lambda: none)
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
         beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)

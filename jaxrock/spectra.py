@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -171,8 +170,8 @@ def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, e
 
     scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
     # Neighbours in intensity share a chunk: they move alike.
-    found = surface(_under_pulse(pulse, model, engine), (ratio, intensity), scene, label, progress)
-    return jax.tree.map(jnp.transpose, found), ratio, intensity
+    found = surface(_under_pulse(pulse, model, engine), (ratio, intensity), scene, label, progress, turned=True)
+    return found, ratio, intensity
 
 
 def axis(name: str, values: Values) -> Float[Array, " n"]:

@@ -118,10 +118,13 @@ def surface(
     label: str,
     progress: bool | None,
     outer: bool = True,
+    turned: bool = False,
 ):
-    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front."""
+    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front
+    (`turned`: with its axes the other way round)."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
-    return jax.tree.map(jnp.asarray, compute(function, plan, scene, label, progress)[0])
+    found = compute(function, plan, scene, label, progress)[0]
+    return jax.tree.map(lambda x: jnp.asarray(x.T if turned else x), found)
 
 
 class Plan(NamedTuple):
@@ -198,17 +201,18 @@ def compute(
     if resumed and own == 0 and progress is not False:
         print(f"{label}: {resumed:,} of {math.prod(plan.shape):,} points come from {store.path}", file=sys.stderr)
     bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
-    results = None if store else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
+    whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
+    results = None if store or whole else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
     for number in mine:
         place = plan.place(number)
         shape = tuple(p.stop - p.start for p in place)
-        order = _tiles(shape)
-        found = run([x[order] for x in plan.points(number)], bar.add)
-        back = np.argsort(order)
-        found = [leaf[back].reshape(*shape, *leaf.shape[1:]) for leaf in found]
+        found = run(plan.points(number), bar.add, _tiles(shape))
+        found = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in found]
         if store:
             store.write(place, found)
+        elif whole:
+            results = found
         else:
             for leaf, part in zip(results, found):
                 leaf[place] = part
@@ -245,7 +249,9 @@ def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
     each of which is compiled."""
     share = -(-points // devices)
     least, most = (64, 16384) if platform == "cpu" else (1024, 65536)
-    return _ROWS, devices, 2 ** (min(max(share, least), most) - 1).bit_length()
+    lanes = 2 ** (min(max(share, least), most) - 1).bit_length()
+    rows = min(_ROWS, 2 ** (max(-(-share // lanes), 1) - 1).bit_length())
+    return rows, devices, lanes
 
 
 def _deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
@@ -254,11 +260,10 @@ def _deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     return points.reshape(rows, lanes // _CHUNK, devices, _CHUNK).swapaxes(1, 2).reshape(shape)
 
 
-def _collect(dealt: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Results of a batch in the order of the flat points."""
-    rows, devices, lanes = shape
-    rest = dealt.shape[3:]
-    return dealt.reshape(rows, devices, lanes // _CHUNK, _CHUNK, *rest).swapaxes(1, 2).reshape(-1, *rest)
+@functools.lru_cache(maxsize=16)
+def _dealt(shape: tuple[int, int, int]) -> list[np.ndarray]:
+    """Which of a batch's points every device has, in its order."""
+    return [own.ravel() for own in np.moveaxis(_deal(np.arange(math.prod(shape)), shape), 1, 0)]
 
 
 @functools.lru_cache(maxsize=16)
@@ -285,31 +290,47 @@ class Runner:
         found, self.tree = jax.tree.flatten(found)
         self.shapes = [jax.ShapeDtypeStruct(x.shape[3:], x.dtype) for x in found]
 
-    def __call__(self, points: list[np.ndarray], report: Callable[[int], None] = lambda more: None) -> list[np.ndarray]:
-        """Results at flat points: the leaves of what the function returns, as NumPy arrays."""
-        size, batch = points[0].size, math.prod(self._layout)
-        found = [np.empty((size, *x.shape), x.dtype) for x in self.shapes]
-        for begin, leaves in self._batches(points, batch):
-            end = min(begin + batch, size)
-            leaves = [_collect(np.asarray(part), self._layout)[: end - begin] for part in leaves]
-            for message, failed in zip(self._messages, leaves[len(found) :]):
-                if failed.any():
-                    place = ", ".join(f"{x[begin + failed.argmax()]:g}" for x in points)
-                    raise ValueError(f"{message}, but is not at the point ({place}).")
-            for whole, part in zip(found, leaves):
-                whole[begin:end] = part
-            report(end - begin)
+    def __call__(
+        self,
+        points: list[np.ndarray],
+        report: Callable[[int], None] = lambda more: None,
+        order: np.ndarray | None = None,
+    ) -> list[np.ndarray]:
+        """Results at flat points: the leaves of what the function returns, as NumPy arrays; `order`: in which they are
+        computed."""
+        order = np.arange(points[0].size) if order is None else order
+        found = [np.empty((order.size, *x.shape), x.dtype) for x in self.shapes]
+        for numbers, leaves in self._batches(points, order):
+            for device, dealt in enumerate(_dealt(self._layout)):
+                there = dealt < numbers.size
+                targets = numbers[dealt] if there.all() else numbers[dealt[there]]
+                own = [self._of_device(part, device) for part in leaves]
+                own = own if there.all() else [x[there] for x in own]
+                for message, failed in zip(self._messages, own[len(found) :]):
+                    if failed.any():
+                        place = ", ".join(f"{x[targets[failed.argmax()]]:g}" for x in points)
+                        raise ValueError(f"{message}, but is not at the point ({place}).")
+                for whole, part in zip(found, own):
+                    whole[targets] = part
+            report(numbers.size)
         return found
 
-    def _batches(self, points: list[np.ndarray], batch: int) -> Iterator[tuple[int, list[jax.Array]]]:
-        """One batch is under way while the one before it is taken."""
-        waiting = collections.deque()
-        for begin in range(0, points[0].size, batch):
-            parts = [x[begin : begin + batch] for x in points]
-            rows = np.int32(-(-parts[0].size // math.prod(self._layout[1:])))
-            parts = [_deal(np.pad(x, (0, batch - x.size), mode="edge"), self._layout) for x in parts]
-            found = self._call(jax.device_put(parts, self._dealt), rows, self._scene)
-            waiting.append((begin, jax.tree.leaves(found)))
+    @staticmethod
+    def _of_device(dealt: jax.Array, device: int) -> np.ndarray:
+        """One device's part of results: its own memory, where that can be read."""
+        (shard,) = (x for x in dealt.addressable_shards if (x.index[1].start or 0) == device)
+        part = np.asarray(shard.data)
+        return part.reshape(-1, *part.shape[3:])
+
+    def _batches(self, points: list[np.ndarray], order: np.ndarray) -> Iterator[tuple[np.ndarray, list[jax.Array]]]:
+        """Numbers of points, and their results. One batch is under way while the one before it is taken."""
+        waiting, batch = collections.deque(), math.prod(self._layout)
+        for begin in range(0, order.size, batch):
+            numbers = order[begin : begin + batch]
+            rows = np.int32(-(-numbers.size // math.prod(self._layout[1:])))
+            parts = [np.pad(x[numbers], (0, batch - numbers.size), mode="edge") for x in points]
+            found = self._call(jax.device_put([_deal(x, self._layout) for x in parts], self._dealt), rows, self._scene)
+            waiting.append((numbers, jax.tree.leaves(found)))
             if len(waiting) > 1:
                 yield waiting.popleft()
         yield from waiting

@@ -65,14 +65,20 @@ class Expansion(NamedTuple):
 
 
 def _total(terms: list):
-    """Their sum, in four chains side by side: additions one after the other would wait for each other."""
-    chains = [sum(terms[i + 4 :: 4], start=terms[i]) for i in range(min(4, len(terms)))]
-    return sum(chains[1:], start=chains[0]) if len(chains) < 4 else (chains[0] + chains[1]) + (chains[2] + chains[3])
+    """Their sum, the last two last: what is new waits for no other sum."""
+    *early, last = terms
+    chains = [sum(early[i + 2 :: 2], start=early[i]) for i in range(min(2, len(early)))]
+    return sum(chains[1:] + [last], start=chains[0]) if chains else last
+
+
+def _by_age(k: int, count: int) -> list[int]:
+    """Numbers j below `count` in the order in which the later of the coefficients j and k - j is known."""
+    return sorted(range(min(k + 1, count)), key=lambda j: max(j, k - j))
 
 
 def _product(first: list, second: list, k: int):
     """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
-    terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
+    terms = [first[j] * second[k - j] for j in _by_age(k, len(first)) if second[k - j] is not None]
     return _total(terms) if terms else 0.0
 
 
@@ -85,10 +91,11 @@ def expand(start: Start, order: int) -> Expansion:
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
     sine, cosine, arms, restorings = [angle.sine], [angle.cosine], [], []
     scale = keep_by(-(start.stretch**2), one)
+    pushes = [start.side * u for u in start.shaking.horizontal]
     for k in range(order - 1):
         if table.trigonometric and k > 0:
-            sine.append(keep_by(_total([slopes[j] * cosine[k - 1 - j] for j in range(k)]) * (1 / k), one))
-            cosine.append(keep_by(_total([slopes[j] * sine[k - 1 - j] for j in range(k)]) * (-1 / k), one))
+            sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
+            cosine.append(keep_by(_product(slopes, sine, k - 1) * (-1 / k), one))
 
         def combine(constant, line, of_sine, of_cosine, k):
             terms = [] if constant is None or k > 0 else [constant]
@@ -99,13 +106,13 @@ def expand(start: Start, order: int) -> Expansion:
 
         arm = combine(table.m0, None, table.ms, table.mc, k)
         arms.append(arm if arm is None else keep_by(arm, one))
-        moment = _product(start.shaking.horizontal, arms, k) * start.side
+        moment = _product(pushes, arms, k)
         restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
         restorings.append(restoring)
         moment = moment if restoring is None else moment + restoring
         if start.shaking.vertical is not None:
             moment = moment + _product(start.shaking.vertical, restorings, k)
-        term = keep_by(scale * moment * (1 / ((k + 1) * (k + 2))), one)
+        term = keep_by(moment * (scale * (1 / ((k + 1) * (k + 2)))), one)
         if k == 0:
             term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)

@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import weakref
 from collections.abc import Callable, Iterator
 
 import jax
@@ -31,7 +32,7 @@ class Traced:
         self.shapes, self.messages, self.constants = shapes[0], tuple(messages), tuple(closed.consts)
         self._jaxpr, self._tree = closed.jaxpr, jax.tree.structure(shapes)
         # JAX prints no addresses and no arrays here: the arrays follow one by one.
-        told = hashlib.sha256(f"{closed.jaxpr}".encode())
+        told = hashlib.sha256(_text(closed.jaxpr).encode())
         callbacks = []
         for part in _hidden(closed.jaxpr):
             if callable(part):
@@ -56,6 +57,34 @@ class Traced:
         return isinstance(other, Traced) and self._key == other._key
 
 
+def _is_compiled(equation) -> bool:
+    """Whether an operation is a call of a function under `jax.jit`."""
+    return equation.primitive.name in ("jit", "pjit") and isinstance(equation.params.get("jaxpr"), ClosedJaxpr)
+
+
+_known = weakref.WeakKeyDictionary()
+
+
+def _known_of(jaxpr: Jaxpr) -> tuple[str, tuple]:
+    """The digest of a program's text, and what that does not show: each program is printed and searched once."""
+    if jaxpr not in _known:
+        _known[jaxpr] = hashlib.sha256(f"{jaxpr}".encode()).hexdigest(), tuple(_hidden(jaxpr))
+    return _known[jaxpr]
+
+
+def _text(jaxpr: Jaxpr) -> str:
+    """A program in words; functions under `jax.jit`, which JAX traces once, stand in it as digests."""
+    digests, short = [], []
+    for equation in jaxpr.eqns:
+        if _is_compiled(equation):
+            inner = equation.params["jaxpr"]
+            digests.append(_known_of(inner.jaxpr)[0])
+            empty = ClosedJaxpr(inner.jaxpr.replace(eqns=[]), inner.consts)
+            equation = equation.replace(params=equation.params | {"jaxpr": empty})
+        short.append(equation)
+    return f"{jaxpr.replace(eqns=short)} {digests}"
+
+
 def _tell(told, value) -> None:
     array = np.asarray(value)
     told.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
@@ -64,6 +93,10 @@ def _tell(told, value) -> None:
 def _hidden(jaxpr: Jaxpr) -> Iterator:
     """What the print of a program does not show: arrays within it, and functions it calls back."""
     for equation in jaxpr.eqns:
+        if _is_compiled(equation):
+            yield from equation.params["jaxpr"].consts
+            yield from _known_of(equation.params["jaxpr"].jaxpr)[1]
+            continue
         for value in equation.params.values():
             for part in value if isinstance(value, (tuple, list)) else (value,):
                 if isinstance(part, ClosedJaxpr):

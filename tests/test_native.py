@@ -43,6 +43,7 @@ REAL = {
     "negative": lambda x, y: -x,
     "sign": lambda x, y: jnp.sign(x),
     "root": lambda x, y: jnp.sqrt(jnp.abs(x)),
+    "one over a root": lambda x, y: jax.lax.rsqrt(x),
     "powers": lambda x, y: x**2 + y**3,
     "down": lambda x, y: jnp.floor(x),
     "up": lambda x, y: jnp.ceil(x),
@@ -60,7 +61,9 @@ REAL = {
 @pytest.mark.parametrize("name", REAL)
 def test_operations_on_real_numbers(name):
     """Zeros of both signs, infinite, and what is not a number."""
-    agree(lambda x, y: [REAL[name](x, y)], NUMBERS, OTHERS, rtol=1e-15 if name == "powers" else 0.0)
+    agree(
+        lambda x, y: [REAL[name](x, y)], NUMBERS, OTHERS, rtol=1e-15 if name in ("powers", "one over a root") else 0.0
+    )
 
 
 @pytest.mark.parametrize("name", ["sum", "quotient", "smaller", "sign", "to even", "whole", "chosen"])
@@ -101,12 +104,75 @@ def test_without_double_precision():
         agree(lambda x: [jnp.where(x > 0.5, 2 * x + 1, x * 3), jnp.round(x).astype(int) + 1], x)
 
 
-@pytest.mark.parametrize("function", [jnp.exp, jnp.sin, jnp.cos, jnp.log, lambda x: jnp.arctan2(x, 2.0)])
-def test_functions(function):
-    """Our own: to a few units of rounding."""
-    x = np.linspace(0.01, 20, 50)
-    found, expected = both(lambda x: [function(x)], x)
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-15, atol=4e-16)
+FUNCTIONS = {
+    "exp": (jnp.exp, np.linspace(0.01, 20, 50)),
+    "sin": (jnp.sin, np.linspace(0.01, 20, 50)),
+    "cos": (jnp.cos, np.linspace(0.01, 20, 50)),
+    "log": (jnp.log, np.linspace(0.01, 20, 50)),
+    "tan": (jnp.tan, np.linspace(-1.5, 1.5, 51)),
+    "arcsin": (jnp.arcsin, np.concatenate([np.linspace(-1, 1, 81), [1e-300, 1 - 1e-15, 1.1]])),
+    "arctan": (jnp.arctan, np.concatenate([np.linspace(-3, 3, 81), [1e-300, -1e9, np.inf, -np.inf, np.nan]])),
+    "tanh": (jnp.tanh, np.concatenate([np.linspace(-3, 3, 61), [1e-300, 1e-9, 40.0, -400.0, np.inf]])),
+    "artanh": (jnp.arctanh, np.concatenate([np.linspace(-1, 1, 81), [1e-300, 1e-9, 1 - 1e-15, 1.1]])),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions(name):
+    """Our own: to a few units of rounding; NumPy is the judge."""
+    function, x = FUNCTIONS[name]
+    found, _ = both(lambda x: [function(x)], x)
+    with np.errstate(all="ignore"):
+        np.testing.assert_allclose(found[0], getattr(np, function.__name__)(x), rtol=1e-15, atol=4e-16)
+
+
+def test_angles_of_points():
+    """In all quadrants, on the axes, with zeros of both signs, and far away."""
+    x, y = (v.ravel() for v in np.meshgrid(NUMBERS, OTHERS))
+    (found,), _ = both(lambda y, x: [jnp.arctan2(y, x)], y, x)
+    np.testing.assert_allclose(found, np.arctan2(y, x), rtol=5e-16)
+    known = ~np.isnan(found)
+    np.testing.assert_array_equal(np.signbit(found[known]), np.signbit(np.arctan2(y, x)[known]))
+
+
+def test_quotients_of_integers():
+    """Also by zero, and one that is too large: the processor would stop there."""
+    first, second = (v.ravel() for v in np.meshgrid(WHOLE, WHOLE))
+    agree(lambda a, b: [jax.lax.div(a, b), jax.lax.rem(a, b), a % jnp.maximum(jnp.abs(b), 1)], first, second)
+
+
+def test_what_is_not_known_at_first_is_done_before():
+    """By XLA, for all lanes; so is what they share."""
+
+    def function(x, table):
+        start = jnp.sort(jnp.stack([x, -x]))[1] + jnp.cumsum(table)[-1]
+        return list(jax.lax.while_loop(lambda s: s[0] < 50, lambda s: (s[0] * 2 + table[2], s[1] + 1), (start, 0)))
+
+    agree(function, np.linspace(-2, 2, 19), np.arange(1.0, 12.0), shared=(1,), rtol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 200])
+def test_lanes_are_filled_again(count):
+    """Loops of any length, none at all too; lists and small arrays that are a lane's own; flags; what all share."""
+
+    def function(x, own, pair, flag, table):
+        turns = jnp.round(jnp.abs(7 * jnp.sin(40 * x))).astype(int)
+
+        def step(s):
+            i, total, odd, last = s
+            return i + 1, total + x * table[i] + own[i] * pair[0], ~odd, jnp.stack([total, pair[1]])
+
+        i, total, odd, last = jax.lax.while_loop(lambda s: s[0] < turns, step, (0, x, flag, pair * 0))
+        return [i, total * 2 + i, odd, last]
+
+    random = np.random.default_rng(0)
+    x, own, pair = random.random(count), random.random((count, 9)), random.random((count, 2))
+    values = [jnp.asarray(v) for v in (x, own, pair, x > 0.5, np.arange(9.0))]
+    flags = [False] * 4 + [True]
+    found = jax.jit(lambda *v: native.run(lambda leaves: function(*leaves), list(v), flags, True))(*values)
+    expected = jax.vmap(function, in_axes=(0, 0, 0, 0, None))(*values)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
 def test_exponential_less_one():
@@ -220,17 +286,25 @@ def test_places_outside_of_a_table():
     agree(lambda i, table: [table[i]], np.array([-30, -1, 0, 9, 10, 300]), np.arange(10.0), shared=(1,))
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: jnp.sort(jnp.stack([x, 2 * x]))[0],
-        lambda x: jax.scipy.special.gamma(x),
-        lambda x: jnp.cumsum(x[None])[0],
-    ],
-)
-def test_what_is_not_known_is_said(function):
-    with pytest.raises(Unsupported):
-        both(lambda x: [function(x)], NUMBERS)
+UNKNOWN = {
+    "sort": lambda x: jnp.sort(jnp.stack([x, 2 * x]))[0],
+    "gamma": lambda x: jax.scipy.special.gamma(x),
+    "running sum": lambda x: jnp.cumsum(x[None])[0],
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_is_not_known_is_said(name):
+    """After a loop, or in it; before it XLA does it."""
+
+    def doubled(x, more=lambda x: x):
+        return jax.lax.while_loop(lambda x: jnp.abs(x) < 50, lambda x: 2 * x + jnp.abs(more(x)), x + 1)
+
+    x = np.linspace(1, 2, 9)
+    for function in (lambda x: UNKNOWN[name](doubled(x)), lambda x: doubled(x, UNKNOWN[name])):
+        with pytest.raises(Unsupported):
+            both(lambda x, function=function: [function(x)], x)
+    agree(lambda x: [doubled(UNKNOWN[name](3 * x))], x, rtol=1e-14)
 
 
 def test_programs_have_names_of_their_own():

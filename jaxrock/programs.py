@@ -1,0 +1,101 @@
+"""Programs of JAX in parts: what XLA computes, what is machine code, and the loop among that."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+
+
+class Part(NamedTuple):
+    """Some operations of a program."""
+
+    program: ClosedJaxpr
+
+    @property
+    def inputs(self) -> list:
+        """The program's variables that it starts from."""
+        return self.program.jaxpr.invars
+
+    @property
+    def outputs(self) -> list:
+        """The variables that it gives."""
+        return self.program.jaxpr.outvars
+
+
+def _part(program: ClosedJaxpr, equations: list, outputs: list) -> Part:
+    """The part of some operations, in order; `outputs`: variables that may be its inputs, too."""
+    jaxpr = program.jaxpr
+    made, constants = {v for equation in equations for v in equation.outvars}, set(jaxpr.constvars)
+    used = [v for equation in equations for v in equation.invars] + outputs
+    inputs = [v for v in used if not isinstance(v, Literal) and v not in made and v not in constants]
+    # Arguments have no names here: JAX would compare their number.
+    told = jaxpr.debug_info.with_unknown_names()
+    cut = jaxpr.replace(invars=list(dict.fromkeys(inputs)), outvars=outputs, eqns=equations, debug_info=told)
+    return Part(ClosedJaxpr(cut, program.consts))
+
+
+def _needed(equations: list, outputs: list) -> dict:
+    """Variables that operations, or results, start from."""
+    used = [v for equation in equations for v in equation.invars] + outputs
+    return dict.fromkeys(v for v in used if not isinstance(v, Literal))
+
+
+def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long: Callable) -> tuple[Part, Part, Part]:
+    """What XLA computes first, of what all lanes share and of each lane's own; and the rest.
+
+    All that lanes share is computed once. A lane's own is left to the rest, but for long arrays, and operations that
+    are not known, with what they need; loops are in the rest, and what follows from it.
+    """
+    jaxpr = program.jaxpr
+    needed = set()
+    for equation in reversed(jaxpr.eqns):
+        if equation.primitive.name != "while" and (not is_known(equation) or needed.intersection(equation.outvars)):
+            needed.update(equation.outvars)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    own = {v for v, same in zip(jaxpr.invars, shared, strict=True) if not same}
+    parts, later = ([], [], []), set()
+    for equation in jaxpr.eqns:
+        inputs = {v for v in equation.invars if not isinstance(v, Literal)}
+        before = needed.intersection(equation.outvars) or any(map(is_long, equation.outvars))
+        if inputs & later or (inputs & own and not before):
+            later |= set(equation.outvars)
+            parts[2].append(equation)
+        elif inputs & own:
+            own |= set(equation.outvars)
+            parts[1].append(equation)
+        else:
+            parts[0].append(equation)
+    for_rest = _needed(parts[2], jaxpr.outvars)
+
+    def results(part, needed):
+        return [v for equation in part for v in equation.outvars if v in needed]
+
+    first = _part(program, parts[0], results(parts[0], for_rest | _needed(parts[1], [])))
+    second = _part(program, parts[1], results(parts[1], for_rest))
+    return first, second, _part(program, parts[2], list(jaxpr.outvars))
+
+
+def around_loop(part: Part) -> list[Part]:
+    """What comes before the one loop of a part, the loop, and what comes after it; or the whole, if that is not so."""
+    program, equations = part.program, part.program.jaxpr.eqns
+    places = [i for i, equation in enumerate(equations) if equation.primitive.name == "while"]
+    if len(places) != 1:
+        return [part]
+    before, loop, after = equations[: places[0]], equations[places[0]], equations[places[0] + 1 :]
+    made = [v for equation in before for v in equation.outvars]
+    needed = _needed([loop, *after], part.outputs)
+    parts = [_part(program, before, [v for v in made if v in needed])] if before else []
+    parts.append(_part(program, [loop], list(loop.outvars)))
+    return [*parts, _part(program, after, part.outputs)] if after or part.outputs != loop.outvars else parts
+
+
+def computed(part: Part, values: dict, batched: bool) -> None:
+    """Add the results of a part to the values of variables; `batched`: with a leading axis of lanes."""
+    if part.outputs:
+        function = jaxpr_as_fun(part.program)
+        given = [values[v] for v in part.inputs]
+        if batched:
+            axes = [0 if values[v].ndim > len(v.aval.shape) else None for v in part.inputs]
+            function = jax.vmap(function, in_axes=axes)
+        values.update(zip(part.outputs, function(*given), strict=True))
