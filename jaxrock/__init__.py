@@ -34,6 +34,7 @@ from jaxrock.hazard import (
     toppling_rate as toppling_rate,
 )
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.histories import HistoryFit as HistoryFit, HistoryStatus as HistoryStatus, fit_history as fit_history
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
 from jaxrock.pulses import (

@@ -66,8 +66,10 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
+    "least_squares": set(),
+    "histories": {"response", "pulses", "parameters", "least_squares"},
     "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity", "hazard_files"},
+    "__init__": {"plot", "records", "similarity", "hazard_files", "histories"},
     "__main__": {"__init__"},
 }
 
