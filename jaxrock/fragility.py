@@ -210,7 +210,7 @@ def probit(z, toppled, survived):
 
 
 def probit_line(abscissas, toppled, survived):
-    """Intercept and slopes of z by (slopes, n) abscissas, for which outcomes are most probable; whether they were found.
+    """Intercept and slopes of z, by (slopes, n) abscissas, for which outcomes are most probable; and if it was found.
 
     The logarithm of the likelihood is concave, so that a step of Newton's method, cut short where it is too long,
     always climbs.

@@ -381,5 +381,6 @@ def _judged(scene: _Scene, found: Minimum, spread: Covariance, problem: Problem,
     for name, near in zip(scene.names, margin < np.sqrt(np.diag(used))):
         if near:
             warnings.append(f"`{name}` is at its bound to within its standard error: its interval reaches beyond.")
-    status = HistoryStatus.successful if identified else HistoryStatus.not_identified
-    return status if found.converged else HistoryStatus.not_converged, warnings
+    # Along what is not told a minimum is never reached.
+    status = HistoryStatus.successful if found.converged else HistoryStatus.not_converged
+    return status if identified else HistoryStatus.not_identified, warnings

@@ -41,42 +41,49 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
 def _peaks(motion: AbstractMotion):
     """Peaks of acceleration [g] and velocity [m/s].
 
-    Every piece is cut into parts, in which the acceleration is integrated by Gauss and Legendre; between ends, extrema
-    are those of the parabola (acceleration) and of the straight line whose integral is taken (velocity).
+    Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
+    passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
     """
     knots = motion.knots
     parts = _PARTS if knots.size - 1 <= _FEW else 1
-    lengths = jnp.diff(knots)
-    shares = jnp.concatenate([(jnp.arange(parts)[:, None] + (1 + _NODES) / 2).ravel(), jnp.arange(parts + 1.0)]) / parts
 
     def in_piece(piece, length):
-        def at(share):
-            return motion.series(piece, share * length, jnp.ones_like(length), 0)[0]
+        step = length / parts
 
-        values = jax.vmap(at)(shares)
-        inner, ends = values[: -parts - 1].reshape(parts, -1), values[-parts - 1 :]
-        return inner @ (_WEIGHTS / 2) * length / parts, ends
+        def jet(local):
+            """Acceleration and its first two derivatives."""
+            terms = motion.series(piece, jnp.clip(local, 0.0, length), jnp.ones_like(length), 2)
+            terms = [*terms, *[jnp.zeros_like(terms[0])] * (3 - len(terms))]
+            return terms[0], terms[1], 2 * terms[2]
 
-    gains, ends = jax.vmap(in_piece)(jnp.arange(lengths.size), lengths)
-    step = (lengths / parts)[:, None]
+        def gain(begin, width):
+            """Velocity that is gained."""
+            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(_NODES)
+            return values @ _WEIGHTS * width / 2
+
+        begins = step * jnp.arange(parts)
+        ends = jax.vmap(lambda local: jet(local)[0])(step * jnp.arange(parts + 1))
+        left, right = ends[:-1], ends[1:]
+        turns = left * right < 0
+        place = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
+
+        def to_zero(begin, place):
+            for _ in range(3):
+                value, slope, _ = jet(begin + place)
+                place = jnp.clip(place - value / jnp.where(slope == 0, jnp.inf, slope), 0.0, step)
+            return gain(begin, place)
+
+        turning = jnp.where(turns, jax.vmap(to_zero)(begins, place), 0.0)
+        top = step * jnp.argmax(jnp.abs(ends))
+        for _ in range(3):
+            _, slope, bend = jet(top)
+            move = -slope / jnp.where(bend == 0, jnp.inf, bend)
+            top = top + jnp.where(jnp.abs(move) <= step, move, 0.0)
+        peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(jet(top)[0]))
+        return peak, jax.vmap(gain, (0, None))(begins, step), turning
+
+    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), jnp.diff(knots))
     velocity = jnp.cumsum(gains.ravel())
-    before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]]).reshape(gains.shape)
-    left, right = ends[:, :-1], ends[:, 1:]
-    # The velocity turns where the acceleration passes zero.
-    turns = left * right < 0
-    share = jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
-    turning = before + left * share * step / 2
-    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(turning)))
-    return jnp.maximum(jnp.max(jnp.abs(ends)), _between(ends)), fastest * GRAVITY
-
-
-def _between(ends):
-    """Largest size of a smooth curve between equally spaced values: at the top of a parabola through three of them."""
-    if ends.shape[1] < 3:
-        return jnp.zeros((), ends.dtype)
-    size = jnp.abs(ends)
-    low, top, high = size[:, :-2], size[:, 1:-1], size[:, 2:]
-    bend = 2 * top - low - high
-    peaked = (top >= low) & (top >= high) & (bend > 0) & (jnp.sign(ends[:, :-2]) == jnp.sign(ends[:, 2:]))
-    rise = (high - low) ** 2 / jnp.where(peaked, 8 * bend, 1.0)
-    return jnp.max(jnp.where(peaked, top + rise, 0.0))
+    before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
+    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings.ravel())))
+    return jnp.max(peaks), fastest * GRAVITY

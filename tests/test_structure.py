@@ -66,10 +66,13 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
+    "intensity": {"motion", "block"},
+    "suites": {"spectra", "fragility", "intensity"},
+    "surfaces": {"suites"},
     "least_squares": set(),
     "histories": {"response", "pulses", "parameters", "least_squares"},
-    "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity", "hazard_files", "histories"},
+    "plot": {"sensitivity", "critical", "closed_form", "surfaces", "histories"},
+    "__init__": {"plot", "records", "similarity", "hazard_files", "histories", "surfaces"},
     "__main__": {"__init__"},
 }
 
