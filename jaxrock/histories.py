@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxrock._checks import Values, checked, finite, positive
+from jaxrock._checks import Values, checked, finite, positive, put_down
 from jaxrock.arcs import Diffrax
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
@@ -242,27 +242,27 @@ class _Scene(eqx.Module):
         """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
         return 2 / self.block.p
 
-    def at(self, values) -> tuple[Block, AbstractMotion, tuple]:
+    def at(self, values: dict) -> tuple[Block, AbstractMotion, tuple]:
         """Block, motion and initial state with other parameters."""
-        values = dict(zip(self.names, values))
         before = named(self.block, self.motion)
         block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
         return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
 
     def rotation(self, point, time, until):
         """Rotation at times up to `until`, and whether the block could be followed."""
-        values = self.values(point)
-        block, motion, initial = self.at(values)
-        delay = values[self.names.index("delay")] if "delay" in self.names else 0.0
-        offset = values[self.names.index("offset")] if "offset" in self.names else 0.0
+        values = dict(zip(self.names, self.values(point)))
         duration = until + (self._reach if "delay" in self.names else 0.0)
-        response = simulate(
-            block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
-        )
-        rotation, _ = response(jnp.clip(time - delay, 0.0, duration))
+        with put_down() as checks:
+            block, motion, initial = self.at(values)
+            response = simulate(
+                block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
+            )
+            rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
         # A verdict that is too close to call is about what comes after the data.
         known = (response.status == Status.successful) | (response.status == Status.undecided)
-        return rotation + offset, known
+        for _, failed in checks:
+            known &= ~failed
+        return rotation + values.get("offset", 0.0), known
 
 
 def _last(name: str) -> str:
@@ -327,7 +327,7 @@ def _fit(scene: _Scene, found: Minimum, spread: Covariance, problem, rotation, w
     values = np.asarray(scene.values(found.point))
     by_coordinates = np.where(scene.logarithmic, values, 1.0)
     both = np.outer(by_coordinates, by_coordinates)
-    block, motion, initial = scene.at(jnp.asarray(values))
+    block, motion, initial = scene.at(dict(zip(scene.names, jnp.asarray(values))))
     status, warnings = HistoryStatus.not_simulated, []
     if simulated:
         status, warnings = _judged(scene, found, spread, problem, correlated, scatter)

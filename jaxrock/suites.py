@@ -221,16 +221,8 @@ class SimulatedFragility(eqx.Module):
         found = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
         if motions == 1 or found.status != FitStatus.successful:
             return found
-        median, dispersion = found.fragility.median, found.fragility.dispersion
-        z = jnp.log(self.levels / median) / dispersion
-        rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
-
-        def score(toppled):
-            return rows @ probit(z, toppled, draws - toppled)[1]
-
-        scores = jax.vmap(score)(jnp.asarray(toppled))
-        middle = scores.T @ scores * motions / (motions - 1)
-        return eqx.tree_at(lambda f: f.covariance, found, found.covariance @ middle @ found.covariance)
+        clustered = _clustered(found, self.levels, jnp.asarray(toppled), float(draws))
+        return eqx.tree_at(lambda f: f.covariance, found, clustered)
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -269,6 +261,17 @@ class SimulatedFragility(eqx.Module):
             "toppled": np.sum(self.verdict == TOPPLED, axis=2).ravel(),
             "undecided": np.sum(self.verdict == UNDECIDED, axis=2).ravel(),
         }
+
+
+@eqx.filter_jit
+def _clustered(found: FragilityFit, levels, toppled, draws):
+    """Covariance of (ln median, ln dispersion) where what one motion (a row) does at all levels is one outcome."""
+    median, dispersion = found.fragility.median, found.fragility.dispersion
+    z = jnp.log(levels / median) / dispersion
+    rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
+    scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
+    motions = toppled.shape[0]
+    return found.covariance @ (scores.T @ scores * motions / (motions - 1)) @ found.covariance
 
 
 def simulated_fragility(

@@ -135,16 +135,19 @@ def stripes(seed, motions=80, levels=np.geomspace(0.1, 1.6, 12)):
 
 
 def test_fits_of_stripes_and_their_errors():
-    """Medians and dispersions of 150 suites scatter as the covariance of clusters says."""
-    fits = [stripes(seed).fit() for seed in range(150)]
+    """Medians and dispersions of 80 suites scatter as the covariance of clusters says."""
+    fits = [stripes(seed).fit() for seed in range(80)]
     assert all(fit.status == rk.FitStatus.successful for fit in fits)
     logarithms = np.array([np.log([fit.fragility.median, fit.fragility.dispersion]) for fit in fits])
     np.testing.assert_allclose(logarithms.mean(axis=0), np.log([0.4, 0.35]), atol=0.03)
     stated = np.mean([np.sqrt(np.diag(fit.covariance)) for fit in fits], axis=0)
-    np.testing.assert_allclose(stated, logarithms.std(axis=0), rtol=0.2)
+    np.testing.assert_allclose(stated, logarithms.std(axis=0), rtol=0.25)
     found = stripes(0)
     independent = rk.fit_fragility(found.levels, found.counts().sum(axis=0), 80.0)
     np.testing.assert_allclose(independent.fragility.median, found.fit().fragility.median)
+    rows = found.table()
+    same = rk.fit_fragility(rows["level"], rows["toppled"], rows["trials"])
+    np.testing.assert_allclose(same.fragility.dispersion, independent.fragility.dispersion, rtol=1e-9)
 
 
 def test_fit_of_a_surface():
@@ -179,7 +182,10 @@ RECORD = rk.Record([0.0, 0.3, 0.0], 0.4)
     [
         (lambda: rk.Suite([]), "`motions` must hold at least one motion"),
         (lambda: rk.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
-        (lambda: rk.Suite([RECORD, 0 * RECORD]), "`motions` must move the ground, but 'Scaled' does not"),
+        (
+            lambda: rk.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
+            "`motions` must move the ground, but 'quiet' does not",
+        ),
         (lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
         (
             lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.2, 0.1]),
