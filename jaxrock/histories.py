@@ -60,7 +60,7 @@ class HistoryFit(eqx.Module):
 
     - `names`, `values`: of the parameters.
     - `covariance`: (parameters, parameters), for independent errors of the measurement.
-    - `robust_covariance`: the same for errors that are correlated in time (Newey & West 1987): wider, if they are.
+    - `robust_covariance`: the same for errors that last, correlated in time as residuals are: wider, if they are.
     - `scatter`: standard deviation of the measurement [rad]: as given (the root mean square, if there are many), or
       estimated from the residuals.
     - `residuals`: (n,) measured less fitted rotation [rad]; `rotation`: (n,) fitted [rad].
@@ -156,8 +156,7 @@ def fit_history(
 
     **Raises:** ValueError for arguments outside their ranges, or names that the scene does not have.
 
-    **Source:** Marquardt (1963); Nielsen (1999), the damping; Newey & West (1987) and Andrews (1991), covariance of
-    estimates from correlated data.
+    **Source:** Marquardt (1963); Nielsen (1999), the damping; Brockwell & Davis (1991), 8.1, correlated residuals.
     """
     if starts < 1:
         raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")

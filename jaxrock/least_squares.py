@@ -149,7 +149,8 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
     - `scale`: (parameters,) natural sizes: what is not told at all gets a variance of 1e10 or more of their squares.
     - `scatter_is_known`: whether residuals were weighted by the inverse of their true standard deviation.
 
-    **Source:** Newey & West (1987), with the bandwidth of Andrews (1991), equations 6.2 and 6.4, for correlated ones.
+    **Source:** for correlated residuals the covariance of ordinary least squares under errors that are stationary: each
+    a combination of those before it (Yule & Walker, by Brockwell & Davis 1991, 8.1), of an order after Akaike (1974).
     """
     residuals, slopes = minimum.residuals, np.nan_to_num(minimum.jacobian) * scale
     size, count = slopes.shape
@@ -157,27 +158,35 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
     values = np.maximum(values, 1e-14 * max(values.max(), 1e-280))
     inverse = (vectors / values) @ vectors.T
     scatter = float(np.sqrt(np.sum(residuals**2) / (size - count)))
-    correlation = _correlation(residuals)
-    scores = slopes * residuals[:, None]
-    lags = _bandwidth(correlation, size)
-    middle = scores.T @ scores
-    for lag in range(1, lags + 1):
-        product = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / (lags + 1)) * (product + product.T)
+    middle = slopes.T @ slopes
+    for lag, correlation in enumerate(_correlations(residuals)[1:], 1):
+        product = correlation * (slopes[lag:].T @ slopes[:-lag])
+        middle += product + product.T
     both = np.outer(scale, scale)
-    robust = inverse @ middle @ inverse * (size / (size - count))
-    return Covariance(both * inverse * (1.0 if scatter_is_known else scatter**2), both * robust, scatter, correlation)
+    robust = inverse @ middle @ inverse * scatter**2
+    neighbours = float(np.sum(residuals[1:] * residuals[:-1]) / max(np.sum(residuals**2), 1e-300))
+    return Covariance(both * inverse * (1.0 if scatter_is_known else scatter**2), both * robust, scatter, neighbours)
 
 
-def _correlation(residuals: np.ndarray) -> float:
-    """Of neighbours."""
-    centred = residuals - residuals.mean()
-    power = float(np.sum(centred**2))
-    return float(np.sum(centred[1:] * centred[:-1]) / power) if power > 0 else 0.0
+def _correlations(residuals: np.ndarray) -> np.ndarray:
+    """Of residuals with those so many places later, from 1 on down to where they vanish.
 
-
-def _bandwidth(correlation: float, size: int) -> int:
-    """Lags that count, for residuals each of which keeps a share of the one before."""
-    kept = float(np.clip(correlation, -0.97, 0.97))
-    strength = 4 * kept**2 / ((1 - kept) ** 2 * (1 + kept) ** 2)  # Andrews 1991, 6.4
-    return min(int(np.ceil(1.1447 * (strength * size) ** (1 / 3))), size // 4)  # Andrews 1991, 6.2
+    Each is taken as a combination of those before it, of the order that explains most for its number of terms.
+    """
+    size, most = residuals.size, min(12, residuals.size // 10)
+    powers = np.array([np.sum(residuals[lag:] * residuals[: size - lag]) for lag in range(most + 1)])
+    if not 0 < powers[0] < np.inf:
+        return np.ones(1)
+    powers = powers / powers[0]
+    best, terms = 0.0, np.zeros(0)
+    for order in range(1, most + 1):
+        places = np.abs(np.subtract.outer(np.arange(order), np.arange(order)))
+        combination = np.linalg.solve(powers[places], powers[1 : order + 1])  # Yule-Walker
+        left = 1 - combination @ powers[1 : order + 1]
+        merit = size * np.log(max(left, 1e-300)) + 2 * order  # Akaike
+        if merit < best:
+            best, terms = merit, combination
+    found = list(powers[: terms.size + 1])  # of no order at all: none but with itself
+    while terms.size and len(found) < size - 1 and np.max(np.abs(found[-terms.size :])) > 1e-3:
+        found.append(float(terms @ found[: -terms.size - 1 : -1]))
+    return np.array(found)

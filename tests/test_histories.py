@@ -161,7 +161,7 @@ def test_robust_variance_of_a_mean(kept):
         spread = covariance(minimum, np.ones(1), False)
         assert isinstance(spread, Covariance) and abs(spread.correlation - kept) < 0.1
         found.append(spread.robust[0, 0])
-    assert np.mean(found) * size == pytest.approx((1 + kept) / (1 - kept), rel=0.2)  # Bartlett's window is biased
+    assert np.mean(found) * size == pytest.approx((1 + kept) / (1 - kept), rel=0.15)
 
 
 # --------------------------------------------------------------------------------------- bad input
