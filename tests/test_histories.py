@@ -54,6 +54,7 @@ def test_free_rocking_without_errors_is_recovered():
     np.testing.assert_allclose(found.rotation, free_rocking(TIME), atol=1e-10)
     assert found.agreement == 1
     assert found["restitution"] == found.values[2] == float(found.block.restitution)
+    assert len(rk.plot.history_fit(found, TIME)) == 2
     # Mirrored, it is the same block from the other side.
     mirrored = fit(-free_rocking(TIME))
     np.testing.assert_allclose(mirrored.values, found.values * [1, 1, 1, -1], rtol=1e-8)

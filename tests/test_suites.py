@@ -165,13 +165,40 @@ def test_fit_of_a_surface():
     np.testing.assert_allclose(truth(contour, 0.1), [0.05, 0.5, 0.95], rtol=1e-12)
     np.testing.assert_allclose(truth.at(0.1)(contour), [0.05, 0.5, 0.95], rtol=1e-12)
     np.testing.assert_allclose(contour[1], 0.15 * 0.1**-0.6)
-    # At one ratio it is the fit in one measure.
-    same = rk.fit_surface(acceleration, ratio, toppled, clusters=np.arange(4000) // 1)
-    np.testing.assert_allclose(same.covariance, found.covariance)
     one = rk.fit_surface(acceleration, np.full(4000, 0.1), toppled)
     assert one.status == rk.FitStatus.not_converged
     safe = rk.fit_surface(acceleration, ratio, np.zeros(4000))
     assert safe.status != rk.FitStatus.successful and np.isnan(safe.fragility.median)
+
+
+def test_fit_of_a_simulated_surface():
+    """All cells of a grid, draws as clusters: nearly as certain as independent outcomes, which these are."""
+    truth = rk.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
+    acceleration, ratio = jnp.geomspace(0.1, 1.5, 20), jnp.geomspace(0.03, 0.3, 20)
+    share = np.asarray(truth(acceleration[:, None], ratio))
+    verdict = (np.random.default_rng(3).uniform(size=(1, 20, 20, 10)) < share[:, :, None]).astype(np.int8)
+    found = rk.SimulatedSurface(acceleration, ratio, verdict)
+    np.testing.assert_array_equal(found.lower, verdict[0].mean(axis=-1))
+    fit, table_ = found.fit(), np.meshgrid(acceleration, ratio, np.arange(10), indexing="ij")
+    plain = rk.fit_surface(table_[0].ravel(), table_[1].ravel(), verdict.ravel())
+    assert fit.fragility.median == plain.fragility.median == pytest.approx(0.15, rel=0.05)
+    errors = np.sqrt(np.diag(fit.covariance) / np.diag(plain.covariance))
+    assert np.all((0.5 < errors) & (errors < 2.0))
+    verdict[0, 5, 5, 0] = -1
+    with pytest.raises(ValueError, match="1 of 4000 scenes are undecided"):
+        found.fit()
+    axis = rk.plot.fragility_surface(found, fit.fragility)
+    assert axis.get_xlabel() == "PGV/PGA [s]" and len(axis.lines) == 3
+
+
+def test_figure_of_a_fragility():
+    found = table([[[0, 0], [1, -1], [1, 1]], [[0, 0], [0, 0], [-1, 1]]])
+    axis = rk.plot.fragility(found, rk.LogNormalFragility(2.0, 0.3))
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == [
+        "simulated",
+        "undecided",
+        "lognormal: 2, 0.3",
+    ]
 
 
 RECORD = rk.Record([0.0, 0.3, 0.0], 0.4)
