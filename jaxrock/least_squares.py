@@ -111,10 +111,11 @@ def _descend(problem: Problem, points: np.ndarray, samples: int, hold: float, mo
         new_residuals, new_jacobian = problem.at(trial, samples)
         new_costs = cost(trial, new_residuals)
         better = ~done & (new_costs < costs)
-        ratio = np.where(better, (costs - new_costs) / np.maximum(gains, 1e-300), 0.0)
+        fall = np.subtract(costs, new_costs, out=np.zeros_like(costs), where=better)
+        ratio = fall / np.maximum(gains, 1e-300)
         small = np.max(np.abs(trial - points) / problem.scale, axis=1) < 1e-9
         # The sum of squares can fall no more, or does so no more.
-        ended = (gains <= enough * costs) | (better & (costs - new_costs <= enough * costs)) | small
+        ended = (gains <= enough * costs) | (better & (fall <= enough * costs)) | small
         points = np.where(better[:, None], trial, points)
         residuals = np.where(better[:, None], new_residuals, residuals)
         jacobian = np.where(better[:, None, None], new_jacobian, jacobian)

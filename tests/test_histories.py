@@ -145,11 +145,21 @@ def test_a_parameter_that_does_not_show_stays_and_has_no_interval():
 
 
 def test_a_start_without_a_result_is_given_up():
-    at = lambda points, samples: (np.full((len(points), 9), np.inf), np.full((len(points), 9, 1), np.nan))
-    found = least_squares(
-        Problem(at, np.ones(1), -np.ones(1), np.ones(1)), np.zeros(1), Progression((9,), 0.1, 0.1), 2, 0
-    )
-    assert not found.converged and found.agreement == 0
+    def at(points, samples):
+        """A line through the origin, that cannot be drawn with a slope below 1.9 (one of the starts)."""
+        slope = np.arange(1.0, 10.0)
+        residuals = np.where(points < 1.9, np.inf, (points - 3) * slope)
+        return residuals, np.tile(slope[:, None], (len(points), 1, 1))
+
+    def found(first, starts):
+        problem = Problem(at, np.ones(1), -9 * np.ones(1), 9 * np.ones(1))
+        return least_squares(problem, np.array([first]), Progression((9,), 1.0, 1e-6), starts, 0)
+
+    nowhere = found(-5.0, 2)
+    assert not nowhere.converged and nowhere.agreement == 0 and np.isinf(nowhere.residuals).all()
+    somewhere = found(1.5, 6)  # the first start has none
+    assert somewhere.converged and 0 < somewhere.agreement < 1
+    np.testing.assert_allclose(somewhere.point, 3.0)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.6, 0.9])
