@@ -155,6 +155,9 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
     """
     residuals, slopes = minimum.residuals, np.nan_to_num(minimum.jacobian) * scale
     size, count = slopes.shape
+    if not np.isfinite(residuals).all():
+        unknown = np.diag(np.full(count, np.inf))
+        return Covariance(unknown, unknown, np.inf, 0.0)
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
     values = np.maximum(values, 1e-14 * max(values.max(), 1e-280))
     inverse = (vectors / values) @ vectors.T

@@ -157,6 +157,7 @@ def test_a_start_without_a_result_is_given_up():
 
     nowhere = found(-5.0, 2)
     assert not nowhere.converged and nowhere.agreement == 0 and np.isinf(nowhere.residuals).all()
+    assert np.isinf(covariance(nowhere, np.ones(1), False).independent)
     somewhere = found(1.5, 6)  # the first start has none
     assert somewhere.converged and 0 < somewhere.agreement < 1
     np.testing.assert_allclose(somewhere.point, 3.0)
