@@ -36,6 +36,8 @@ from jaxrock.hazard import (
     toppling_rate as toppling_rate,
 )
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.histories import HistoryFit as HistoryFit, HistoryStatus as HistoryStatus, fit_history as fit_history
+from jaxrock.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear, Spring as Spring
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
 from jaxrock.pulses import (
@@ -65,6 +67,20 @@ from jaxrock.spectra import (
     self_similar_spectrum as self_similar_spectrum,
 )
 from jaxrock.status import Status as Status
+from jaxrock.suites import (
+    SimulatedFragility as SimulatedFragility,
+    Suite as Suite,
+    draw_blocks as draw_blocks,
+    simulated_fragility as simulated_fragility,
+)
+from jaxrock.surfaces import (
+    SimulatedSurface as SimulatedSurface,
+    SurfaceFit as SurfaceFit,
+    SurfaceFragility as SurfaceFragility,
+    fit_surface as fit_surface,
+    simulated_surface as simulated_surface,
+    surface_of as surface_of,
+)
 from jaxrock.sweeps import sweep as sweep
 
 if TYPE_CHECKING:

@@ -175,13 +175,13 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     logarithm = jnp.log(levels)
     centre, spread = jnp.mean(logarithm), jnp.std(logarithm)
     abscissa = (logarithm - centre) / jnp.where(separable, 1.0, spread)
-    line, converged = _probit_line(abscissa, toppled, survived)
+    line, converged = probit_line(abscissa[None], toppled, survived)
     # z = line[0] + line[1] (ln level - centre)/spread = (ln level - ln median)/dispersion.
     z = line[0] + line[1] * abscissa
     dispersion = spread / jnp.where(line[1] > 0, line[1], 1.0)
     median = jnp.exp(centre - line[0] * dispersion)
     growing = (line[1] > 0) & (median > 0) & (median < jnp.inf)
-    likelihood, _, curvature = _probit(z, toppled, survived)
+    likelihood, _, curvature = probit(z, toppled, survived)
     # By ln median and ln dispersion; where the slopes add to zero, the curvature of z itself plays no part.
     rows = jnp.stack([jnp.full_like(z, 1 / dispersion), z])
 
@@ -200,7 +200,7 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     return FragilityFit(*found, highest_survived, lowest_toppled, status)
 
 
-def _probit(z, toppled, survived):
+def probit(z, toppled, survived):
     """Log-likelihood of outcomes with the probability Phi(z), and its first and second derivative by each z."""
     signed, counts = jnp.stack([z, -z]), jnp.stack([toppled, survived])
     logarithm = log_ndtr(signed)
@@ -209,30 +209,31 @@ def _probit(z, toppled, survived):
     return jnp.sum(counts * logarithm), slopes[0] - slopes[1], -jnp.sum(slopes * (signed + ratio), axis=0)
 
 
-def _probit_line(abscissa, toppled, survived):
-    """Intercept and slope of z for which outcomes are most probable, and whether they were found.
+def probit_line(abscissas, toppled, survived):
+    """Intercept and slopes of z, by (slopes, n) abscissas, for which outcomes are most probable; and if it was found.
 
     The logarithm of the likelihood is concave, so that a step of Newton's method, cut short where it is too long,
     always climbs.
     """
 
-    def newton(line, abscissa, toppled, survived):
-        rows = jnp.stack([jnp.ones_like(abscissa), abscissa])
-        _, slope, curvature = _probit(line @ rows, toppled, survived)
+    def newton(line, abscissas, toppled, survived):
+        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
+        _, slope, curvature = probit(line @ rows, toppled, survived)
         return jnp.linalg.solve(rows @ (-curvature[:, None] * rows.T), rows @ slope)
 
-    fixed = jax.lax.stop_gradient((abscissa, toppled, survived))
+    fixed = jax.lax.stop_gradient((abscissas, toppled, survived))
     shares = 0.5 ** jnp.arange(8.0)
 
     def step(carry):
         line, _, count = carry
         change = newton(line, *fixed)
         candidates = line + shares[:, None] * change
-        climbed = jax.vmap(lambda line: _probit(line[0] + line[1] * fixed[0], *fixed[1:])[0])(candidates)
+        climbed = jax.vmap(lambda line: probit(line[0] + line[1:] @ fixed[0], *fixed[1:])[0])(candidates)
         return candidates[jnp.argmax(climbed)], jnp.max(jnp.abs(change)), count + 1
 
-    tight = jnp.sqrt(jnp.finfo(abscissa.dtype).eps)
-    start = jnp.zeros(2, abscissa.dtype), jnp.asarray(jnp.inf, abscissa.dtype), 0
+    dtype = abscissas.dtype
+    tight = jnp.sqrt(jnp.finfo(dtype).eps)
+    start = jnp.zeros(1 + len(abscissas), dtype), jnp.asarray(jnp.inf, dtype), 0
     line, change, _ = jax.lax.while_loop(lambda carry: (carry[1] > tight) & (carry[2] < 50), step, start)
     # One step more, with derivatives by the data: those of first order are exact.
-    return line + newton(line, abscissa, toppled, survived), change <= tight
+    return line + newton(line, abscissas, toppled, survived), change <= tight

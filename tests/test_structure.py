@@ -72,7 +72,12 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
-    "plot": {"sensitivity", "critical", "closed_form"},
+    "intensity": {"motion", "block"},
+    "suites": {"spectra", "fragility", "intensity"},
+    "surfaces": {"suites"},
+    "least_squares": set(),
+    "histories": {"response", "pulses", "parameters", "least_squares"},
+    "plot": {"sensitivity", "critical", "closed_form", "surfaces", "histories"},
     "__init__": {"plot", "contact", "records", "similarity", "hazard_files"},
     "__main__": {"__init__"},
 }
