@@ -164,8 +164,8 @@ class Emitter:
         if name in MOVES:
             found = MOVES[name](parameters, *map(boxed, inputs))
             return [unboxed(x) for x in (found if isinstance(found, list) else [found])]
-        if name in SUMS and inputs[0].size:
-            array = inputs[0]
+        if name in SUMS and boxed(inputs[0]).size:
+            array = boxed(inputs[0])
             for axis in sorted(parameters["axes"], reverse=True):
                 parts = list(np.moveaxis(array, axis, 0))
                 array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)

@@ -136,8 +136,8 @@ def _is_zero(tangent) -> bool:
 
 
 def _weighed(terms: list, vertical: list[Scalar] | None, order: int, like: Scalar) -> list:
-    """A series times 1 + v."""
-    if vertical is None:
+    """A series times 1 + v, where the model has it."""
+    if vertical is None or len(terms) < order - 1:
         return terms
     return [terms[k] + keep(_product(vertical, terms, k), like) for k in range(order - 1)]
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.motion import Shaking
 from jaxrock.polynomial import jet
 from jaxrock.taylor import End, Start, arrive, expand
 
@@ -160,15 +161,17 @@ def test_a_history_in_both_modes():
 # ---- One step and one impact: independent formulas ----
 
 
+@pytest.mark.parametrize("vertical", [False, True], ids=["horizontal", "also vertical"])
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_a_step_against_its_own_series(model):
+def test_a_step_against_its_own_series(model, vertical):
     """The end of a step at a fixed time moves as the polynomial does when JAX differentiates it term by term."""
     order = 12
 
     def start(q):
         table = model.table(rk.Block(q[0], 2.0))
         forcing = [q[4 + k] for k in range(5)] + [0.0 * q[0]] * (order - 4)
-        return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], forcing, jnp.ones(()))
+        shaking = Shaking(forcing, [0.5 * q[4] - 0.1, q[5] * q[6], -q[7]] if vertical else None)
+        return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], shaking, jnp.ones(()))
 
     def plainly(q):
         return jnp.stack(jet(expand(start(q), order).opening, jnp.array(0.8), 1))
