@@ -173,6 +173,20 @@ def hyperbolic_arctangent(x: Real) -> Real:
     return jnp.where(x < 0, -value, value)
 
 
+def hyperbolic_arcsine(x: Real) -> Real:
+    """arsinh(x), to a few units of rounding."""
+    size = jnp.abs(x)
+    inside = jnp.minimum(size, 1e9)  # beyond, arsinh is log(2 x) to rounding
+    root = jnp.sqrt(inside * inside + 1)
+    near = hyperbolic_arctangent(jnp.minimum(inside, 0.2) / root)
+    finite = jnp.where(size < jnp.inf, jnp.maximum(size, 1e9), 1.0)
+    far = jnp.where(size < jnp.inf, logarithm(jnp.where(size < 1e9, inside + root, finite)), jnp.inf)
+    far = far + jnp.where(size < 1e9, 0.0, math.log(2))
+    value = jnp.where(size < 0.17, near, far)
+    value = jnp.where(x < 0, -value, value)
+    return jnp.where(x == x, value, jnp.nan)
+
+
 def hyperbolic_tangent(x: Real) -> Real:
     """tanh(x), to a few units of rounding."""
     grown = exponential_less_one(2 * jnp.minimum(jnp.abs(x), 30.0))

@@ -7,6 +7,8 @@ import pytest
 
 native = pytest.importorskip("jaxrock.native", reason="needs llvmlite")
 
+import jaxrock as rk  # noqa: E402
+from jaxrock import lanes  # noqa: E402
 from jaxrock.operations import Unsupported  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
@@ -113,6 +115,10 @@ FUNCTIONS = {
     "arcsin": (jnp.arcsin, np.concatenate([np.linspace(-1, 1, 81), [1e-300, 1 - 1e-15, 1.1]])),
     "arctan": (jnp.arctan, np.concatenate([np.linspace(-3, 3, 81), [1e-300, -1e9, np.inf, -np.inf, np.nan]])),
     "tanh": (jnp.tanh, np.concatenate([np.linspace(-3, 3, 61), [1e-300, 1e-9, 40.0, -400.0, np.inf]])),
+    "arsinh": (
+        jnp.arcsinh,
+        np.concatenate([np.linspace(-3, 3, 81), [1e-300, 1e-9, -1e8, 2e9, 1e200, -np.inf, np.nan]]),
+    ),
     "artanh": (jnp.arctanh, np.concatenate([np.linspace(-1, 1, 81), [1e-300, 1e-9, 1 - 1e-15, 1.1]])),
 }
 
@@ -312,3 +318,30 @@ def test_programs_have_names_of_their_own():
     program, other = (jax.make_jaxpr(lambda x, factor=factor: [jnp.exp(x) * factor])(1.0) for factor in (3, 4))
     assert native.registered(program, [False]) == native.registered(program, [False])
     assert len({native.registered(*each) for each in ((program, [False]), (program, [True]), (other, [False]))}) == 3
+
+
+SCENES = {
+    "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
+    "derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin, (0, 1)),
+    "two sides, exponential": lambda a, u: (
+        rk.outcome(rk.AsymmetricBlock(a, 1.3 * a, 2.0), rk.ExponentialPulse(u, 1.0, u)).margin
+    ),
+    "spring": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear")).margin,
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_do_not_fall_back(name, monkeypatch):
+    """A program that XLA has to take over is right, but many times as slow, and nothing tells."""
+    refused, natively = [], lanes._Batch._natively
+
+    def watched(self, scenes):
+        try:
+            return natively(self, scenes)
+        except Unsupported as error:
+            refused.append(str(error))
+            raise
+
+    monkeypatch.setattr(lanes._Batch, "_natively", watched)
+    jax.eval_shape(jax.vmap(SCENES[name]), jnp.full(333, 0.2), jnp.full(333, 0.5))
+    assert not refused
