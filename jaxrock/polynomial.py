@@ -5,7 +5,6 @@ operation unrolls into straight-line code that vectorises over lanes.
 """
 
 import functools
-import math
 from typing import NamedTuple
 
 import jax
@@ -27,33 +26,18 @@ def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
     return scaled
 
 
-_LONG = 6  # from which on even and odd powers go apart: two sums side by side wait half as long
-
-
-def _jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
-    """Value and the first derivatives over their factorials, by Horner's scheme."""
+def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
+    """Value and the first derivatives of a polynomial at x."""
     values = [jnp.zeros_like(x)] * (derivatives + 1)
     for c in reversed(coefficients):
         for j in range(derivatives, 0, -1):
             values[j] = values[j] * x + values[j - 1]
         values[0] = values[0] * x + c
+    factorial = 1
+    for j in range(2, derivatives + 1):
+        factorial *= j
+        values[j] = factorial * values[j]
     return values
-
-
-def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
-    """Value and the first derivatives of a polynomial at x."""
-    if len(coefficients) >= _LONG and derivatives <= 2:
-        square = x * x
-        # p(x) = e(x^2) + x o(x^2)
-        even, odd = (_jet(coefficients[i::2], square, derivatives) for i in (0, 1))
-        values = [even[0] + x * odd[0]]
-        if derivatives > 0:
-            values.append(odd[0] + 2 * (x * even[1] + square * odd[1]))
-        if derivatives > 1:
-            values.append(2 * (even[1] + 3 * x * odd[1]) + 8 * square * (even[2] + x * odd[2]))
-        return values
-    values = _jet(coefficients, x, derivatives)
-    return [math.factorial(j) * value if j > 1 else value for j, value in enumerate(values)]
 
 
 def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
@@ -72,9 +56,6 @@ def derivative(coefficients: list[Scalar]) -> list[Scalar]:
 
 def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
     """Value of a polynomial at x."""
-    if len(coefficients) >= _LONG:
-        square = x * x
-        return horner(coefficients[0::2], square) + x * horner(coefficients[1::2], square)
     total = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         total = total * x + c

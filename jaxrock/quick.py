@@ -26,7 +26,9 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
 _SHORTER = (0.4, 0.1)  # shares of a step that are tried for a certificate, after the whole
-_TURN, _MEET = (5, 9, 99), (4, 7, 12, 99)  # degrees of the polynomials whose roots Newton's iterations take
+# Degrees of the polynomials whose roots Newton's iterations take: for a value that is stationary there, for the time of
+# a turning point, and for what meets a level.
+_FLAT, _TURN, _MEET = (5, 9, 99), (5, 9, 99, 99), (4, 7, 12, 99)
 _STEPS = 1000
 
 
@@ -148,8 +150,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
         x, last = _root(_TURN, derivative(terms), zero, part.length, terms[1], 2 * terms[2], part.speed)
         x = keep_by(x, one)
         opening, _, bend = (keep_by(value, one) for value in jet(terms, x, 2))
-        # Where the velocity is zero the angle is exact to the square of what the time is.
-        return x, opening, bend, last <= 1e-4 * x
+        return x, opening, bend, last <= 1e-6 * x
 
     turn_at, top, top_bend, sure = _if(turns, turn, (part.length, part.opening, part.bend, part.certain))
     certain = part.certain & sure
@@ -186,7 +187,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
-        x, last = _root(_TURN, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
+        x, last = _root(_FLAT, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
         return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
 
     return _if(part.bends & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.bends)))

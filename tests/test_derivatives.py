@@ -288,7 +288,7 @@ def test_sensitivity_of_a_scene():
     assert found.names == ("alpha", "p", "restitution", "amplitude", "duration", "shape", "uplift_strength")
     assert named["p"] == pytest.approx(named["duration"], rel=1e-10)  # only p t_d counts
     assert named["alpha"] + named["amplitude"] == pytest.approx(1.0, rel=1e-10)  # linear: rotation over alpha
-    assert named["uplift_strength"] == -named["amplitude"]
+    np.testing.assert_allclose(named["uplift_strength"], -named["amplitude"], rtol=1e-15)
     assert named["restitution"] == 0  # the peak comes before the first impact
     # The single lobe's peak has a closed form.
     shape = jnp.array([0.2 / 0.3, 1.6, -1.0])

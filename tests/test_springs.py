@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
-from jaxrock.free import free_stage
+from jaxrock.free import Visit, free_stage
 from jaxrock.models import Angle
 
 SCENES = json.loads((Path(__file__).parent / "springs.json").read_text())["scenes"]
@@ -167,9 +167,12 @@ def free_peak(kind, alpha, e, x, v):
 @pytest.mark.parametrize("spring", SPRINGS[2:], ids=" ".join)
 def test_free_stage(spring):
     """A constant and a sinusoid: peak and its time by quadrature, from below the saddle and from beyond it."""
-    follow = jax.jit(
-        lambda alpha, e, x, v: free_stage(rk.Spring(*spring).table(rk.Block(alpha, 1.0, e)), e, x, v, jnp.array(True))
-    )
+
+    def stage(alpha, e, x, v):
+        visit = Visit(rk.Spring(*spring).table(rk.Block(alpha, 1.0, e)), e)
+        return free_stage((visit, visit), x, v, jnp.array(True))
+
+    follow = jax.jit(stage)
     for alpha, share, speed in [
         (0.05, 0.3, 0.9),
         (0.3, 0.5, -0.7),
