@@ -14,9 +14,9 @@ from jaxrock._checks import Values, checked, scalar
 from jaxrock.derivatives import differentiable
 from jaxrock.flexible_block import FlexibleBlock
 from jaxrock.flexible_phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
-from jaxrock.modal_curves import Curve, first_exit, highest
+from jaxrock.modal_curves import Curve, first_exit, highest, powers
 from jaxrock.motion import AbstractMotion
-from jaxrock.polynomial import rescaled, step_length
+from jaxrock.polynomial import step_length
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, "..."]
@@ -128,7 +128,7 @@ class FlexibleScene(eqx.Module):
         length = jnp.where(left > 0, cap * unit, 1.0)
         whole = cap * unit >= left
         share = jnp.where(whole, remaining / length, 1.0)
-        load = rescaled(load, length / unit)
+        load = jnp.stack(load) * powers(length / unit, len(load))
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
 
@@ -378,7 +378,7 @@ def _budget(motion: AbstractMotion, max_steps: int) -> int:
 def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
     def run(given):
         scene = FlexibleScene.of(*given)
-        state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), scene.advance, scene.start())
+        state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), lambda s: scene.advance(s), scene.start())
         return scene.conclude(state)
 
     return differentiable(run)((block, motion, stop))

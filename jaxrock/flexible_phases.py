@@ -10,20 +10,24 @@ in units of m L^2. While the base rocks this is linear in (q, q', theta), about 
 theta = alpha side. Its rates are the zeros of one function; left and right vectors follow from them in closed form.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
 from jaxrock.flexible_block import FlexibleBlock, unit_column
-from jaxrock.modal_curves import Curve
+from jaxrock.modal_curves import Curve, powers
 
 Scalar = Inexact[ArrayLike, ""]
 
 # Damping ratio below which the base follows the column at once, and the least that is computed with.
 UNDAMPED, _LEAST = 1e-9, 1e-13
 _EASY = 1e-8  # damping ratio from which on eigenvalues are found as they are
-_SERIES = 20  # terms for modes that hardly turn within a step
+_TERMS = 21  # of the Taylor series of modes that hardly turn within a step
+_FACTORIALS = np.array([float(math.factorial(k)) for k in range(_TERMS)])
 
 
 class Numbers(eqx.Module):
@@ -187,10 +191,13 @@ def _rocking_rates(numbers: Numbers) -> Complex[Array, " rates"]:
     rates = jnp.linalg.eigvals(matrix)
     relaxing = (easier > 1) & (rates.real == jnp.min(rates.real))
     rates = jnp.where(relaxing, -stiffness / jnp.sum(held.rotation**2 * held.damping), rates)
-    for k in range(6):
-        value, slope = _characteristic(numbers if k >= 4 else held, rates)
-        rates = rates - value / slope
-    return rates
+
+    def better(numbers, rates):
+        value, slope = _characteristic(numbers, rates)
+        return rates - value / slope
+
+    rates = jax.lax.fori_loop(0, 4, lambda _, rates: better(held, rates), rates)
+    return better(numbers, better(numbers, rates))
 
 
 def _ratio(numbers: Numbers) -> Scalar:
@@ -218,8 +225,7 @@ class Arc(eqx.Module):
         return self.offsets + (self.phase.outputs @ self._at(x)).real
 
     def _at(self, x):
-        powers = jnp.concatenate([jnp.ones(1), jnp.cumprod(jnp.full(len(self.coefficients) - 1, x))])
-        return self.amplitudes * jnp.exp(self.exponents * x) + powers @ self.coefficients
+        return self.amplitudes * jnp.exp(self.exponents * x) + powers(x, len(self.coefficients)) @ self.coefficients
 
     def curves(self) -> Curve:
         """The outputs as curves (one axis more)."""
@@ -229,7 +235,7 @@ class Arc(eqx.Module):
         return Curve(rows * self.amplitudes, exponents, coefficients, jnp.abs(rows) * self.errors)
 
 
-def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: list[Scalar], length: Scalar) -> Arc:
+def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array, " order"], length: Scalar) -> Arc:
     """The motion from `state` on one side (0: locked) under a_g = sum of load[k] x^k, x = time/length."""
     n = numbers.rotation.size
     center = numbers.alpha * side * jnp.concatenate([numbers.rotation, jnp.zeros(n), jnp.ones(1)])
@@ -237,19 +243,29 @@ def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: list[Scalar],
     start = phase.project @ (state - center)
     exponents = phase.rates * length
     slow = jnp.abs(exponents) < 1
-    # Modes that hardly turn within the step: Taylor series of c' = rate c + drive a_g.
-    drive, series = phase.drive * length, [start]
-    for k in range(_SERIES):
-        forced = drive * load[k] if k < len(load) else 0.0
-        series.append((exponents * series[k] + forced) / (k + 1))
-    # The others: an exponential, and the polynomial that follows the load.
-    turning = jnp.where(slow, 1.0, exponents)
-    follows, above = [], jnp.zeros_like(start)
-    for k in range(len(load) - 1, -1, -1):
-        above = ((k + 1) * above - drive * load[k]) / turning
-        follows.insert(0, above)
-    follows += [jnp.zeros_like(start)] * (_SERIES + 1 - len(follows))
-    coefficients = jnp.stack([jnp.where(slow, a, b) for a, b in zip(series, follows)])
+    series = _series(jnp.where(slow, exponents, 0.0), start, phase.drive * length, load)
+    follows = _follows(jnp.where(slow, 1.0, exponents), phase.drive * length, load)
     amplitudes = jnp.where(slow, 0.0, start - follows[0])
     errors = 8 * jnp.finfo(center.dtype).eps * (jnp.abs(phase.project) @ (jnp.abs(state) + jnp.abs(center)))
-    return Arc(phase, center, offsets, amplitudes, exponents, coefficients, errors)
+    return Arc(phase, center, offsets, amplitudes, exponents, jnp.where(slow, series, follows), errors)
+
+
+def _series(exponents, start, drive, load) -> Complex[Array, "terms modes"]:
+    """Taylor coefficients of c' = exponent c + drive load(x), for modes that hardly turn within the step."""
+    rising = powers(exponents, _TERMS)
+    derivatives = _FACTORIALS[: load.size] * load
+    # Coefficient k + 1 of the answer, times its factorial: sum over j of load's derivative j times exponent^(k - j).
+    lag = np.subtract.outer(np.arange(_TERMS - 1), np.arange(_TERMS - 1))
+    known = (lag >= 0) & (lag < load.size)
+    answer = jnp.where(known, derivatives[np.where(known, lag, 0)], 0.0) @ rising[:-1]
+    answer = jnp.concatenate([jnp.zeros_like(rising[:1]), answer])
+    return (rising * start + answer * drive) / _FACTORIALS[:, None]
+
+
+def _follows(exponents, drive, load) -> Complex[Array, "terms modes"]:
+    """The polynomial that solves c' = exponent c + drive load(x), for modes that turn."""
+    derivatives = _FACTORIALS[: load.size] * load
+    order = np.add.outer(np.arange(_TERMS), np.arange(load.size))
+    known = order < load.size
+    answer = jnp.where(known, derivatives[np.where(known, order, 0)], 0.0) @ powers(1 / exponents, load.size)
+    return -answer * drive / exponents / _FACTORIALS[:, None]

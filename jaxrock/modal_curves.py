@@ -15,6 +15,13 @@ Flag = Bool[ArrayLike, ""]
 _MOST_STRIDES = 400
 
 
+def powers(base: Inexact[Array, "..."], count: int) -> Inexact[Array, "count ..."]:
+    """Powers 0 to count - 1, along a new first axis."""
+    base = jnp.asarray(base)
+    repeated = jnp.broadcast_to(base, (count - 1, *base.shape))
+    return jnp.cumprod(jnp.concatenate([jnp.ones_like(base)[None], repeated]), 0)
+
+
 class Curve(eqx.Module):
     """Re(sum of amplitude e^(rate x)) + sum of coefficient x^k."""
 
@@ -33,10 +40,9 @@ class Curve(eqx.Module):
     @staticmethod
     def _polynomial(coefficients, x) -> tuple[Scalar, Scalar, Scalar, Scalar]:
         """Value and three derivatives of the polynomial."""
-        powers = jnp.concatenate([jnp.ones(1), jnp.cumprod(jnp.full(coefficients.size - 1, x))])
-        found = []
-        for order in range(4):
-            found.append(jnp.sum(coefficients * powers[: coefficients.size]))
+        rising, found = powers(x, coefficients.size), []
+        for _ in range(4):
+            found.append(jnp.sum(coefficients * rising[: coefficients.size]))
             coefficients = coefficients[1:] * jnp.arange(1, coefficients.size)
         return tuple(found)
 
@@ -49,10 +55,10 @@ class Curve(eqx.Module):
 
     def noise(self) -> tuple[Scalar, Scalar]:
         """What rounding may change in value and slope on [0, 1]."""
-        powers, eps = jnp.arange(self.coefficients.size), 8 * jnp.finfo(self.errors.dtype).eps
+        order, eps = jnp.arange(self.coefficients.size), 8 * jnp.finfo(self.errors.dtype).eps
         sizes = (eps * jnp.abs(self.amplitudes) + self.errors) * jnp.exp(jnp.maximum(self.rates.real, 0.0))
         sides = eps * jnp.abs(self.coefficients)
-        return sizes.sum() + sides.sum(), (sizes * jnp.abs(self.rates)).sum() + (sides * powers).sum()
+        return sizes.sum() + sides.sum(), (sizes * jnp.abs(self.rates)).sum() + (sides * order).sum()
 
     def ceiling(self) -> Scalar:
         """A bound of the size on [0, 1]."""
@@ -78,6 +84,11 @@ def _clear(value, slope, curvature, bounds, noise):
     # From zero: slope + curvature x/2 - third x^2/6.
     leaving = jnp.where(up >= 0, _below_parabola(jnp.maximum(up, 0.0), curvature / 2, third / 3), 0.0)
     return touching, jnp.where(touching, leaving, _below_parabola(jnp.maximum(value, 0.0), slope, second))
+
+
+def _ratio(part: Scalar, whole: Scalar) -> Scalar:
+    """|part/whole|, or infinity."""
+    return jnp.where(whole == 0, jnp.inf, jnp.abs(part / jnp.where(whole == 0, 1.0, whole)))
 
 
 def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Scalar, Flag, Flag]:
@@ -123,15 +134,16 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
         record = least - value <= noise[0]
         _, falling = _clear(least - value, -slope, -curvature, (second, third), noise)
         rising = jnp.where(record & (slope >= 0), _below_parabola(jnp.maximum(slope, 0.0), curvature, third), 0.0)
-        # On a top the next stride may be lost in rounding.
-        stride = jnp.maximum(jnp.maximum(falling, rising), 16 * eps)
-        stride = jnp.minimum(stride, radius)
+        # What stays within rounding may be passed over.
+        within = jnp.minimum(jnp.sqrt(_ratio(noise[0], curvature)), jnp.cbrt(_ratio(noise[0], third)))
+        within = jnp.minimum(within, _ratio(noise[0], slope))
+        stride = jnp.minimum(jnp.maximum(jnp.maximum(falling, rising), jnp.maximum(within, 4 * eps)), radius)
         return jnp.minimum(x + stride, last), jnp.minimum(4 * stride, last), least, place, count + 1
 
     nowhere = still.ceiling() <= least
     start = (jnp.where(nowhere, last, 0.0), last, least, -jnp.ones_like(last), jnp.zeros((), jnp.int32))
     _, _, least, place, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < carry[4].dtype.type(0) + last) & (carry[4] < 25 * _MOST_STRIDES), step, start
+        lambda carry: (carry[0] < last) & (carry[4] < 25 * _MOST_STRIDES), step, start
     )
     at_end = ~nowhere & (still.jet(last)[0] > least)
     place = jnp.where(at_end, end, place)
