@@ -146,7 +146,7 @@ class FlexibleScene(eqx.Module):
         )
         low, high = jnp.where(rocking, 0.0, -limit), jnp.where(rocking, jnp.pi / 2, limit)
         x, below, above = first_exit(watched, low, high, share)
-        value, slope, _ = watched.jet(x)
+        value, slope = watched.jet(x)
         # One step of Newton's method gives the time of the event its derivatives.
         miss = value - jnp.where(below, low, high)
         hit = (below | above) & (slope != 0) & (x > 0)

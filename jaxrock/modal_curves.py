@@ -7,19 +7,28 @@ of its terms, so that a march in strides that cannot hold a zero finds every eve
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
-_MOST_STRIDES = 400
+_MOST_STRIDES = 10_000
 
 
-def powers(base: Inexact[Array, "..."], count: int) -> Inexact[Array, "count ..."]:
+def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count ..."]:
     """Powers 0 to count - 1, along a new first axis."""
     base = jnp.asarray(base)
-    repeated = jnp.broadcast_to(base, (count - 1, *base.shape))
-    return jnp.cumprod(jnp.concatenate([jnp.ones_like(base)[None], repeated]), 0)
+    found, next_ = jnp.ones_like(base)[None], base
+    while len(found) < count:
+        found, next_ = jnp.concatenate([found, found * next_]), next_ * next_
+    return found[:count]
+
+
+def _derivatives(count: int) -> np.ndarray:
+    """Matrices that take a polynomial's coefficients to those of its derivatives, orders 0 to 3."""
+    first = np.diag(np.arange(1.0, count), 1)
+    return np.stack([np.linalg.matrix_power(first, order) for order in range(4)])
 
 
 class Curve(eqx.Module):
@@ -30,28 +39,11 @@ class Curve(eqx.Module):
     coefficients: Inexact[Array, " terms"]
     errors: Inexact[Array, " modes"]  # what rounding may have changed in each mode at 0
 
-    def jet(self, x: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-        """Value and two derivatives."""
+    def jet(self, x: Scalar) -> tuple[Scalar, Scalar]:
+        """Value and slope."""
         terms = self.amplitudes * jnp.exp(self.rates * x)
-        faster = self.rates * terms
-        value, slope, curvature, _ = self._polynomial(self.coefficients, x)
-        return value + terms.real.sum(), slope + faster.real.sum(), curvature + (self.rates * faster).real.sum()
-
-    @staticmethod
-    def _polynomial(coefficients, x) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Value and three derivatives of the polynomial."""
-        rising, found = powers(x, coefficients.size), []
-        for _ in range(4):
-            found.append(jnp.sum(coefficients * rising[: coefficients.size]))
-            coefficients = coefficients[1:] * jnp.arange(1, coefficients.size)
-        return tuple(found)
-
-    def bounds(self, x: Scalar, radius: Scalar) -> tuple[Scalar, Scalar]:
-        """Bounds of the second and the third derivative's size on [x, x + radius]."""
-        growth = jnp.maximum(self.rates.real, 0.0) * radius
-        sizes = jnp.abs(self.amplitudes) * jnp.exp(self.rates.real * x + growth) * jnp.abs(self.rates) ** 2
-        _, _, second, third = self._polynomial(jnp.abs(self.coefficients), x + radius)
-        return second + sizes.sum(), third + (sizes * jnp.abs(self.rates)).sum()
+        value, slope = (_derivatives(self.coefficients.size)[:2] @ self.coefficients) @ powers(x, self.coefficients.size)
+        return value + terms.real.sum(), slope + (self.rates * terms).real.sum()
 
     def noise(self) -> tuple[Scalar, Scalar]:
         """What rounding may change in value and slope on [0, 1]."""
@@ -66,6 +58,61 @@ class Curve(eqx.Module):
         return sizes.sum() + jnp.abs(self.coefficients).sum()
 
 
+class _Tables(eqx.Module):
+    """What a march along a curve needs at every point, as products with few exponentials and powers."""
+
+    rates: Complex[Array, " modes"]
+    waves: Complex[Array, "five modes"]  # value, slope, curvature; value and slope of what does not vibrate
+    sizes: Inexact[Array, "four modes"]  # of second and third derivative; of the steady part's second; of the rest
+    smooth: Inexact[Array, "five terms"]
+    largest: Inexact[Array, "four terms"]
+
+    @classmethod
+    def of(cls, curve: Curve) -> "_Tables":
+        amplitudes, rates = curve.amplitudes, curve.rates
+        steady = jnp.where(rates.imag == 0, amplitudes, 0.0)
+        turned = [amplitudes * rates**k for k in range(4)]
+        smooth = _derivatives(curve.coefficients.size) @ curve.coefficients
+        return cls(
+            rates=rates,
+            waves=jnp.stack([*turned[:3], steady, steady * rates]),
+            sizes=jnp.abs(jnp.stack([turned[2], turned[3], steady * rates**2, amplitudes - steady])),
+            smooth=smooth[np.array([0, 1, 2, 0, 1])],
+            largest=jnp.abs(smooth[np.array([2, 3, 2, 3])]) * np.array([[1.0], [1], [1], [0]]),
+        )
+
+
+class _View:
+    """A curve at x, and bounds of it on [x, x + radius], from which lengths without a crossing follow."""
+
+    def __init__(self, tables: _Tables, noise: tuple[Scalar, Scalar], x: Scalar, radius: Scalar):
+        count = tables.smooth.shape[1]
+        turned = jnp.exp(tables.rates * x)
+        here = (tables.waves @ turned).real + tables.smooth @ powers(x, count)
+        grown = jnp.abs(turned) * jnp.exp(jnp.maximum(tables.rates.real, 0.0) * radius)
+        bounds = tables.sizes @ grown + tables.largest @ powers(x + radius, count)
+        self.value, self.slope, self.curvature, self.steady, self.drift = here
+        self.second, self.third, self.bend, self.swing = bounds
+        self.noise = noise
+
+    def clear(self, level: Scalar, sign: float) -> tuple[Flag, Scalar]:
+        """Whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
+
+        The longer of two: by parabolas below the whole curve, and below its steady part, less the swing of the rest.
+        A curve that touches the level must be on its way from it.
+        """
+        value, slope = sign * (self.value - level), sign * self.slope
+        touching = value <= self.noise[0]
+        up = jnp.where(jnp.abs(slope) <= self.noise[1], 0.0, slope)
+        # From zero: slope + curvature x/2 - third x^2/6.
+        leaving = _below_parabola(jnp.maximum(up, 0.0), sign * self.curvature / 2, self.third / 3)
+        above = sign * (self.steady - level) - self.swing
+        apart = _below_parabola(jnp.maximum(above, 0.0), sign * self.drift, self.bend)
+        apart = jnp.where(above > self.noise[0], apart, 0.0)
+        near = _below_parabola(jnp.maximum(value, 0.0), slope, self.second)
+        return touching, jnp.where(touching, jnp.where(up >= 0, leaving, 0.0), jnp.maximum(near, apart))
+
+
 def _below_parabola(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
     """Length on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
     root = jnp.sqrt(slope**2 + 2 * fall * value)
@@ -74,16 +121,6 @@ def _below_parabola(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
     under = jnp.where(rising, fall, root - slope)
     endless = jnp.where((value > 0) | rising, jnp.inf, 0.0)
     return jnp.where(under > 0, above / jnp.where(under > 0, under, 1.0), endless)
-
-
-def _clear(value, slope, curvature, bounds, noise):
-    """Length on which a quantity stays positive; one that is zero here must be on its way up."""
-    second, third = bounds
-    touching = value <= noise[0]
-    up = jnp.where(jnp.abs(slope) <= noise[1], 0.0, slope)
-    # From zero: slope + curvature x/2 - third x^2/6.
-    leaving = jnp.where(up >= 0, _below_parabola(jnp.maximum(up, 0.0), curvature / 2, third / 3), 0.0)
-    return touching, jnp.where(touching, leaving, _below_parabola(jnp.maximum(value, 0.0), slope, second))
 
 
 def _ratio(part: Scalar, whole: Scalar) -> Scalar:
@@ -98,15 +135,13 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
     early, with no hit: what lies before is certain. It has no derivatives.
     """
     curve, low, high, end = jax.lax.stop_gradient((curve, low, high, end))
-    noise = curve.noise()
+    noise, tables = curve.noise(), _Tables.of(curve)
     noise = noise[0] + 4 * jnp.finfo(noise[0].dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high)), noise[1]
 
     def step(carry):
         x, radius, _, _, _, count = carry
-        value, slope, curvature = curve.jet(x)
-        bounds = curve.bounds(x, radius)
-        at_low, from_low = _clear(value - low, slope, curvature, bounds, noise)
-        at_high, from_high = _clear(high - value, -slope, -curvature, bounds, noise)
+        view = _View(tables, noise, x, radius)
+        (at_low, from_low), (at_high, from_high) = view.clear(low, 1.0), view.clear(high, -1.0)
         below, above = at_low & (from_low <= 0), at_high & (from_high <= 0)
         stride = jnp.minimum(jnp.minimum(from_low, from_high), radius)
         reached = jnp.where(below | above, x, jnp.minimum(x + stride, end))
@@ -123,16 +158,15 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
 def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
     """The largest value on [0, end], or `best` if that is larger; with derivatives."""
     still, least, last = jax.lax.stop_gradient((curve, best, end))
-    noise, eps = still.noise(), jnp.finfo(last.dtype).eps
+    noise, tables, eps = still.noise(), _Tables.of(still), jnp.finfo(last.dtype).eps
 
     def step(carry):
         x, radius, least, place, count = carry
-        value, slope, curvature = still.jet(x)
-        second, third = still.bounds(x, radius)
+        view = _View(tables, noise, x, radius)
+        value, slope, curvature, third = view.value, view.slope, view.curvature, view.third
         higher = value > least
         least, place = jnp.where(higher, value, least), jnp.where(higher, x, place)
-        record = least - value <= noise[0]
-        _, falling = _clear(least - value, -slope, -curvature, (second, third), noise)
+        record, falling = view.clear(least, -1.0)
         rising = jnp.where(record & (slope >= 0), _below_parabola(jnp.maximum(slope, 0.0), curvature, third), 0.0)
         # What stays within rounding may be passed over.
         within = jnp.minimum(jnp.sqrt(_ratio(noise[0], curvature)), jnp.cbrt(_ratio(noise[0], third)))
@@ -143,7 +177,7 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
     nowhere = still.ceiling() <= least
     start = (jnp.where(nowhere, last, 0.0), last, least, -jnp.ones_like(last), jnp.zeros((), jnp.int32))
     _, _, least, place, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < last) & (carry[4] < 25 * _MOST_STRIDES), step, start
+        lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
     at_end = ~nowhere & (still.jet(last)[0] > least)
     place = jnp.where(at_end, end, place)
