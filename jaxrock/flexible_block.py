@@ -176,7 +176,9 @@ class FlexibleBlock(eqx.Module):
     def frequencies(self) -> Inexact[Array, "*batch modes"]:
         """Angular frequencies of the clamped column of masses [rad/s]."""
         # sqrt(E I/(m L^3)), with section width^3/12 and mass density width height, both per depth.
-        rate = jnp.sqrt(self.youngs_modulus / (12 * self.density * self.height * self.length)) * self.width / self.length
+        rate = (
+            jnp.sqrt(self.youngs_modulus / (12 * self.density * self.height * self.length)) * self.width / self.length
+        )
         return rate[..., None] * unit_column(self.masses).frequencies
 
     @property

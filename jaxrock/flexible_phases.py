@@ -140,9 +140,9 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
     ones = jnp.ones_like(at)
     modes = jnp.concatenate([shape, at * shape, ones], axis=1).T
     along_rotation = jnp.sum(numbers.rotation**2 * numbers.damping * inertia / denominator, 1, keepdims=True)
-    project = jnp.concatenate(
-        [numbers.rotation * square * (at + decay) / denominator, shape, along_rotation], axis=1
-    ) / slope
+    project = (
+        jnp.concatenate([numbers.rotation * square * (at + decay) / denominator, shape, along_rotation], axis=1) / slope
+    )
     whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-6
     # Without damping the base has no motion of its own: it follows the column.
     relaxing = (rates.imag == 0) & (rates.real == jnp.min(rates.real))
@@ -187,7 +187,9 @@ def _rocking_rates(numbers: Numbers) -> Complex[Array, " rates"]:
     coupling = jnp.concatenate(
         [-jnp.diag(held.squares), -jnp.diag(damping + held.mass_damping), push[:, None]], axis=1
     ) + jnp.outer(held.rotation * damping, turning)
-    matrix = jnp.concatenate([jnp.concatenate([jnp.zeros((n, n)), eye, jnp.zeros((n, 1))], axis=1), coupling, turning[None]])
+    matrix = jnp.concatenate(
+        [jnp.concatenate([jnp.zeros((n, n)), eye, jnp.zeros((n, 1))], axis=1), coupling, turning[None]]
+    )
     rates = jnp.linalg.eigvals(matrix)
     relaxing = (easier > 1) & (rates.real == jnp.min(rates.real))
     rates = jnp.where(relaxing, -stiffness / jnp.sum(held.rotation**2 * held.damping), rates)

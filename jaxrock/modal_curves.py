@@ -45,7 +45,9 @@ class Curve(eqx.Module):
     def jet(self, x: Scalar) -> tuple[Scalar, Scalar]:
         """Value and slope."""
         terms = self.amplitudes * jnp.exp(self.rates * x)
-        value, slope = (_derivatives(self.coefficients.size)[:2] @ self.coefficients) @ powers(x, self.coefficients.size)
+        value, slope = (_derivatives(self.coefficients.size)[:2] @ self.coefficients) @ powers(
+            x, self.coefficients.size
+        )
         return value + terms.real.sum(), slope + (self.rates * terms).real.sum()
 
     def noise(self) -> tuple[Scalar, Scalar]:

@@ -63,11 +63,15 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "parameters": {"scene"},
     "sensitivity": {"spectra", "parameters"},
     "critical": {"sweeps", "parameters"},
+    "modal_curves": set(),
+    "flexible_block": {"block"},
+    "flexible_phases": {"flexible_block", "modal_curves"},
+    "flexible": {"flexible_phases", "derivatives", "motion", "polynomial"},
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
     "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity", "hazard_files"},
+    "__init__": {"plot", "records", "similarity", "hazard_files", "flexible"},
     "__main__": {"__init__"},
 }
 
