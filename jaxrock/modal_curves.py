@@ -37,10 +37,10 @@ def _derivatives(count: int) -> np.ndarray:
 class Curve(eqx.Module):
     """Re(sum of amplitude e^(rate x)) + sum of coefficient x^k."""
 
-    amplitudes: Complex[Array, " modes"]
-    rates: Complex[Array, " modes"]
-    coefficients: Inexact[Array, " terms"]
-    errors: Inexact[Array, " modes"]  # what rounding may have changed in each mode at 0
+    amplitudes: Complex[Array, "*rows modes"]
+    rates: Complex[Array, "*rows modes"]
+    coefficients: Inexact[Array, "*rows terms"]
+    errors: Inexact[Array, "*rows modes"]  # what rounding may have changed in each mode at 0
 
     def jet(self, x: Scalar) -> tuple[Scalar, Scalar]:
         """Value and slope."""

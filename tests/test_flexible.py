@@ -1,4 +1,4 @@
-"""Flexible blocks: against an independent integration, published numbers, the rigid limit, and conservation of energy."""
+"""Flexible blocks: against an independent integration, known histories, the rigid limit, conservation of energy."""
 
 import jax
 import jax.numpy as jnp
@@ -54,13 +54,12 @@ def independent(block, motion, duration):
     while t < duration:
         stop = float(motion.period) if t < float(motion.period) else duration
 
-        def edge(t, x):
+        def edge(t, x, side=side):
             return side * x[-1] if side else strength - abs(lever @ (x[:n] + a1 * x[n:-1]))
 
-        # A solver looks for changes of sign: start a hair beyond the edge.
         edge.terminal, edge.direction = True, -1
         path = solve(
-            lambda t, x: rates(t, x, side), (t, stop), x, "DOP853", events=edge, rtol=1e-10, atol=1e-13,
+            lambda t, x, side=side: rates(t, x, side), (t, stop), x, "DOP853", events=edge, rtol=1e-10, atol=1e-13,
             dense_output=True, max_step=0.02,
         )  # fmt: skip
         pieces.append((t, path.t[-1], path.sol))
