@@ -35,7 +35,6 @@ class FlexibleState(eqx.Module):
     maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
     impacts: Int[Array, ""]
     impacted: Bool[Array, ""]  # just now
-    before: Inexact[Array, " states"]  # the motion before the last impact
     fallen: Bool[Array, ""]
     done: Bool[Array, ""]
     status: Status
@@ -97,7 +96,6 @@ class FlexibleScene(eqx.Module):
             maxima=jnp.zeros(6),
             impacts=count,
             impacted=no,
-            before=jnp.zeros(n),
             fallen=no,
             done=~(finite & self.whole),
             status=Status.where(finite & ~self.whole, Status.solver_failed, status),
@@ -187,7 +185,6 @@ class FlexibleScene(eqx.Module):
             maxima=state.maxima,
             impacts=state.impacts + counts,
             impacted=counts,
-            before=jnp.where(counts, still, state.before),
             fallen=state.fallen | fallen,
             done=stopped | fallen | ~finite,
             status=Status.where(finite, state.status, Status.not_finite),

@@ -50,13 +50,6 @@ class Curve(eqx.Module):
         )
         return value + terms.real.sum(), slope + (self.rates * terms).real.sum()
 
-    def noise(self) -> tuple[Scalar, Scalar]:
-        """What rounding may change in value and slope on [0, 1]."""
-        order, eps = jnp.arange(self.coefficients.size), 8 * jnp.finfo(self.errors.dtype).eps
-        sizes = (eps * jnp.abs(self.amplitudes) + self.errors) * jnp.exp(jnp.maximum(self.rates.real, 0.0))
-        sides = eps * jnp.abs(self.coefficients)
-        return sizes.sum() + sides.sum(), (sizes * jnp.abs(self.rates)).sum() + (sides * order).sum()
-
     def ceiling(self) -> Scalar:
         """A bound of the size on [0, 1]."""
         sizes = jnp.abs(self.amplitudes) * jnp.exp(jnp.maximum(self.rates.real, 0.0))
@@ -71,26 +64,34 @@ class _Tables(eqx.Module):
     sizes: Inexact[Array, "four modes"]  # of second and third derivative; of the steady part's second; of the rest
     smooth: Inexact[Array, "five terms"]
     largest: Inexact[Array, "four terms"]
+    errors: Inexact[Array, "two modes"]  # of value and slope, from rounding: of modes, which fade with them
+    floor: Inexact[Array, " two"]  # and of what stays
 
     @classmethod
-    def of(cls, curve: Curve) -> "_Tables":
+    def of(cls, curve: Curve, level: Scalar) -> "_Tables":
+        """Tables of a curve that is compared with numbers of the size `level`."""
         amplitudes, rates = curve.amplitudes, curve.rates
         steady = jnp.where(rates.imag == 0, amplitudes, 0.0)
         turned = [amplitudes * rates**k for k in range(4)]
         smooth = _derivatives(curve.coefficients.size) @ curve.coefficients
+        eps = 8 * jnp.finfo(smooth.dtype).eps
+        errors = eps * jnp.abs(amplitudes) + curve.errors
+        sides = eps * jnp.abs(smooth[:2]).sum(1)
         return cls(
             rates=rates,
             waves=jnp.stack([*turned[:3], steady, steady * rates]),
             sizes=jnp.abs(jnp.stack([turned[2], turned[3], steady * rates**2, amplitudes - steady])),
             smooth=smooth[np.array([0, 1, 2, 0, 1])],
             largest=jnp.abs(smooth[np.array([2, 3, 2, 3])]) * np.array([[1.0], [1], [1], [0]]),
+            errors=jnp.stack([errors, errors * jnp.abs(rates)]),
+            floor=sides.at[0].add(eps * jnp.abs(level)),
         )
 
 
 class _View:
     """A curve at x, and bounds of it on [x, x + radius], from which lengths without a crossing follow."""
 
-    def __init__(self, tables: _Tables, noise: tuple[Scalar, Scalar], x: Scalar, radius: Scalar):
+    def __init__(self, tables: _Tables, x: Scalar, radius: Scalar):
         count = tables.smooth.shape[1]
         turned = jnp.exp(tables.rates * x)
         here = (tables.waves @ turned).real + tables.smooth @ powers(x, count)
@@ -98,24 +99,29 @@ class _View:
         bounds = tables.sizes @ grown + tables.largest @ powers(x + radius, count)
         self.value, self.slope, self.curvature, self.steady, self.drift = here
         self.second, self.third, self.bend, self.swing = bounds
-        self.noise = noise
+        self.noise = tables.errors @ jnp.abs(turned) + tables.floor
+        # What cannot leave the noise may be passed over.
+        still = jnp.maximum(jnp.abs(self.slope), self.noise[1])
+        within = _ratio(self.noise[0], still), jnp.sqrt(_ratio(self.noise[0], self.curvature))
+        self.within = jnp.minimum(jnp.minimum(*within), jnp.cbrt(_ratio(self.noise[0], self.third)))
 
     def clear(self, level: Scalar, sign: float) -> tuple[Flag, Scalar]:
         """Whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
 
         The longer of two: by parabolas below the whole curve, and below its steady part, less the swing of the rest.
-        A curve that touches the level must be on its way from it.
+        It is zero where the curve touches the level and leaves this side, certainly in spite of rounding.
         """
         value, slope = sign * (self.value - level), sign * self.slope
         touching = value <= self.noise[0]
-        up = jnp.where(jnp.abs(slope) <= self.noise[1], 0.0, slope)
         # From zero: slope + curvature x/2 - third x^2/6.
-        leaving = _below_parabola(jnp.maximum(up, 0.0), sign * self.curvature / 2, self.third / 3)
+        up = jnp.where(slope <= self.noise[1], 0.0, slope)
+        leaving = _below_parabola(up, sign * self.curvature / 2, self.third / 3)
+        leaving = jnp.where(slope < -self.noise[1], 0.0, jnp.maximum(leaving, self.within))
         above = sign * (self.steady - level) - self.swing
         apart = _below_parabola(jnp.maximum(above, 0.0), sign * self.drift, self.bend)
         apart = jnp.where(above > self.noise[0], apart, 0.0)
         near = _below_parabola(jnp.maximum(value, 0.0), slope, self.second)
-        return touching, jnp.where(touching, jnp.where(up >= 0, leaving, 0.0), jnp.maximum(near, apart))
+        return touching, jnp.where(touching, leaving, jnp.maximum(near, apart))
 
 
 def _below_parabola(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
@@ -140,12 +146,11 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
     early, with no hit: what lies before is certain. It has no derivatives.
     """
     curve, low, high, end = jax.lax.stop_gradient((curve, low, high, end))
-    noise, tables = curve.noise(), _Tables.of(curve)
-    noise = noise[0] + 4 * jnp.finfo(noise[0].dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high)), noise[1]
+    tables = _Tables.of(curve, jnp.maximum(jnp.abs(low), jnp.abs(high)))
 
     def step(carry):
         x, radius, _, _, _, count = carry
-        view = _View(tables, noise, x, radius)
+        view = _View(tables, x, radius)
         (at_low, from_low), (at_high, from_high) = view.clear(low, 1.0), view.clear(high, -1.0)
         below, above = at_low & (from_low <= 0), at_high & (from_high <= 0)
         stride = jnp.minimum(jnp.minimum(from_low, from_high), radius)
@@ -163,20 +168,18 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
 def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
     """The largest value on [0, end], or `best` if that is larger; with derivatives."""
     still, least, last = jax.lax.stop_gradient((curve, best, end))
-    noise, tables, eps = still.noise(), _Tables.of(still), jnp.finfo(last.dtype).eps
+    tables, eps = _Tables.of(still, least), jnp.finfo(last.dtype).eps
 
     def step(carry):
         x, radius, least, place, count = carry
-        view = _View(tables, noise, x, radius)
+        view = _View(tables, x, radius)
         value, slope, curvature, third = view.value, view.slope, view.curvature, view.third
         higher = value > least
         least, place = jnp.where(higher, value, least), jnp.where(higher, x, place)
         record, falling = view.clear(least, -1.0)
         rising = jnp.where(record & (slope >= 0), _below_parabola(jnp.maximum(slope, 0.0), curvature, third), 0.0)
-        # What stays within rounding may be passed over.
-        within = jnp.minimum(jnp.sqrt(_ratio(noise[0], curvature)), jnp.cbrt(_ratio(noise[0], third)))
-        within = jnp.minimum(within, _ratio(noise[0], slope))
-        stride = jnp.minimum(jnp.maximum(jnp.maximum(falling, rising), jnp.maximum(within, 4 * eps)), radius)
+        stride = jnp.maximum(jnp.maximum(falling, rising), jnp.maximum(view.within, 4 * eps))
+        stride = jnp.minimum(stride, radius)
         return jnp.minimum(x + stride, last), jnp.minimum(4 * stride, last), least, place, count + 1
 
     nowhere = still.ceiling() <= least
