@@ -300,8 +300,8 @@ def test_stiff_columns():
 
 
 def test_small_budgets_have_a_status():
-    found = rk.outcome_flexible(rk.FlexibleBlock(**TALL, damping_ratio=0.0), 1000 * PULSE, duration=12.0, max_steps=1)
-    assert found.status in (rk.Status.step_budget_exhausted, rk.Status.successful)
+    found = rk.outcome_flexible(rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1)
+    assert found.status == rk.Status.step_budget_exhausted
 
 
 @pytest.mark.parametrize(
