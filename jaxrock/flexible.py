@@ -31,7 +31,9 @@ class FlexibleState(eqx.Module):
     local: Scalar  # time since the start of the piece [s]
     motion: Inexact[Array, " states"]  # (q, q', theta)
     side: Scalar  # 0: the base is locked
-    last_side: Scalar  # from which the last impact came
+    last_side: Scalar  # from which the base returned last
+    stay: Scalar  # how long the base has rocked on this side [s]
+    braked_stay: Scalar  # the stay that the last impact ended [s]
     maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
     impacts: Int[Array, ""]
     impacted: Bool[Array, ""]  # just now
@@ -93,6 +95,8 @@ class FlexibleScene(eqx.Module):
             motion=jnp.zeros(n),
             side=zero,
             last_side=zero,
+            stay=zero,
+            braked_stay=zero,
             maxima=jnp.zeros(6),
             impacts=count,
             impacted=no,
@@ -160,7 +164,10 @@ class FlexibleScene(eqx.Module):
         returned, fallen = rocking & below, rocking & above
         # A locked base, whose rotation is zero to the last digit.
         still = motion.at[-1].set(jnp.where(rocking & ~returned, motion[-1], 0.0))
-        counts = returned & ((state.side != state.last_side) | (self.block.impacts == "every"))
+        stay = jnp.where(rocking, state.stay + elapsed, 0.0)
+        # A column that trembles while the base uplifts must not use up the impact that ends the rocking.
+        counts = (state.side != state.last_side) | (stay > state.braked_stay) | (self.block.impacts == "every")
+        counts &= returned
         n = numbers.rotation.size
         after = jnp.where(counts, still.at[n:-1].multiply(self.block.restitution), still)
         # A damped column may push the base over at once.
@@ -182,6 +189,8 @@ class FlexibleScene(eqx.Module):
             motion=after,
             side=side,
             last_side=jnp.where(returned, state.side, state.last_side),
+            stay=jnp.where(returned, 0.0, stay),
+            braked_stay=jnp.where(counts, stay, state.braked_stay),
             maxima=state.maxima,
             impacts=state.impacts + counts,
             impacted=counts,
@@ -267,7 +276,11 @@ class FlexibleResponse(eqx.Module):
         return rotation, displacement, bending
 
     def base_moment(self, time: Values) -> Inexact[Array, "..."]:
-        """Moment of the base over m g R sin(alpha), at which it unlocks [-]."""
+        """Moment of the base over m g R sin(alpha), at which it unlocks [-].
+
+        Locked: the column's elastic and damping forces times their heights. Rocking: the spring's own moment,
+        side - rotation/alpha.
+        """
         return self._rows(time)[3] / self.scene.numbers.strength
 
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:

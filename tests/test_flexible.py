@@ -148,7 +148,7 @@ HISTORIES = {
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(k, marks=pytest.mark.slow) if "ten" in k or "ray" in k else k for k in HISTORIES]
+    "case", [pytest.param(k, marks=pytest.mark.slow) if k != "tall, undamped" else k for k in HISTORIES]
 )
 def test_peaks_and_impacts(case):
     """Peaks of the source are those of 8001 samples: never above the true ones, and a little below them."""
@@ -179,6 +179,7 @@ def test_against_an_independent_integration():
     np.testing.assert_allclose(response.impact_times, impacts, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_energy_is_conserved_between_impacts():
     """After the pulse, without damping: to 1e-10 of the whole between impacts; at an impact the kinetic part falls."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
@@ -196,6 +197,7 @@ def test_energy_is_conserved_between_impacts():
         before = total[-1]
 
 
+@pytest.mark.slow
 def test_the_work_of_the_ground_is_the_gain_of_energy():
     """Under the pulse: energy = - integral of the ground's force times velocity, by Gauss's quadrature."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
@@ -226,32 +228,59 @@ def _momentum(response, t):
     return jnp.sum(response.scene.numbers.load * state[n:-1])
 
 
-def test_the_rigid_limit():
-    """As the modulus grows the peak tends to that of the rigid block with the spring of figure 3b, as 1/modulus.
+def rigid_peak(block, amplitude, period):
+    """Peak rotation by SciPy of the rigid block with the column's moment of inertia and the same spring."""
+    solve = pytest.importorskip("scipy.integrate").solve_ivp
+    alpha, length, restitution = float(block.alpha), float(block.length), float(block.restitution)
+    strength, inertia = 9.81 * np.sin(alpha) / (2 * length), (1 + 1 / (2 * (block.masses - 1) ** 2)) / 3  # over m L^2
+    push = amplitude * 9.81 * np.cos(alpha) / (2 * length)
 
-    That block is a linear one, with p^2 sin(alpha)/(alpha inertia) and the motion times alpha/tan(alpha).
+    def rates(t, x, side):
+        return [x[1], (-push * np.sin(2 * np.pi * t / period) * (t < period) - side * strength
+                       + strength / alpha * x[0]) / inertia]  # fmt: skip
+
+    def returns(t, x, side):
+        return side * x[0] if t > start + 1e-6 else 1.0
+
+    def turns(t, x, side):
+        return x[1]
+
+    returns.terminal, returns.direction = True, -1
+    start = period / (2 * np.pi) * np.arcsin(strength / push)
+    t, x, side, peak = start, [0.0, 0.0], -1.0, 0.0
+    while t < 2 * period:
+        path = solve(
+            rates, (t, period if t < period else 2 * period), x, "DOP853", events=[returns, turns], args=(side,),
+            rtol=1e-13, atol=1e-15, max_step=0.02,
+        )  # fmt: skip
+        peak = max(peak, np.abs(path.y[0]).max(), *(np.abs(y[0]) for y in path.y_events[1]))
+        t, x = path.t[-1], path.y[:, -1]
+        if path.status == 1:
+            x, side = [0.0, restitution * x[1]], -side
+    return peak
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.25, 0.3])
+def test_the_rigid_limit(amplitude):
+    """As the modulus grows the peak tends to the rigid block's, as 1/modulus.
+
+    So do the column's bending under the motion and the time for which an impact locks the base. The factor varies
+    with the modulus, because the column trembles when the base uplifts; at 0.25 g it may touch down again, which must
+    not use up the impact.
     """
-    shape = dict(width=1.0, height=5.0, density=2500.0, damping_ratio=0.0, masses=6)
-    block = rk.FlexibleBlock(youngs_modulus=1e9, **shape)
-    alpha = float(block.alpha)
-    p = np.sqrt(1.5 * 9.81 / float(block.length) * np.sin(alpha) / alpha / (1 + 1 / 50))
-    pulse = rk.SinePulse(0.5, 0.8)
-    rigid = rk.outcome(
-        rk.Block(alpha, p, restitution=float(block.restitution)), (alpha / np.tan(alpha)) * pulse, rk.Linear()
-    ).max_rotation
-    errors = [
-        float(rk.outcome_flexible(rk.FlexibleBlock(youngs_modulus=E, **shape), pulse, duration=1.5).max_rotation)
-        / float(rigid) - 1
-        for E in (1e12, 1e13, 1e14)
-    ]  # fmt: skip
-    orders = np.log10(np.abs(errors[:-1]) / np.abs(errors[1:]))
-    assert np.abs(errors[-1]) < 1e-5
-    assert orders == pytest.approx(1, abs=0.2)
+    blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, 0.0) for E in (1e11, 1e12, 1e13, 1e14)]
+    pulse, rigid = rk.SinePulse(amplitude, 0.8), rigid_peak(blocks[0], amplitude, 0.8)
+    errors = np.array([float(rk.outcome_flexible(b, pulse, duration=1.6).max_rotation) / rigid - 1 for b in blocks])
+    order = np.polyfit(np.log(10) * np.arange(4), np.log(np.abs(errors)), 1)[0]
+    assert order == pytest.approx(-1, abs=0.1)
+    assert np.abs(errors[-1]) < 2e-5
 
 
 # ------------------------------------------------------- many, and derivatives
 
 
+@pytest.mark.slow
 def test_derivatives_and_finite_differences():
     """By modulus, density, damping and size: forward mode against central differences of the values."""
 
@@ -299,6 +328,7 @@ def test_stiff_columns():
 # ----------------------------------------------------------------- arguments
 
 
+@pytest.mark.slow
 def test_small_budgets_have_a_status():
     found = rk.outcome_flexible(rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1)
     assert found.status == rk.Status.step_budget_exhausted
@@ -313,6 +343,7 @@ def test_small_budgets_have_a_status():
         (dict(damping_ratio=1.0), r"`damping_ratio` must be in \[0, 1\), but is 1.0"),
         (dict(damping="viscous"), "`damping` must be one of"),
         (dict(youngs_modulus=1e5), "stiffer than its base"),
+        (dict(youngs_modulus=1e17), "at most 1e8 times as stiff"),
         (dict(width=80.0), "at most 1.41 times the height"),
     ],
 )
