@@ -78,8 +78,8 @@ class FlexibleBlock(eqx.Module):
 
     - `width`, `height`: full sizes [m], positive. (The depth does not matter.)
     - `youngs_modulus`: [Pa], positive; so large that the column does not give way before its base, and at most such
-      that it is 10^8 times as stiff (some 10^14 Pa; peaks of 3 10^14 Pa are still right to 1e-6, those of 10^15 Pa
-      wrong by 6e-4).
+      that it is 10^8 times as stiff (some 10^14 Pa of 1 m by 5 m; there, peaks of 3 10^14 Pa are still right to 1e-6,
+      those of 10^15 Pa wrong by 6e-4).
     - `density`: [kg/m^3], positive.
     - `damping_ratio`: of the column, in [0, 1) [-]; 0 for none.
     - `masses`: number of lumped masses, the one at the base included; 2 to 60. Six are within a few per cent of many.
