@@ -19,6 +19,13 @@ from jaxrock.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.flexible import (
+    FlexibleOutcome as FlexibleOutcome,
+    FlexibleResponse as FlexibleResponse,
+    outcome_flexible as outcome_flexible,
+    simulate_flexible as simulate_flexible,
+)
+from jaxrock.flexible_block import FlexibleBlock as FlexibleBlock
 from jaxrock.fragility import (
     AbstractFragility as AbstractFragility,
     FitStatus as FitStatus,

@@ -69,6 +69,10 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "parameters": {"scene"},
     "sensitivity": {"spectra", "parameters"},
     "critical": {"sweeps", "parameters"},
+    "modal_curves": set(),
+    "flexible_block": {"block"},
+    "flexible_phases": {"flexible_block", "modal_curves"},
+    "flexible": {"flexible_phases", "derivatives", "motion", "polynomial"},
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
@@ -78,7 +82,7 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "least_squares": set(),
     "histories": {"response", "pulses", "parameters", "least_squares"},
     "plot": {"sensitivity", "critical", "closed_form", "surfaces", "histories"},
-    "__init__": {"plot", "contact", "records", "similarity", "hazard_files"},
+    "__init__": {"plot", "contact", "records", "similarity", "hazard_files", "flexible"},
     "__main__": {"__init__"},
 }
 

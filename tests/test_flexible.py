@@ -1,0 +1,360 @@
+"""Flexible blocks: against an independent integration, known histories, the rigid limit, conservation of energy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.flexible_block import unit_column
+from jaxrock.flexible_phases import Numbers, locked_phase, rocking_phase
+
+TALL = dict(width=5.0, height=50.0, youngs_modulus=30e9, density=2500.0)  # Diamantopoulos & Fragiadakis, figure 22
+SHORT = dict(width=5.0, height=25.0, youngs_modulus=30e9, density=2500.0)  # figure 23
+PULSE = rk.SinePulse(0.5, 1.6)
+
+
+def beam(masses, length, bending, mass):
+    """Masses, heights and stiffness of a clamped cantilever, from its flexibility y^2 (3 Y - y)/(6 EI)."""
+    elements = masses - 1
+    y = length * np.arange(1, masses) / elements
+    low, high = np.minimum.outer(y, y), np.maximum.outer(y, y)
+    lumped = np.full(elements, mass / elements)
+    lumped[-1] /= 2
+    return lumped, y, np.linalg.inv(low**2 * (3 * high - low) / (6 * bending))
+
+
+def independent(block, motion, duration):
+    """Base rotation and displacements by SciPy: the matrix equations in displacements, phase by phase with events.
+
+    The damping is in proportion to stiffness, so that the base's rotation has an equation of first order.
+    """
+    solve = pytest.importorskip("scipy.integrate").solve_ivp
+    width, height, modulus, density, ratio = (
+        float(getattr(block, k)) for k in ("width", "height", "youngs_modulus", "density", "damping_ratio")
+    )
+    length, alpha, g = np.hypot(width, height), np.arctan2(width, height), 9.81
+    mass = density * width * height
+    m, y, stiffness = beam(block.masses, length, modulus * width**3 / 12, mass)
+    n, strength = len(y), mass * g * length / 2 * np.sin(alpha)
+    lever, kappa = stiffness @ y, y @ stiffness @ y
+    a1 = 2 * ratio / np.sqrt(np.linalg.eigvalsh(stiffness / np.sqrt(np.outer(m, m)))[0])
+    ground = float(motion.amplitude) * g * np.cos(alpha)
+
+    def rates(t, x, side):
+        u, v, theta = x[:n], x[n:-1], x[-1]
+        push = lever @ (u + a1 * v)
+        turn = (push - (kappa - strength / alpha) * theta - side * strength) / (a1 * kappa) if side else 0.0
+        load = ground * np.sin(2 * np.pi * t / float(motion.period)) if t < float(motion.period) else 0.0
+        force = stiffness @ (u + a1 * v) - lever * (theta + a1 * turn)
+        return np.concatenate([v, -force / m - load, [turn]])
+
+    t, x, side, last = 0.0, np.zeros(2 * n + 1), 0, 0
+    pieces, impacts = [], []
+    while t < duration:
+        stop = float(motion.period) if t < float(motion.period) else duration
+
+        def edge(t, x, side=side):
+            return side * x[-1] if side else strength - abs(lever @ (x[:n] + a1 * x[n:-1]))
+
+        edge.terminal, edge.direction = True, -1
+        path = solve(
+            lambda t, x, side=side: rates(t, x, side), (t, stop), x, "DOP853", events=edge, rtol=1e-10, atol=1e-13,
+            dense_output=True, max_step=0.02,
+        )  # fmt: skip
+        pieces.append((t, path.t[-1], path.sol))
+        t, x = path.t[-1], path.y[:, -1].copy()
+        if path.status == 1 and side:
+            if side != last:
+                impacts.append(t)
+                x[n:-1] *= float(block.restitution)
+            x[-1], last = 0.0, side
+            pushed = lever @ (x[:n] + a1 * x[n:-1])
+            side = int(np.sign(pushed)) if abs(pushed) > strength else 0
+        elif path.status == 1:
+            side = int(np.sign(lever @ (x[:n] + a1 * x[n:-1])))
+
+    def at(time):
+        found = next(path for start, end, path in reversed(pieces) if time >= start)(time)
+        return found[-1], np.cos(alpha) * found[n - 1]
+
+    return at, impacts
+
+
+# ---------------------------------------------------------------- the column
+
+
+@pytest.mark.parametrize("masses", [2, 6, 20])
+def test_the_unit_column_is_a_cantilever(masses):
+    column = unit_column(masses)
+    m, y, stiffness = beam(masses, 1.0, 1.0, 1.0)
+    squares = np.linalg.eigvalsh(stiffness / np.sqrt(np.outer(m, m)))
+    np.testing.assert_allclose(column.frequencies**2, squares, rtol=1e-7)
+    np.testing.assert_allclose(column.shapes.T @ (m[:, None] * column.shapes), np.eye(masses - 1), atol=1e-11)
+    # The block's own moment of inertia, and a little more.
+    assert column.rotation @ column.rotation == pytest.approx((1 + 1 / (2 * (masses - 1) ** 2)) / 3, rel=1e-12)
+    assert column.rotation @ column.tip == pytest.approx(1, rel=1e-12)
+
+
+def test_first_period():
+    """12.38 sqrt(density/modulus) h/tan(alpha); the column of masses is 2R long and tends to its own continuum."""
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    assert block.first_period == pytest.approx(12.38 * np.sqrt(2500 / 30e9) * 25 / 0.1, rel=2e-4)
+    lengthened = block.first_period * (block.length / 50) ** 1.5
+    errors = [
+        2 * np.pi / rk.FlexibleBlock(**TALL, damping_ratio=0.0, masses=n).frequencies[0] / lengthened - 1
+        for n in (6, 11, 21)
+    ]
+    assert errors[0] == pytest.approx(0.0185, abs=2e-3)
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1) and errors[1] / errors[2] == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize("damping", ["stiffness", "modal", "rayleigh"])
+def test_modes_span_the_motion_and_solve_the_equations(damping):
+    """project undoes modes; each rocking mode satisfies the equations of column and base."""
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.02, damping=damping)
+    numbers = Numbers.of(block)
+    locked, (rocking, whole) = locked_phase(numbers), rocking_phase(numbers)
+    n = numbers.rotation.size
+    assert whole
+    np.testing.assert_allclose(rocking.project @ rocking.modes, np.eye(2 * n + 1), atol=1e-11)
+    np.testing.assert_allclose((locked.project @ locked.modes)[:-1, :-1], np.eye(2 * n), atol=1e-11)
+    q, v, theta = np.split(np.asarray(rocking.modes), [n, 2 * n])
+    rate, column = np.asarray(rocking.rates), np.asarray(numbers.rotation)[:, None]
+    bend, bend_rate = q - column * theta, v - column * theta * rate
+    stiff, damp = np.asarray(numbers.squares)[:, None], np.asarray(numbers.damping)[:, None]
+    force = stiff * bend + damp * bend_rate
+    size = np.abs(stiff).max() * np.abs(q).max() + np.abs(rate) ** 2 * np.abs(q).max()
+    assert np.abs((rate * v + float(numbers.mass_damping) * v + force) / size).max() < 1e-13
+    moment = (column * force).sum(0) + float(numbers.spring_rate) * theta[0]
+    assert np.abs(moment / np.abs(column * stiff).sum()).max() < 1e-13
+
+
+# ------------------------------------------------------------- histories
+
+
+# peak rotation/alpha, displacement and bending of the top [m], impacts [s]; from the matrix equations of the column,
+# phase by phase with their eigenvectors, in NumPy.
+HISTORIES = {
+    "tall, undamped": (TALL, dict(damping_ratio=0.0, restitution=1.0), (.685775033, 3.40355433, .115993410),
+                       (2.33160572, 9.07118215, 15.66654802)),
+    "tall": (TALL, dict(damping_ratio=0.0), (.646087561, 3.20725943, .0798637348),
+             (2.33160572, 8.61887261, 14.68686782)),
+    "short, rayleigh": (SHORT, dict(damping_ratio=0.01, damping="rayleigh"), (.370776344, 1.83154689, .0115913049),
+                        (1.52765824, 4.32317654, 5.93067213, 7.09643430, 8.00636609, 8.74102191, 9.34960218)),
+    "tall, ten masses": (TALL, dict(damping_ratio=0.01, masses=10), (.643104225, 3.21633476, .0712043527),
+                         (2.33069047, 8.60484949, 14.23805287, 19.38760199)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(k, marks=pytest.mark.slow) if k != "tall, undamped" else k for k in HISTORIES]
+)
+def test_peaks_and_impacts(case):
+    """Peaks of the source are those of 8001 samples: never above the true ones, and a little below them."""
+    shape, more, peaks, impacts = HISTORIES[case]
+    amplitude = 5.2974 / 9.81 if shape is SHORT else 0.5
+    response = rk.simulate_flexible(
+        rk.FlexibleBlock(**shape, **more), rk.SinePulse(amplitude, 1.6), duration=20.0, samples=2
+    )
+    assert response.status == rk.Status.successful
+    found = response.outcome
+    alpha = float(response.scene.block.alpha)
+    for value, peak in zip((found.max_rotation / alpha, found.max_displacement, found.max_bending), peaks):
+        assert -1e-8 < float(value) / peak - 1 < 2e-3
+    np.testing.assert_allclose(response.impact_times[: len(impacts)], impacts, atol=2e-8)
+
+
+@pytest.mark.slow
+def test_against_an_independent_integration():
+    """Histories to 1e-6 of the peak (the goal; 1e-8 here, the integrator's own), impacts to 1e-8 s."""
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.01, masses=4)
+    response = rk.simulate_flexible(block, PULSE, duration=10.0)
+    at, impacts = independent(block, PULSE, 10.0)
+    times = np.linspace(0.01, 9.99, 300)
+    theta, top = np.array([at(t) for t in times]).T
+    rotation, displacement, _ = response(times)
+    np.testing.assert_allclose(rotation, theta, atol=1e-7 * np.abs(theta).max())
+    np.testing.assert_allclose(displacement, top, atol=1e-7 * np.abs(top).max())
+    np.testing.assert_allclose(response.impact_times, impacts, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_energy_is_conserved_between_impacts():
+    """After the pulse, without damping: to 1e-10 of the whole between impacts; at an impact the kinetic part falls."""
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    response = rk.simulate_flexible(block, PULSE, duration=20.0, samples=2)
+    edges = [1.6, *response.impact_times, 20.0]
+    assert len(edges) == 5
+    before = None
+    for start, end in zip(edges, edges[1:]):
+        times = np.linspace(start, end, 101)[:-1]
+        kinetic, strain, base = map(np.asarray, response.energy(times))
+        total = kinetic + strain + base
+        np.testing.assert_allclose(total, total[0], rtol=1e-10)
+        if before is not None:
+            assert total[0] < before
+        before = total[-1]
+
+
+@pytest.mark.slow
+def test_the_work_of_the_ground_is_the_gain_of_energy():
+    """Under the pulse: energy = - integral of the ground's force times velocity, by Gauss's quadrature."""
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    response = rk.simulate_flexible(block, PULSE, duration=20.0, samples=2)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    edges = np.linspace(0, 1.6, 9)
+    numbers, scene = response.scene.numbers, response.scene
+    total = 0.0
+    unlock = float(response.node_times[np.argmax(np.asarray(response.nodes.side) != 0)])
+    edges = np.unique(np.append(edges, unlock))
+    for a, b in zip(edges, edges[1:]):
+        times = (a + b) / 2 + (b - a) / 2 * nodes
+        momentum = jax.vmap(lambda t: _momentum(response, t))(jnp.asarray(times))
+        total -= (b - a) / 2 * np.sum(weights * np.asarray(PULSE.acceleration(times)) * np.asarray(momentum))
+    gained = sum(float(part) for part in response.energy(1.6))
+    scale = float(scene.block.density * scene.block.width * scene.block.height * scene.block.length**2)
+    assert gained / scale == pytest.approx(total, rel=1e-10)
+    assert numbers.load.shape == (5,)
+
+
+def _momentum(response, t):
+    """Sum of load times modal velocity, from the node before."""
+    index = jnp.searchsorted(response.node_times, t, side="right") - 1
+    node = jax.tree.map(lambda x: x[index], response.nodes)
+    path, length, _, _ = response.scene.arc(node)
+    state = path.state((t - response.node_times[index]) / length)
+    n = response.scene.numbers.rotation.size
+    return jnp.sum(response.scene.numbers.load * state[n:-1])
+
+
+def rigid_peak(block, amplitude, period):
+    """Peak rotation by SciPy of the rigid block with the column's moment of inertia and the same spring."""
+    solve = pytest.importorskip("scipy.integrate").solve_ivp
+    alpha, length, restitution = float(block.alpha), float(block.length), float(block.restitution)
+    strength, inertia = 9.81 * np.sin(alpha) / (2 * length), (1 + 1 / (2 * (block.masses - 1) ** 2)) / 3  # over m L^2
+    push = amplitude * 9.81 * np.cos(alpha) / (2 * length)
+
+    def rates(t, x, side):
+        return [x[1], (-push * np.sin(2 * np.pi * t / period) * (t < period) - side * strength
+                       + strength / alpha * x[0]) / inertia]  # fmt: skip
+
+    def returns(t, x, side):
+        return side * x[0] if t > start + 1e-6 else 1.0
+
+    def turns(t, x, side):
+        return x[1]
+
+    returns.terminal, returns.direction = True, -1
+    start = period / (2 * np.pi) * np.arcsin(strength / push)
+    t, x, side, peak = start, [0.0, 0.0], -1.0, 0.0
+    while t < 2 * period:
+        path = solve(
+            rates, (t, period if t < period else 2 * period), x, "DOP853", events=[returns, turns], args=(side,),
+            rtol=1e-13, atol=1e-15, max_step=0.02,
+        )  # fmt: skip
+        peak = max(peak, np.abs(path.y[0]).max(), *(np.abs(y[0]) for y in path.y_events[1]))
+        t, x = path.t[-1], path.y[:, -1]
+        if path.status == 1:
+            x, side = [0.0, restitution * x[1]], -side
+    return peak
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.25, 0.3])
+def test_the_rigid_limit(amplitude):
+    """As the modulus grows the peak tends to the rigid block's, as 1/modulus.
+
+    So do the column's bending under the motion and the time for which an impact locks the base. The factor varies
+    with the modulus, because the column trembles when the base uplifts; at 0.25 g it may touch down again, which must
+    not use up the impact.
+    """
+    blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, 0.0) for E in (1e11, 1e12, 1e13, 1e14)]
+    pulse, rigid = rk.SinePulse(amplitude, 0.8), rigid_peak(blocks[0], amplitude, 0.8)
+    errors = np.array([float(rk.outcome_flexible(b, pulse, duration=1.6).max_rotation) / rigid - 1 for b in blocks])
+    order = np.polyfit(np.log(10) * np.arange(4), np.log(np.abs(errors)), 1)[0]
+    assert order == pytest.approx(-1, abs=0.1)
+    assert np.abs(errors[-1]) < 2e-5
+
+
+# ------------------------------------------------------- many, and derivatives
+
+
+@pytest.mark.slow
+def test_derivatives_and_finite_differences():
+    """By modulus, density, damping and size: forward mode against central differences of the values."""
+
+    def peaks(x):
+        block = rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2])
+        found = rk.outcome_flexible(block, PULSE, duration=12.0)
+        return jnp.stack([found.max_rotation, found.max_displacement, found.max_bending])
+
+    x = jnp.array([30.0, 2.5, 0.01, 5.0, 50.0])
+    steps = 1e-5 * jnp.diag(x)
+    values = jax.jit(jax.vmap(peaks))(jnp.concatenate([x + steps, x - steps]))
+    slopes = (values[:5] - values[5:]) / (2e-5 * x[:, None])
+    jacobian = jax.jit(jax.jacfwd(peaks))(x)
+    np.testing.assert_allclose(jacobian.T, slopes, rtol=2e-6, atol=1e-6 * float(jnp.abs(slopes).max()))
+
+
+@pytest.mark.slow
+def test_a_thousand_blocks_at_once():
+    """One call, with the answers of single calls; reverse mode agrees with forward mode."""
+    moduli = jnp.linspace(10e9, 60e9, 1000)
+
+    def peak(E):
+        return rk.outcome_flexible(
+            rk.FlexibleBlock(5.0, 50.0, E, 2500.0, 0.01), PULSE, duration=12.0
+        )  # fmt: skip
+
+    found = jax.jit(jax.vmap(peak))(moduli)
+    assert (found.status == rk.Status.successful).all()
+    for i in (0, 500, 999):
+        assert found.max_rotation[i] == pytest.approx(float(peak(moduli[i]).max_rotation), rel=1e-12)
+    forward = jax.jacfwd(lambda E: peak(E).max_rotation)(30e9)
+    assert jax.grad(lambda E: peak(E).max_rotation)(30e9) == pytest.approx(float(forward), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_stiff_columns():
+    """300 GPa, 5 m, 20 masses: the fastest mode turns 1e5 times a second, and steps do not notice it."""
+    block = rk.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, 0.0, 20)
+    response = rk.simulate_flexible(block, rk.SinePulse(0.5, 0.8), duration=8.0, samples=2)
+    assert float(block.frequencies[-1]) > 1e5
+    assert response.status == rk.Status.successful
+    assert int(response.nodes.steps.max()) < 200
+
+
+# ----------------------------------------------------------------- arguments
+
+
+@pytest.mark.slow
+def test_small_budgets_have_a_status():
+    found = rk.outcome_flexible(rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1)
+    assert found.status == rk.Status.step_budget_exhausted
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(width=-1.0), "`width` must be positive"),
+        (dict(masses=1), "`masses` must be a whole number from 2 to 60, but is 1"),
+        (dict(masses=2, damping="rayleigh"), "from 3 to 60"),
+        (dict(damping_ratio=1.0), r"`damping_ratio` must be in \[0, 1\), but is 1.0"),
+        (dict(damping="viscous"), "`damping` must be one of"),
+        (dict(youngs_modulus=1e5), "stiffer than its base"),
+        (dict(youngs_modulus=1e17), "at most 1e8 times as stiff"),
+        (dict(width=80.0), "at most 1.41 times the height"),
+    ],
+)
+def test_wrong_arguments(change, message):
+    with pytest.raises(ValueError, match=message):
+        rk.FlexibleBlock(**(TALL | dict(damping_ratio=0.01) | change))
+
+
+def test_wrong_durations():
+    block = rk.FlexibleBlock(**TALL, damping_ratio=0.01)
+    with pytest.raises(ValueError, match="`duration` must be positive"):
+        rk.simulate_flexible(block, PULSE, duration=0.0)
+    with pytest.raises(ValueError, match="`samples` must be at least 2"):
+        rk.simulate_flexible(block, PULSE, samples=1)
