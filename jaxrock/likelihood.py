@@ -184,7 +184,11 @@ class Likelihood(eqx.Module):
                 real = jnp.stack([found.margin, rotation])
                 return real, (real, found.overturned, found.status == Status.successful)
 
-            return jax.jacfwd(results, has_aux=True)(parameters) if slopes else (None, results(parameters)[1])
+            if not slopes:
+                return None, results(parameters)[1]
+            # The product of a small Jacobian: in reverse it is computed once, with the values.
+            _, back, found = jax.vjp(results, parameters, has_aux=True)
+            return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
 
         parameters = jnp.stack([jnp.broadcast_to(x[..., None, None], shape).ravel() for x in parameters], axis=-1)
         rows, (real, lost, known) = jax.vmap(one)(parameters, *(jnp.broadcast_to(x, shape).ravel() for x in scenes))
