@@ -17,6 +17,12 @@ from jaxrock.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.feasible import (
+    FeasibleRegion as FeasibleRegion,
+    Unexceeded as Unexceeded,
+    feasible_region as feasible_region,
+    unexceeded_motion as unexceeded_motion,
+)
 from jaxrock.fragility import (
     AbstractFragility as AbstractFragility,
     FitStatus as FitStatus,
@@ -34,8 +40,18 @@ from jaxrock.hazard import (
     toppling_rate as toppling_rate,
 )
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.inverse import (
+    Estimate as Estimate,
+    EstimateStatus as EstimateStatus,
+    estimate_motion as estimate_motion,
+)
+from jaxrock.likelihood import Likelihood as Likelihood
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record
+from jaxrock.observation_files import read_observations as read_observations
+from jaxrock.observations import Observations as Observations
+from jaxrock.posterior import Posterior as Posterior, PosteriorStatus as PosteriorStatus, sample_motion as sample_motion
+from jaxrock.problem import Unknown as Unknown
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,
     ExponentialPulse as ExponentialPulse,

@@ -1,8 +1,8 @@
 """Maxima of a function whose values and slopes come in batches: many climbers at once, each at its own pace.
 
 Each climber has a BFGS matrix of its own; there are few dimensions. It tries one point in every round; whether that was
-good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's line
-search, and a round is one call of one compiled program, whatever the climbers are at.
+good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's
+line search, and a round is one call of one compiled program, whatever the climbers are at.
 """
 
 from collections.abc import Callable

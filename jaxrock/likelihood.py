@@ -11,17 +11,17 @@ margin:
 
 A probit of the margin over its slope (the delta method) would give that where the margin is straight; but overturning
 sets are unions of intervals, narrower than the scatter or wider, and a probit with one slope would be certain where the
-slope vanishes, in the middle of one. So the margin is computed at 13 nodes along the direction in which the scatter moves
-it most (a larger amplitude, a slenderer or a smaller rock all act alike), and is taken as straight between them:
+slope vanishes, in the middle of one. So the margin is computed at 13 nodes along the direction in which the scatter
+moves it most (a larger amplitude, a slenderer or a smaller rock all act alike), and is taken as straight between them:
 
     P(stands) = sum_k w_k Phi(y_k/s_k),
 
-over the quarter points of the 12 intervals, with y a function of the margin that is nearly straight in ln amplitude, w_k
-the normal probability, and s_k a little over a quarter of what y changes by from node to node: a probit that smears each
-interval just so far that the sum is smooth. Beyond the last nodes, 3.6 standard deviations away, y goes on straight, so
-that an observation that is all but impossible still says in which direction it is less so. The nodes also lie off the main
-direction, in such a pattern that all four add their variance. Detail below about 0.3 scatter is not resolved. No
-derivatives are needed for the likelihood, and only first ones for its slope.
+over the quarter points of the 12 intervals, with y a function of the margin that is nearly straight in ln amplitude,
+w_k the normal probability, and s_k a little over a quarter of what y changes by from node to node: a probit that smears
+each interval just so far that the sum is smooth. Beyond the last nodes, 3.6 standard deviations away, y goes on
+straight, so that an observation that is all but impossible still says in which direction it is less so. The nodes also
+lie off the main direction, in such a pattern that all four add their variance. Detail below about 0.3 scatter is not
+resolved. No derivatives are needed for the likelihood, and only first ones for its slope.
 """
 
 import math
@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp
-from jaxtyping import Array, ArrayLike, Inexact, PyTree
+from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import positive, put_down
 from jaxrock.block import Block
@@ -45,7 +45,8 @@ from jaxrock.status import Status
 
 Real = Inexact[Array, "..."]
 
-_NODES = np.arange(-6, 7)
+NODES = 13  # scenes that are computed for each rock
+_NODES = np.arange(NODES) - NODES // 2
 _APART = 0.6  # distance of nodes, in standard deviations
 _SMEAR = 0.28  # of the difference between nodes
 _LEAST_WIDTH = 1e-3
@@ -84,7 +85,7 @@ def _design() -> np.ndarray:
     something straight is 1 in each column.
     """
     turn = 2 * np.pi * _NODES / np.array([[3], [3], [5]])
-    columns = np.stack([np.ones(13), _NODES * _APART, np.cos(turn[0]), np.sin(turn[1]), np.cos(turn[2])], axis=1)
+    columns = np.stack([np.ones(NODES), _NODES * _APART, np.cos(turn[0]), np.sin(turn[1]), np.cos(turn[2])], axis=1)
     weights = np.exp(-((_NODES * _APART) ** 2) / 2)[:, None]
     root = np.sqrt(weights / weights.sum())
     off = (np.linalg.qr(columns * root)[0] / root)[:, 2:]
@@ -132,8 +133,8 @@ class Likelihood(eqx.Module):
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
         For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
-        [1/rad]. It has first derivatives if `slopes`, and is computed faster without. Many motions at once take less time
-        than `jax.vmap` of one.
+        [1/rad]. It has first derivatives if `slopes`, and is computed faster without. Many motions at once take less
+        time than `jax.vmap` of one.
         """
         seen, possible = self.observations, self._possible(values, slopes)
         variance = possible.rotation_width**2 + seen.rotation_sd**2
@@ -235,7 +236,8 @@ class _Possible(NamedTuple):
         sign = 1.0 if stands else -1.0
         # Of a scene that could not be computed nothing is known: one half, and no slope.
         inner = log_ndtr(jnp.where(self.known, sign * self.y / self.width, 0.0))
-        # A motion that is small enough spares every rock, and one that is large enough topples it. How far away is that?
+        # A motion that is small enough spares every rock, and one that is large enough topples it. How far away is
+        # that?
         first, last, before, after = self.ends
         near, slope, far = (first, before, last) if stands else (-last, after, -first)
         beyond = log_ndtr(-_LAST + jnp.minimum(near, 0.0) / slope)
@@ -255,8 +257,8 @@ def _straightened(margin: Real) -> Real:
     """A function of the margin that is nearly straight in ln amplitude, with slope 1/2 through zero.
 
     In a free stage the margin is 1 - E/E_crit, and energy goes with the square of the amplitude: -ln(1 - margin)/2 is
-    ln(critical/amplitude) there. Above zero its Taylor polynomial stands for it, because a margin of 1 is not infinitely
-    far away.
+    ln(critical/amplitude) there. Above zero its Taylor polynomial stands for it, because a margin of 1 is not
+    infinitely far away.
     """
     lost = margin < 0
     return jnp.where(lost, -jnp.log1p(-jnp.where(lost, margin, 0.0)) / 2, margin / 2 + margin**2 / 4)

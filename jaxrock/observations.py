@@ -27,8 +27,8 @@ class Observations(eqx.Module):
     - `restitution`: (rocks,) in [0, 1]; None, or NaN for a rock, is Housner's value, which follows alpha.
     - `alpha_sd`, `p_sd`, `restitution_sd`: (rocks,) or one number: standard deviations, 0 or more, in the units of what
       they belong to. Alpha and p are uncertain by lognormal factors, the restitution by a normal sum within [0, 0.99].
-    - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive; not
-      read for rocks without one.
+    - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive;
+      not read for rocks without one.
     - `names`: of the rocks; None numbers them.
 
     **Raises:** ValueError for values outside their ranges, or of different lengths.
@@ -80,8 +80,7 @@ class Observations(eqx.Module):
         )
         measured = np.asarray(self.seen) == ROTATION
         self.rotation, self.rotation_sd = (
-            _measured(name, value, measured)
-            for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
+            _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
         )
         self.names = tuple(f"rock {i + 1}" for i in range(count)) if names is None else tuple(map(str, names))
         if len(self.names) != count:

@@ -66,9 +66,19 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "fragility": set(),
     "hazard": {"fragility"},
     "hazard_files": {"hazard"},
+    "observations": {"block"},
+    "observation_files": {"observations"},
+    "likelihood": {"response", "observations"},
+    "climb": set(),
+    "problem": {"likelihood"},
+    "profiles": {"problem", "climb"},
+    "inverse": {"profiles"},
+    "posterior": {"inverse"},
+    "feasible": {"likelihood", "critical", "spectra"},
+    "invert": {"feasible", "inverse", "observation_files", "pulses"},
     "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity", "hazard_files"},
-    "__main__": {"__init__"},
+    "__init__": {"plot", "records", "similarity", "hazard_files", "posterior", "observation_files", "feasible"},
+    "__main__": {"__init__", "invert"},
 }
 
 MOST_LINES_OF_A_MODULE = 450
