@@ -13,7 +13,7 @@ import numpy as np
 _FARTHEST = 1.0  # a step, in the units of the points
 _ENOUGH = 1e-4  # of the gain that the slope promises
 _SHORTEST = 1e-9  # step below which there is a jump
-_HOPELESS = ((8, 30.0), (15, 10.0), (30, 4.0))  # rounds after which climbers so far below the best are given up
+_HOPELESS = ((6, 20.0), (12, 6.0), (20, 3.0), (35, 0.5))  # rounds after which climbers so far below are given up
 _SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
 
 

@@ -6,7 +6,7 @@ others explain the observations nearly as well as the best. Where the observatio
 range that was searched, and say so.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -131,8 +131,7 @@ def estimate_motion(
     problem = Problem(Likelihood(observations, motion, scatter, model, engine), dict(unknowns))
     bar = Progress(starts * 80, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
-    first = np.asarray(problem.points(jnp.asarray(_spread(starts, problem))))
-    found = climb(evaluate, first)
+    found = climb(evaluate, evaluate.points(_spread(starts, evaluate)))
     for _ in range(3):
         best = int(np.argmax(found.values))
         shape = shape_at(evaluate, found.points[best])
@@ -147,9 +146,9 @@ def estimate_motion(
     return result
 
 
-def _spread(count: int, problem: Problem) -> np.ndarray:
+def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
     """Places spread evenly over the ranges: multiples of irrational numbers, modulo one."""
-    low, high = np.asarray(problem.ends).T
+    low, high = evaluate.ends
     size = low.size
     root = np.roots([1, *[0] * (size - 1), -1, -1])
     ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
@@ -157,21 +156,15 @@ def _spread(count: int, problem: Problem) -> np.ndarray:
     return low + (high - low) * (0.01 + 0.98 * share)
 
 
-@eqx.filter_jit
-def _facts(problem: Problem, place: Real) -> tuple[Real, tuple[Real, Real, Real]]:
-    values = problem.values(place)
-    return problem.likelihood.survival(values), problem.likelihood.surprise(values)
-
-
 def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profile) -> Estimate:
     problem = evaluate.problem
     best = int(np.argmax(found.values))
-    places = problem.places(jnp.asarray(found.points))
+    places = jnp.asarray(evaluate.places(found.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     values = {name: x[best] for name, x in problem.values(places).items()}
-    terms, facts = _facts(problem, places[best])
+    stands, *facts = evaluate.facts(found.points[best])
     surprise = _surprise(facts)
-    probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - terms, terms)
+    probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
     remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
     status = EstimateStatus.successful
     if profiled.open.any():
@@ -213,8 +206,8 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
     )
 
 
-def _surprise(facts: tuple[Real, Real, Real]) -> float:
-    badness, mean, variance = (float(jnp.sum(x)) for x in facts)
+def _surprise(facts: Sequence[np.ndarray]) -> float:
+    badness, mean, variance = (float(np.sum(x)) for x in facts)
     # A quarter keeps near certainties, whose variance is nothing, from being surprised by rounding.
     return (badness - mean) / np.sqrt(variance + 0.25)
 
@@ -225,11 +218,10 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         scatter = evaluate.problem.likelihood.scatter * factor
         problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
         again = Evaluator(problem)
-        starts = np.concatenate([point[None], np.asarray(problem.points(jnp.asarray(_spread(_RETRIES, problem))))])
+        starts = np.concatenate([point[None], again.points(_spread(_RETRIES, again))])
         found = climb(again, starts)
         evaluate.count += again.count
-        place = problem.places(jnp.asarray(found.points[np.argmax(found.values)]))
-        if _surprise(_facts(problem, place)[1]) <= _SURPRISED:
+        if _surprise(again.facts(found.points[np.argmax(found.values)])[1:]) <= _SURPRISED:
             return float(scatter)
     return np.inf
 

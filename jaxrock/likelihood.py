@@ -136,7 +136,10 @@ class Likelihood(eqx.Module):
         [1/rad]. It has first derivatives if `slopes`, and is computed faster without. Many motions at once take less
         time than `jax.vmap` of one.
         """
-        seen, possible = self.observations, self._possible(values, slopes)
+        return self._terms(self._possible(values, slopes))
+
+    def _terms(self, possible: "_Possible") -> Real:
+        seen = self.observations
         variance = possible.rotation_width**2 + seen.rotation_sd**2
         density = -((seen.rotation - possible.rotation) ** 2) / (2 * variance) - jnp.log(2 * jnp.pi * variance) / 2
         # Of a rotation in a scene that overturns, had it not, nothing is known; nor of one that was not computed.
@@ -156,7 +159,15 @@ class Likelihood(eqx.Module):
         The badness is minus the log-probability; for a measured rotation half its squared distance from what is
         expected, in standard deviations, and minus the log-probability that it stands.
         """
-        seen, nodes = self.observations, self._possible(values)
+        return self._surprise(self._possible(values))
+
+    def terms_and_facts(self, values: dict[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real]]:
+        """What `log_terms`, and `survival` with `surprise`, return; for the cost of the first."""
+        possible = self._possible(values, slopes=True)
+        return self._terms(possible), (jnp.exp(possible.log_probability(True)), *self._surprise(possible))
+
+    def _surprise(self, nodes: "_Possible") -> tuple[Real, Real, Real]:
+        seen = self.observations
         stands, topples = (jnp.maximum(nodes.log_probability(which), -1e3) for which in (True, False))
         share, lost = jnp.exp(stands), jnp.exp(topples)
         badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
@@ -192,12 +203,11 @@ class Likelihood(eqx.Module):
             return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
 
         parameters = jnp.stack([jnp.broadcast_to(x[..., None, None], shape).ravel() for x in parameters], axis=-1)
-        rows, (real, lost, known) = jax.vmap(one)(parameters, *(jnp.broadcast_to(x, shape).ravel() for x in scenes))
+        # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
+        fixed = jax.lax.stop_gradient(parameters)
+        rows, (real, lost, known) = jax.vmap(one)(fixed, *(jnp.broadcast_to(x, shape).ravel() for x in scenes))
         if slopes:
-            # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
-            rows = jax.lax.stop_gradient(jnp.where(jnp.isfinite(rows), rows, 0.0))
-            change = parameters - jax.lax.stop_gradient(parameters)
-            real = jax.lax.stop_gradient(real) + jnp.sum(rows * change[:, None], axis=-1)
+            real += jnp.sum(jnp.where(jnp.isfinite(rows), rows, 0.0) * (parameters - fixed)[:, None], axis=-1)
         return _Possible.of(*(jnp.moveaxis(x.reshape(shape), -2, 0) for x in (*real.T, lost, known)))
 
 

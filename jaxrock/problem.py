@@ -96,18 +96,26 @@ class Problem(eqx.Module):
             for i, (name, unknown) in enumerate(self.unknowns.items())
         }
 
-    def log_density(self, points: Real, slopes: bool = True) -> Real:
-        """Log-likelihood and log-prior (by the places) at points, (..., parameters); first derivatives if `slopes`."""
+    def log_prior(self, places: Real) -> Real:
+        """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
+        return sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
+
+    def log_density(self, points: Real) -> Real:
+        """Log-likelihood and log-prior (by the places) at points, (..., parameters); with first derivatives."""
         places = self.places(points)
-        prior = sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
-        return jnp.sum(self.likelihood.log_terms(self.values(places), slopes), axis=-1) + prior
+        return jnp.sum(self.likelihood.log_terms(self.values(places)), axis=-1) + self.log_prior(places)
 
 
 @eqx.filter_jit
-def _batch(problem: Problem, points: Real) -> tuple[Real, Real]:
+def _batch(problem: Problem, points: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
+    def density(points):
+        places = problem.places(points)
+        terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
+        return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
+
     # The points do not depend on one another, so that the slopes of the sum are those of each.
-    value, back = jax.vjp(problem.log_density, points)
-    return value, back(jnp.ones_like(value))[0]
+    value, back, facts = jax.vjp(density, points, has_aux=True)
+    return value, back(jnp.ones_like(value))[0], facts
 
 
 class Evaluator:
@@ -115,14 +123,30 @@ class Evaluator:
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
         self.problem, self.count, self.progress = problem, 0, progress
+        self.ends = np.asarray(problem.ends).T
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        points = np.asarray(points)
         found = []
         for begin in range(0, len(points), _LANES):
             part = points[begin : begin + _LANES]
             padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append([np.asarray(x)[: len(part)] for x in _batch(self.problem, jnp.asarray(padded))])
+            found.append([np.asarray(x)[: len(part)] for x in _batch(self.problem, padded)[:2]])
             self.progress(len(part))
         self.count += len(points)
         return tuple(np.concatenate(x) for x in zip(*found))
+
+    def facts(self, point: np.ndarray) -> tuple[np.ndarray, ...]:
+        """`survival` and `surprise` of the likelihood at a point, (rocks,) each."""
+        self.count += 1
+        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(point, (_LANES, 1)))[2])
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """As of the problem; outside JAX, which would compile it for every number of points."""
+        low, high = self.ends
+        return low + (high - low) / (1 + np.exp(-points))
+
+    def points(self, places: np.ndarray) -> np.ndarray:
+        """As of the problem."""
+        low, high = self.ends
+        share = np.clip((places - low) / (high - low), _NEAR, 1 - _NEAR)
+        return np.log(share) - np.log1p(-share)

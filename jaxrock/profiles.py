@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.climb import Summits, climb
@@ -24,15 +23,14 @@ class Shape(NamedTuple):
 
 def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
     """The Hessian by differences of slopes over a third of a standard deviation: on a finer scale there are steps."""
-    problem = evaluate.problem
-    place = np.asarray(problem.places(jnp.asarray(point)))
-    low, high = np.asarray(problem.ends).T
+    place = evaluate.places(point)
+    low, high = evaluate.ends
     size = high - low
     step = np.full(place.size, 0.02)  # of the range
     for _ in range(2):
         moves = np.concatenate([np.diag(step), -np.diag(step)]) * size
-        at = np.asarray(problem.points(jnp.asarray(np.clip(place + moves, low, high))))
-        at_places = np.asarray(problem.places(jnp.asarray(at)))
+        at = evaluate.points(np.clip(place + moves, low, high))
+        at_places = evaluate.places(at)
         share = (at_places - low) / size
         slopes = evaluate(at)[1] / (share * (1 - share))  # by places in ranges
         half = place.size
@@ -72,7 +70,7 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
     For every parameter and side: some values outward to the end of the range, the others climbing at each; then the
     root of the likelihood ratio, which is nearly straight, by secants in the outermost bracket.
     """
-    low, high = np.asarray(evaluate.problem.ends).T
+    low, high = evaluate.ends
     size, near = high - low, _NEAR * (high - low)
     sides = _Sides(evaluate, found.values.max(), shape.place)
     variance = np.diagonal(shape.covariance)
@@ -89,7 +87,7 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
         pair = sides.bracket((j, s))
         if pair is not None:
             ends[j, (s + 1) // 2], open_[j, (s + 1) // 2] = _secant(*pair, 0.0), False
-    others = np.asarray(evaluate.problem.places(jnp.asarray(found.points[found.values > sides.best - _RATIO])))
+    others = evaluate.places(found.points[found.values > sides.best - _RATIO])
     ends[:, 0] = np.minimum(ends[:, 0], others.min(axis=0))
     ends[:, 1] = np.maximum(ends[:, 1], others.max(axis=0))
     better = sides.highest[1] if sides.highest[0] > sides.best + 1e-6 else None
@@ -114,15 +112,15 @@ class _Sides:
         """Climb with one parameter held at a value, from the nearest place that is known; for each of some sides."""
         if not wanted:
             return
-        problem, begin, free = self.evaluate.problem, [], []
+        begin, free = [], []
         for side, value in wanted.items():
             nearest = min(self.rows[side], key=lambda row: abs(row.value - value))
             held = np.arange(nearest.place.size) == side[0]
             begin.append(np.where(held, value, nearest.place))
             free.append(~held)
-        points = np.asarray(problem.points(jnp.asarray(np.array(begin))))
-        reached = climb(self.evaluate, points, np.array(free), promise=1e-4, together=False)
-        places = np.asarray(problem.places(jnp.asarray(reached.points)))
+        points = self.evaluate.points(np.array(begin))
+        reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-4, together=False)
+        places = self.evaluate.places(reached.points)
         for side, place, value in zip(wanted, places, reached.values):
             self.rows[side].append(_Row(place[side[0]], np.sqrt(2 * max(self.best - value, 0.0)), place))
         top = int(np.argmax(reached.values))
