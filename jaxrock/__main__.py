@@ -42,7 +42,6 @@ def _parser() -> argparse.ArgumentParser:
         sub = commands.add_parser(
             name, help=text, description=text, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        sub.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
         sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
         sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
         return sub
@@ -58,6 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     spectrum.add_argument("--shortest", type=float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
     spectrum.add_argument("--longest", type=float, default=8.0, help="longest 2 pi/p [s] (default 8)")
     spectrum.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
+    surface = command("map", "overturning map: intensity against frequency of a pulse")
+    for sub in (run, spectrum, surface):
+        sub.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
     for sub in (run, spectrum):
         sub.add_argument(
             "record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)"
@@ -68,7 +70,6 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--scale", type=float, default=1.0, help="factor on the acceleration (default 1)")
     rocks = command("invert", "motions that rocks which stand, or fell, allow: estimates, intervals, maps")
     add_options(rocks)
-    surface = command("map", "overturning map: intensity against frequency of a pulse")
     surface.add_argument("--pulse", choices=tuple(_PULSES), default="sine", help="shape of the pulse (default sine)")
     surface.add_argument("--alpha", type=float, default=0.2, help="slenderness angle [rad] (default 0.2)")
     surface.add_argument("--frequency-ratio", type=float, nargs=2, default=(0.3, 8.0), metavar=("FROM", "TO"))

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._checks import Values, positive
 from jaxrock._progress import Progress
@@ -86,13 +86,16 @@ class Unexceeded(eqx.Module):
 
     - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g] up to which every rock stands; infinite where no
       amplitude that was looked at topples any.
-    - `by_rock`: (rocks, n) the same for each rock alone; `weakest`: (n,) the number of the rock that sets it.
+    - `by_rock`: (rocks, n) the same for each rock alone that stands.
+    - `weakest`: (n,) the number, from 0, among all rocks of the one that sets it; -1 where none does.
+    - `complete`: (n,) whether every amplitude that was looked at could be decided.
     """
 
     durations: Float[Array, " n"]
     amplitude: Float[Array, " n"]
     by_rock: Float[Array, "rocks n"]
-    weakest: Array
+    weakest: Int[Array, " n"]
+    complete: Bool[Array, " n"]
 
 
 def unexceeded_motion(
@@ -138,5 +141,7 @@ def unexceeded_motion(
         progress=progress,
     )
     by_rock = found.lowest.reshape(standing.size, durations.size)
-    weakest = jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)]
-    return Unexceeded(durations, by_rock.min(axis=0), by_rock, weakest)
+    amplitude = by_rock.min(axis=0)
+    weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
+    complete = found.complete.reshape(by_rock.shape).all(axis=0)
+    return Unexceeded(durations, amplitude, by_rock, weakest, complete)

@@ -77,7 +77,7 @@ def _write(
     folder: Path, observations: Observations, found: Estimate, region: FeasibleRegion, wall: Unexceeded | None
 ) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / name for name in ("estimate.csv", "rocks.csv", "region.csv", "region.png")]
+    files = [folder / name for name in ("estimate.csv", "probabilities.csv", "region.csv", "region.png")]
     with files[0].open("w") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
         for name, value, interval, open_ in zip(found.names, found.values, found.interval, found.open):
@@ -88,18 +88,26 @@ def _write(
         print("name,alpha_rad,p_rad_per_s,observed,probability", file=file)
         rows = zip(observations.names, observations.alpha, observations.p, observations.seen, found.probability)
         for name, alpha, p, seen, probability in rows:
-            quoted = name.replace('"', '""')
-            print(f'"{quoted}",{float(alpha):.6g},{float(p):.6g},{SEEN[int(seen)]},{float(probability):.4g}', file=file)
+            numbers = f"{float(alpha):.6g},{float(p):.6g},{SEEN[int(seen)]},{float(probability):.4g}"
+            print(f"{_quoted(name)},{numbers}", file=file)
     rows, columns = np.meshgrid(*region.values, indexing="ij")
     header = ",".join(f"{name}_{_UNITS[name]}" for name in region.names) + ",log_likelihood,allowed"
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
     np.savetxt(files[2], np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
     if wall is not None:
         files.append(folder / "unexceeded.csv")
-        table = np.column_stack([wall.durations, wall.amplitude, wall.weakest + 1.0])
-        np.savetxt(files[-1], table, delimiter=",", header="duration_s,amplitude_g,rock", comments="", fmt="%.8g")
+        with files[-1].open("w") as file:
+            print("duration_s,amplitude_g,rock,complete", file=file)
+            for duration, amplitude, rock, complete in zip(wall.durations, wall.amplitude, wall.weakest, wall.complete):
+                name = _quoted(observations.names[int(rock)]) if rock >= 0 else ""
+                print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
     draw(region, found, wall).figure.savefig(files[3], dpi=150)
     return files
+
+
+def _quoted(name: str) -> str:
+    """A name as a field of a CSV file."""
+    return '"' + name.replace('"', '""') + '"'
 
 
 def draw(region: FeasibleRegion, found: Estimate | None = None, wall: Unexceeded | None = None, axis=None):
@@ -114,23 +122,27 @@ def draw(region: FeasibleRegion, found: Estimate | None = None, wall: Unexceeded
     **Returns:** the axis.
     """
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
     rows, columns = (np.asarray(x) for x in region.values)
     below = np.asarray(region.log_likelihood - region.log_likelihood.max())
     shade = axis.pcolormesh(columns, rows, np.maximum(below, -20), cmap="Blues", shading="nearest", rasterized=True)
-    axis.figure.colorbar(shade, ax=axis, label="log-likelihood below the best")
-    axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1)
+    axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
+    axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
     if wall is not None:
         axis.plot(
             wall.durations, wall.amplitude, color="#b3352c", linewidth=1, label="up to here all that stand, stand"
         )
     if found is not None and set(region.names) <= set(found.names):
         axis.plot(found[region.names[1]], found[region.names[0]], "k+", markersize=9, label="most likely")
-    for values, scale in ((rows, axis.set_yscale), (columns, axis.set_xscale)):
+    for values, scale, ticks in ((rows, axis.set_yscale, axis.yaxis), (columns, axis.set_xscale, axis.xaxis)):
         if values.min() > 0:
             scale("log")
+            ticks.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ticks.set_minor_formatter(NullFormatter())
     axis.set(xlim=(columns.min(), columns.max()), ylim=(rows.min(), rows.max()))
     unit = [f"{name} [{_UNITS[name]}]" if _UNITS.get(name) else name for name in region.names]
     axis.set(ylabel=unit[0], xlabel=unit[1])

@@ -13,7 +13,7 @@ from jaxrock.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
 
-_LANES = 8  # points in one call of the compiled program
+_LANES = 4  # points in one call of the compiled program
 _NEAR = 1e-4  # of a range: nearer to its ends nobody goes
 
 

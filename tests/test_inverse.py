@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.__main__ import main
 from jaxrock.climb import climb
 from jaxrock.likelihood import rocks_at
 from jaxrock.problem import Evaluator, Problem
@@ -22,30 +23,35 @@ def rocks(seen, alpha=ALPHA, p=P, **more):
     return rk.Observations(alpha, p, seen, **({"alpha_sd": 0.04 * alpha, "p_sd": 0.02 * p} | more))
 
 
+def fallen(amplitude, period, alpha, p, restitution):
+    return {"fallen": rk.outcome(rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period)).overturned}
+
+
+def overturned(**scenes):
+    """The verdict on scenes given by lists that go together: no likelihood, no margin."""
+    lists = dict(zip(scenes, (np.ravel(x) for x in np.broadcast_arrays(*scenes.values()))))
+    shape = np.broadcast_shapes(*(np.shape(x) for x in scenes.values()))
+    return rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"].reshape(shape)
+
+
 @pytest.fixture(scope="module")
 def verdicts():
-    """Shares of 2,000 possible scenes in which each rock stands: from the verdict alone, at four motions."""
+    """Shares of 1,000 possible scenes in which each rock stands: from the verdict alone, at four motions."""
     seen, rng = rocks(["survived"] * 12, restitution_sd=0.03), np.random.default_rng(0)
-    e = rng.normal(size=(4, 2000, 12))
+    e = rng.normal(size=(4, 1000, 12))
     sd = np.stack([seen.alpha_sd / seen.alpha, seen.p_sd / seen.p, seen.restitution_sd])[:, None]
     alpha, p, restitution = (np.ravel(x) for x in rocks_at(seen, jnp.asarray(e[1:] * sd)))
     motions = [(0.15, 0.4), (0.25, 0.8), (0.35, 0.8), (0.5, 1.6)]
-
-    def fallen(amplitude, period, alpha, p, restitution):
-        return {"fallen": rk.outcome(rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period)).overturned}
-
-    axes = [np.concatenate(x) for x in zip(*((a * np.exp(SCATTER * e[0]).ravel(), np.full(alpha.size, t), alpha, p,
-            restitution) for a, t in motions))]  # fmt: skip
-    names = ("amplitude", "period", "alpha", "p", "restitution")
-    found = rk.sweep(fallen, outer=False, progress=False, **dict(zip(names, axes)))
-    return seen, motions, 1 - found.values["fallen"].reshape(4, 2000, 12).mean(axis=1)
+    size, length = np.array(motions).T[..., None]
+    factor = np.exp(SCATTER * e[0]).ravel()
+    lost = overturned(amplitude=size * factor, period=length, alpha=alpha, p=p, restitution=restitution)
+    return seen, motions, 1 - lost.reshape(4, 1000, 12).mean(axis=1)
 
 
 def test_probabilities_are_shares_of_verdicts(verdicts):
     seen, motions, shares = verdicts
-    likelihood = rk.Likelihood(seen, rk.SinePulse, SCATTER)
-    amplitude, period = jnp.array(motions).T
-    found = np.asarray(jax.jit(lambda *x: likelihood.survival(dict(zip(UNKNOWNS, x))))(amplitude, period))
+    evaluate = evaluator(seen)
+    found = np.array([evaluate.facts(point)[0] for point in evaluate.points(np.log(motions))])
     unsure = (shares > 0.02) & (shares < 0.98)
     assert unsure.sum() > 12
     assert np.max(np.abs(found - shares)) < 0.12
@@ -79,6 +85,7 @@ def truth(seed, scatter=SCATTER):
     return ["toppled" if x else "survived" for x in np.asarray(fallen)]
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_maximum_of_a_refined_grid():
     seen = rocks(truth(3))
     found = rk.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=24)
@@ -111,6 +118,7 @@ def test_rocks_that_no_motion_moves_tell_nothing():
     np.testing.assert_allclose(found.interval, [[0.05, 0.3], [0.2, 3.0]])
 
 
+@pytest.mark.slow
 def test_contradictions_have_no_intervals():
     # The sturdiest half fell, the slenderest stands.
     found = rk.estimate_motion(rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0)), rk.SinePulse, UNKNOWNS,
@@ -129,6 +137,68 @@ def test_climbers_find_summits_and_hold_what_is_held():
     np.testing.assert_allclose(climb(hills, starts).points[0], 1.0, atol=1e-4)
     held = climb(hills, starts, np.array([True, False]), together=False)
     np.testing.assert_allclose(held.points, [[1.0, 0.0], [1.0, -2.0]], atol=1e-4)
+
+
+WORDS = ["toppled"] * 6 + ["survived"] * 6
+
+
+def test_regions_agree_with_verdicts():
+    """Rocks known exactly, hardly any scatter: a motion is allowed if it does to every rock what was seen."""
+    scatter = 0.01
+    over = {"amplitude": np.linspace(0.2, 0.5, 16), "period": np.linspace(0.5, 1.2, 16)}
+    known = {"alpha": ALPHA, "p": P, "restitution": np.asarray(rocks(WORDS).restitution)}
+    words = overturned(amplitude=over["amplitude"][7], period=over["period"][6], **known)
+    seen = rocks(["toppled" if x else "survived" for x in words], alpha_sd=0.0, p_sd=0.0)
+    found = rk.feasible_region(rk.Likelihood(seen, rk.SinePulse, scatter), over)
+    # Five standard deviations to both sides of the motion at each rock: (rows, columns, factors, rocks).
+    factors = np.exp(np.linspace(-5, 5, 21) * scatter)
+    lost = overturned(amplitude=over["amplitude"][:, None, None, None] * factors[:, None],
+                      period=over["period"][:, None, None], **known)  # fmt: skip
+    sure = (lost.all(axis=2) | ~lost.any(axis=2)).all(axis=-1)
+    as_seen = (lost[:, :, 10] == (np.asarray(seen.seen) == 1)).all(axis=-1)
+    assert (sure & as_seen).sum() >= 3 and (sure & ~as_seen).sum() > 100
+    assert np.min(found.log_likelihood[sure & as_seen]) > -0.02
+    assert np.max(found.log_likelihood[sure & ~as_seen]) < np.log(0.05)
+    assert not found.allowed[sure & ~as_seen].any()
+
+
+def test_up_to_the_unexceeded_motion_all_that_stand_stand():
+    seen, durations = rocks(WORDS), np.array([0.02, 0.3, 0.5, 0.8, 1.2, 2.0])  # as many as below: one program
+    found = rk.unexceeded_motion(seen, rk.SinePulse, durations, progress=False)
+    assert np.isinf(found.amplitude[0]) and found.weakest[0] == -1 and found.complete.all()
+    wall, weakest = np.asarray(found.amplitude[1:]), np.asarray(found.weakest[1:])
+    assert (weakest >= 6).all()  # those that toppled do not count
+    known = {"alpha": seen.alpha[6:], "p": seen.p[6:], "restitution": seen.restitution[6:]}
+    below = wall[:, None] * np.append(np.linspace(0.2, 0.999, 100), 1 - 1e-9)
+    assert not overturned(amplitude=below[..., None], period=durations[1:, None, None], **known).any()
+    above = overturned(amplitude=wall[:, None] * (1 + 1e-9), period=durations[1:, None], **known)
+    assert (above.sum(axis=1) == 1).all() and (above.argmax(axis=1) + 6 == weakest).all()
+
+
+def test_the_command_from_a_table_to_figures(tmp_path, capsys):
+    rows = [f"{a!r},{0.04 * a!r},{p!r},{0.02 * p!r},{word}" for a, p, word in zip(ALPHA.tolist(), P.tolist(), WORDS)]
+    rows = [f'"rock {i + 1}",{row}' for i, row in enumerate(rows)]
+    path = tmp_path / "rocks.csv"
+    path.write_text("\n".join(["name,alpha_rad,alpha_rad_sd,p_rad_per_s,p_rad_per_s_sd,observed", *rows]) + "\n")
+    ranges = ("--amplitude", "0.05", "2", "--duration", "0.2", "3", "--scatter", "0.2")
+    status = main(["invert", str(path), *ranges, "--starts", "8", "--points", "6", "--out", str(tmp_path)])
+    printed, errors = capsys.readouterr()
+    assert status == 0 and errors == ""
+    assert printed.startswith("12 rocks: 6 survived, 6 toppled, 0 rotation\n  amplitude ")
+    found = rk.estimate_motion(rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    lines = (tmp_path / "estimate.csv").read_text().splitlines()
+    for line, name, value, interval in zip(lines[1:], found.names, found.values, found.interval, strict=True):
+        fields = line.split(",")
+        assert fields[:2] == [name, {"amplitude": "g", "period": "s"}[name]]
+        np.testing.assert_allclose([float(x) for x in fields[2:5]], [value, *interval], rtol=2e-5)
+    shares = np.genfromtxt(tmp_path / "probabilities.csv", delimiter=",", skip_header=1, usecols=4)
+    np.testing.assert_allclose(shares, found.probability, rtol=1e-3, atol=1e-5)
+    region = np.loadtxt(tmp_path / "region.csv", delimiter=",", skiprows=1)
+    assert region.shape == (36, 4) and (region[:, 2] <= float(found.log_likelihood)).all()
+    wall = (tmp_path / "unexceeded.csv").read_text().splitlines()
+    assert wall[0] == "duration_s,amplitude_g,rock,complete" and len(wall) == 7
+    assert (tmp_path / "region.png").stat().st_size > 1000
+    assert len(path.read_text().splitlines()) == 13  # what was read is left alone
 
 
 HEADER = (
