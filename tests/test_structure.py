@@ -73,11 +73,10 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "problem": {"likelihood"},
     "profiles": {"problem", "climb"},
     "inverse": {"profiles"},
-    "posterior": {"inverse"},
     "feasible": {"likelihood", "critical", "spectra"},
     "invert": {"feasible", "inverse", "observation_files", "pulses"},
     "plot": {"sensitivity", "critical", "closed_form"},
-    "__init__": {"plot", "records", "similarity", "hazard_files", "posterior", "observation_files", "feasible"},
+    "__init__": {"plot", "records", "similarity", "hazard_files", "inverse", "observation_files", "feasible"},
     "__main__": {"__init__", "invert"},
 }
 
