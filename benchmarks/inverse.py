@@ -165,7 +165,7 @@ def _coverage_text(rows: list[dict]) -> list[str]:
         "",
         f"- An interval is open in {np.mean([row['open'] for row in rows]):.2f} of them; "
         f"{sum(row['contradictory'] for row in rows)} were called contradictory (they count as not held).",
-        f"- A fit with its intervals took a median of {np.median(points):.0f} points ({NODES} responses for each rock), "
+        f"- A fit with its intervals took a median of {np.median(points):.0f} points ({NODES} responses a rock), "
         f"1/{65536 / np.median(points):.0f} of those of a plain grid of 256 x 256 points, whose steps are 1.4 % of the "
         "amplitude and 1.1 % of the period.",
     ]
