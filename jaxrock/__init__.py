@@ -19,6 +19,12 @@ from jaxrock.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.feasible import (
+    FeasibleRegion as FeasibleRegion,
+    Unexceeded as Unexceeded,
+    feasible_region as feasible_region,
+    unexceeded_motion as unexceeded_motion,
+)
 from jaxrock.flexible import (
     FlexibleOutcome as FlexibleOutcome,
     FlexibleResponse as FlexibleResponse,
@@ -45,8 +51,17 @@ from jaxrock.hazard import (
 from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
 from jaxrock.histories import HistoryFit as HistoryFit, HistoryStatus as HistoryStatus, fit_history as fit_history
 from jaxrock.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
+from jaxrock.inverse import (
+    Estimate as Estimate,
+    EstimateStatus as EstimateStatus,
+    estimate_motion as estimate_motion,
+)
+from jaxrock.likelihood import Likelihood as Likelihood
 from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear, Spring as Spring
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
+from jaxrock.observation_files import read_observations as read_observations
+from jaxrock.observations import Observations as Observations
+from jaxrock.problem import Unknown as Unknown
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,
     ExponentialPulse as ExponentialPulse,

@@ -1,4 +1,4 @@
-"""The command line: simulate a block under a record, draw its spectrum, draw an overturning map."""
+"""The command line: simulate a block under a record, its spectrum, an overturning map; motions that rocks allow."""
 
 import argparse
 import contextlib
@@ -8,12 +8,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxrock.invert import add_options, invert
+
 _EPILOG = """examples:
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
   jaxrock run motion.AT2 --width 0.5 --height 2   the same for your block and record
   jaxrock run data.csv --dt 0.01 --unit cm/s2     a column of numbers
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
+  jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
 """
 
 _PULSES = {
@@ -39,7 +42,6 @@ def _parser() -> argparse.ArgumentParser:
         sub = commands.add_parser(
             name, help=text, description=text, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        sub.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
         sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
         sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
         return sub
@@ -55,6 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     spectrum.add_argument("--shortest", type=float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
     spectrum.add_argument("--longest", type=float, default=8.0, help="longest 2 pi/p [s] (default 8)")
     spectrum.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
+    surface = command("map", "overturning map: intensity against frequency of a pulse")
+    for sub in (run, spectrum, surface):
+        sub.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
     for sub in (run, spectrum):
         sub.add_argument(
             "record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)"
@@ -63,7 +68,8 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
         sub.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
         sub.add_argument("--scale", type=float, default=1.0, help="factor on the acceleration (default 1)")
-    surface = command("map", "overturning map: intensity against frequency of a pulse")
+    rocks = command("invert", "motions that rocks which stand, or fell, allow: estimates, intervals, maps")
+    add_options(rocks)
     surface.add_argument("--pulse", choices=tuple(_PULSES), default="sine", help="shape of the pulse (default sine)")
     surface.add_argument("--alpha", type=float, default=0.2, help="slenderness angle [rad] (default 0.2)")
     surface.add_argument("--frequency-ratio", type=float, nargs=2, default=(0.3, 8.0), metavar=("FROM", "TO"))
@@ -233,6 +239,16 @@ def _map(arguments) -> int:
     return _complete(result.status)
 
 
+def _invert(arguments) -> int:
+    text, files, wrong = invert(arguments, _model(arguments))
+    print(text)
+    for path in files:
+        print(f"wrote {path}")
+    if wrong:
+        print(f"jaxrock: {wrong}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
 def main(words: list[str] | None = None) -> int:
     """Run the command line; return its exit status: 0 good, 1 not computed, 2 bad input."""
     arguments = _parser().parse_args(words)
@@ -247,7 +263,7 @@ def main(words: list[str] | None = None) -> int:
     try:
         if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
             raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
-        return {"run": _run, "spectrum": _spectrum, "map": _map}[arguments.command](arguments)
+        return {"run": _run, "spectrum": _spectrum, "map": _map, "invert": _invert}[arguments.command](arguments)
     except (ValueError, OSError) as error:
         print(f"jaxrock: error: {error}", file=sys.stderr)
         return 2

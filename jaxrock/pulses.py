@@ -141,7 +141,8 @@ class ExponentialPulse(AbstractMotion):
 
     def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
         """Whether a piece is a layer; one thinner than rounding is left out."""
-        in_layer = jnp.where(self.shape > 0, piece % 3 > 0, piece % 3 == 0)
+        middle = (piece == 1) | (piece == 2)
+        in_layer = jnp.where(self.shape > 0, middle, ~middle)
         return in_layer & (jnp.abs(self.shape) < 1e24)
 
     @property
@@ -168,9 +169,9 @@ class ExponentialPulse(AbstractMotion):
         value_down = 2 * foot * _growth_ratio(2 * down * foot) / _growth_ratio(down)
         value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
         # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
-        flat = layer < 0.5
-        value_up = jnp.where((piece % 3 == 0) & flat, 0.0, value_up)
-        value_down = jnp.where((piece % 3 > 0) & flat, 1.0, value_down)
+        flat, middle = layer < 0.5, (piece == 1) | (piece == 2)
+        value_up = jnp.where(~middle & flat, 0.0, value_up)
+        value_down = jnp.where(middle & flat, 1.0, value_down)
         direction = jnp.where(piece < 2, 1.0, -1.0)
         step = direction * unit / self.duration
         terms = [self.amplitude * jnp.where(spiked, value_up, value_down)]

@@ -1,0 +1,197 @@
+"""What the inverse estimates are worth: coverage of intervals, errors, times, and the fit beside a brute-force grid.
+
+    python benchmarks/inverse.py coverage --repetitions 400
+    python benchmarks/inverse.py times
+    python benchmarks/inverse.py grid
+
+Each adds what it measured to inverse.json and writes inverse.md from all of it; what is done of a coverage is kept,
+and goes on from there. Synthetic rocks are drawn anew in every repetition: sizes and shapes, then their true alpha, p
+and the factor on the motion at each of them, by the same rules by which the likelihood takes them to scatter. Truth is
+judged by the verdict of `outcome` alone.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import jaxrock as rk
+from jaxrock.likelihood import NODES
+from jaxrock.problem import Evaluator, Problem
+
+TRUTH = {"amplitude": 0.35, "period": 0.8}
+KEPT = Path(__file__).with_suffix(".json")
+
+
+def unknowns() -> dict[str, rk.Unknown]:
+    """What is looked for, and where; made when numbers are double."""
+    return {"amplitude": rk.Unknown(0.05, 2.0), "period": rk.Unknown(0.2, 3.0)}
+
+
+def _fallen(alpha, p, amplitude, period):
+    return {"fallen": rk.outcome(rk.Block(alpha, p), rk.SinePulse(amplitude, period)).overturned}
+
+
+def synthetic(count: int, rng: np.random.Generator, scatter: float) -> rk.Observations:
+    """Rocks of many shapes and sizes, and what became of them."""
+    alpha, p = rng.uniform(0.08, 0.35, count), rng.uniform(1.8, 5.0, count)
+    e = rng.normal(size=(3, count))
+    found = rk.sweep(
+        _fallen,
+        outer=False,
+        progress=False,
+        alpha=alpha * np.exp(0.03 * e[0]),
+        p=p * np.exp(0.02 * e[1]),
+        amplitude=TRUTH["amplitude"] * np.exp(scatter * e[2]),
+        period=np.full(count, TRUTH["period"]),
+    )
+    words = ["toppled" if x else "survived" for x in found.values["fallen"]]
+    return rk.Observations(alpha, p, words, alpha_sd=0.03 * alpha, p_sd=0.02 * p)
+
+
+def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: int) -> None:
+    """Fit until there are so many repetitions; a number seeds each, so that they can go on later."""
+    key = f"{rocks} rocks, scatter {scatter:g}, {starts} starts"
+    rows = kept.setdefault("coverage", {}).setdefault(key, [])
+    for number in range(len(rows), repetitions):
+        seen = synthetic(rocks, np.random.default_rng([number, rocks]), scatter)
+        begun = time.process_time()
+        found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), scatter, starts=starts, progress=False)
+        # The first one compiles.
+        spent = time.process_time() - begun if rows else None
+        rows.append(
+            {
+                "values": np.asarray(found.values).tolist(),
+                "interval": np.asarray(found.interval).tolist(),
+                "open": bool(found.open.any()),
+                "contradictory": bool(found.status == rk.EstimateStatus.contradictory),
+                "points": found.responses // (NODES * rocks),
+                "cpu": spent,
+            }
+        )
+        if (number + 1) % 10 == 0 or number + 1 == repetitions:
+            write(kept)
+
+
+def times(kept: dict, rocks: int, starts: int) -> None:
+    """A full fit of an exponential pulse, three parameters: with compilation, then without."""
+    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
+    three = {
+        "amplitude": rk.Unknown(0.05, 2.0),
+        "duration": rk.Unknown(0.1, 3.0),
+        "shape": rk.Unknown(-6, 6, log=False),
+    }
+    for name in ("first", "again"):
+        begun, used = time.monotonic(), time.process_time()
+        found = rk.estimate_motion(seen, rk.ExponentialPulse, three, 0.2, starts=starts, progress=False)
+        row = {"wall": time.monotonic() - begun, "cpu": time.process_time() - used, "responses": found.responses}
+        kept.setdefault("times", {})[f"{rocks} rocks, {starts} starts, {name}"] = row
+        write(kept)
+
+
+def grid(kept: dict, rocks: int, points: int) -> None:
+    """The maximum of the likelihood by the fit, and by a grid that is refined around its best point."""
+    seen = synthetic(rocks, np.random.default_rng(4), 0.2)
+    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.2, starts=16, progress=False)
+    evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.2), unknowns()))
+    low, high = (x.copy() for x in evaluate.ends)
+    for _ in range(9):
+        axes = [np.linspace(a, b, points) for a, b in zip(low, high)]
+        places = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=1)
+        values = evaluate(evaluate.points(places))[0]
+        best, size = places[np.argmax(values)], (high - low) / 5
+        low, high = np.maximum(best - size, evaluate.ends[0]), np.minimum(best + size, evaluate.ends[1])
+    kept["grid"] = {
+        "rocks": rocks,
+        "fit": float(found.log_likelihood),
+        "grid": float(values.max()),
+        "fit_points": found.responses // (NODES * rocks),
+        "grid_points": evaluate.count,
+    }
+    write(kept)
+
+
+def write(kept: dict) -> None:
+    """Keep what was measured, and say it."""
+    KEPT.write_text(json.dumps(kept) + "\n")
+    lines = ["# Inverse estimates: what was measured", "", "Written by `benchmarks/inverse.py`, whose head says how."]
+    for key, rows in kept.get("coverage", {}).items():
+        lines += ["", f"## Sine pulses: {key}", "", *_coverage_text(rows)]
+    if "times" in kept:
+        lines += ["", "## Exponential pulses, three parameters: time of a whole fit with its intervals", ""]
+        lines += ["| fit | time [s] | processor time [s] | responses |", "| --- | ---: | ---: | ---: |"]
+        lines += [
+            f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['responses']:,} |"
+            for key, row in kept["times"].items()
+        ]
+        lines += ["", "The first fit compiles. Where processor time is less than time, other work took the machine."]
+    if "grid" in kept:
+        row = kept["grid"]
+        lines += [
+            "",
+            "## Beside a grid",
+            "",
+            f"{row['rocks']} rocks: the fit reached a log-likelihood of {row['fit']:.9f} with {row['fit_points']:,} "
+            f"points, intervals included; a grid refined eight times {row['grid']:.9f} with {row['grid_points']:,}.",
+        ]
+    KEPT.with_suffix(".md").write_text("\n".join(lines) + "\n")
+
+
+def _coverage_text(rows: list[dict]) -> list[str]:
+    truth = np.array(list(TRUTH.values()))
+    interval = np.array([row["interval"] for row in rows])
+    held = (interval[..., 0] <= truth) & (truth <= interval[..., 1])
+    errors = np.log(np.array([row["values"] for row in rows]) / truth)
+    share, count = held.mean(axis=0), len(rows)
+    doubt = 1.96 * np.sqrt(share * (1 - share) / count)
+    lines = [
+        f"{count} repetitions; truth {TRUTH['amplitude']} g and {TRUTH['period']} s.",
+        "",
+        "| parameter | 95 % interval holds the truth | median of ln(estimate/truth) | median of its size | "
+        "geometric mean of estimate/truth |",
+        "| --- | --- | ---: | ---: | ---: |",
+    ]
+    for i, name in enumerate(TRUTH):
+        median, size = np.median(errors[:, i]), np.median(np.abs(errors[:, i]))
+        lines.append(
+            f"| {name} | {share[i]:.3f} +- {doubt[i]:.3f} | {median:+.3f} | {size:.3f} | "
+            f"{np.exp(errors[:, i].mean()):.3f} |"
+        )
+    points, spent = (np.array([row[name] for row in rows if row[name] is not None]) for name in ("points", "cpu"))
+    lines += [
+        "",
+        f"- An interval is open in {np.mean([row['open'] for row in rows]):.2f} of them; "
+        f"{sum(row['contradictory'] for row in rows)} were called contradictory (they count as not held).",
+        f"- A fit with its intervals took a median of {np.median(points):.0f} points ({NODES} responses a rock), "
+        f"1/{65536 / np.median(points):.0f} of those of a plain grid of 256 x 256 points, whose steps are 1.4 % of the "
+        "amplitude and 1.1 % of the period.",
+    ]
+    if spent.size:
+        lines.append(f"- Median processor time of a fit, compiled: {np.median(spent):.1f} s.")
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("coverage", "times", "grid"))
+    parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
+    parser.add_argument("--repetitions", type=int, default=400)
+    parser.add_argument("--scatter", type=float, default=0.1)
+    parser.add_argument("--starts", type=int, help="default 8; 64 for times")
+    parser.add_argument("--points", type=int, default=24)
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    if given.what == "coverage":
+        coverage(kept, given.rocks or 20, given.repetitions, given.scatter, given.starts or 8)
+    elif given.what == "times":
+        times(kept, given.rocks or 100, given.starts or 64)
+    else:
+        grid(kept, given.rocks or 20, given.points)
+
+
+if __name__ == "__main__":
+    main()

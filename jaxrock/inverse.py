@@ -1,0 +1,242 @@
+"""The motion that rocks allow: parameters of a pulse, with intervals, from rocks that stand, fell, or rocked so far.
+
+The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals: it is climbed from
+many starts. Intervals are those of the profile likelihood: all values of a parameter with which some values of the
+others explain the observations nearly as well as the best. Where the observations leave a side open they end at the
+range that was searched, and say so.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact
+
+from jaxrock._progress import Progress
+from jaxrock.climb import Summits, climb
+from jaxrock.engine import AbstractEngine
+from jaxrock.likelihood import NODES, Likelihood
+from jaxrock.models import Housner, Model
+from jaxrock.observations import TOPPLED, Observations
+from jaxrock.problem import Evaluator, Problem, Unknown
+from jaxrock.profiles import Profile, Shape, profile, shape_at
+
+Real = Inexact[Array, "..."]
+
+_RETRIES = 15  # starts with another scatter
+_RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
+_SURPRISED = 3.0  # standard deviations of the observations' log-probability
+_FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
+
+
+class EstimateStatus(eqx.Enumeration):
+    """What became of an estimate; `EstimateStatus[estimate.status]` is the message."""
+
+    successful = "One maximum stands out, and every interval lies within the range that was searched."
+    open_interval = (
+        "The observations leave a parameter open: an interval ends at the range that was searched, not where the "
+        "observations end it. More rocks near the boundary, or a prior, would close it."
+    )
+    no_information = (
+        "The observations tell nothing: every motion in the range explains them about equally well. Intervals are the "
+        "ranges that were searched."
+    )
+    contradictory = (
+        "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
+        "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
+    )
+    not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
+
+
+class Estimate(eqx.Module):
+    """The motion that observations allow; arrays have the order of `names`.
+
+    - `names`, `values`: the parameters and where their likelihood (with priors: posterior density) is largest.
+    - `interval`: (parameters, 2) 95 % intervals of the profile likelihood, in the parameters' units; other starts'
+      maxima that are as good lie within.
+    - `open`: (parameters, 2) whether an end is only the end of the range.
+    - `covariance`: (parameters, parameters) of logarithms of the parameters (of a parameter itself that is not searched
+      in its logarithm): the inverse of minus the Hessian at the maximum; infinite where that is singular.
+    - `directions`, `deviations`: (parameters, parameters) rows of unit vectors in ranges of the parameters, and
+      (parameters,) the standard deviation along each, in ranges; those of half a range and more are not determined.
+    - `log_likelihood`: at the maximum, with the priors.
+    - `surprise`: how many standard deviations less probable the observations are than is to be expected; above 3 they
+      contradict each other.
+    - `probability`: (rocks,) that each rock does what it did (that it stands, where a rotation was measured).
+    - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
+      least with which they would not; infinite if there is none up to ten times as large.
+    - `summits`, `summit_values`: (starts, parameters) where each start arrived, and (starts,) the log-likelihood there.
+    - `responses`: how many scenes were computed.
+    - `remarks`: what is to be said about it, in words.
+    - `status`: an `EstimateStatus`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Real
+    interval: Real
+    open: Bool[Array, "parameters 2"]
+    covariance: Real
+    directions: Real
+    deviations: Real
+    log_likelihood: Real
+    surprise: Real
+    probability: Real
+    scatter: Real
+    consistent_scatter: Real
+    summits: Real
+    summit_values: Real
+    responses: int = eqx.field(static=True)
+    remarks: tuple[str, ...] = eqx.field(static=True)
+    status: EstimateStatus
+
+    def __getitem__(self, name: str) -> Real:
+        """The value of a parameter."""
+        return self.values[self.names.index(name)]
+
+
+def estimate_motion(
+    observations: Observations,
+    motion: Callable,
+    unknowns: dict[str, Unknown],
+    scatter: ArrayLike = 0.3,
+    *,
+    starts: int = 64,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Estimate:
+    """Estimate the parameters of a motion from rocks that stand, fell, or rocked so far.
+
+    **Arguments:**
+
+    - `observations`: an `Observations`.
+    - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
+      own.
+    - `unknowns`: an `Unknown` for each of these parameters.
+    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; see `Likelihood`. It is not
+      estimated.
+    - `starts`: points spread over the ranges from which the maximum is looked for, at least 1.
+    - `model`, `engine`: as in `outcome`.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** an `Estimate`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    if starts < 1:
+        raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
+    if not unknowns:
+        raise ValueError("Argument `unknowns` must name at least one parameter.")
+    problem = Problem(Likelihood(observations, motion, scatter, model, engine), dict(unknowns))
+    bar = Progress(starts * 80, "fit", progress)
+    evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
+    found = climb(evaluate, evaluate.points(_spread(starts, evaluate)))
+    for _ in range(3):
+        best = int(np.argmax(found.values))
+        shape = shape_at(evaluate, found.points[best])
+        profiled = profile(evaluate, found, shape)
+        if profiled.better is None:
+            break
+        # A profile went over a pass to a higher summit.
+        more = climb(evaluate, profiled.better[None])
+        found = Summits(*(np.concatenate(pair) for pair in zip(more, found)))
+    result = _conclude(evaluate, found, shape, profiled)
+    bar.add(bar.total - bar.done)
+    return result
+
+
+def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
+    """Places spread evenly over the ranges: multiples of irrational numbers, modulo one."""
+    low, high = evaluate.ends
+    size = low.size
+    root = np.roots([1, *[0] * (size - 1), -1, -1])
+    ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
+    share = (0.5 + np.outer(np.arange(count), ratio ** -np.arange(1.0, size + 1))) % 1
+    return low + (high - low) * (0.01 + 0.98 * share)
+
+
+def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profile) -> Estimate:
+    problem = evaluate.problem
+    best = int(np.argmax(found.values))
+    places = jnp.asarray(evaluate.places(found.points))
+    logs = np.array([unknown.log for unknown in problem.unknowns.values()])
+    values = {name: x[best] for name, x in problem.values(places).items()}
+    stands, *facts = evaluate.facts(found.points[best])
+    surprise = _surprise(facts)
+    probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
+    remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
+    status = EstimateStatus.successful
+    if profiled.open.any():
+        status = EstimateStatus.open_interval
+    if found.values[best] - profiled.lowest < _RATIO:
+        status = EstimateStatus.no_information
+    if not found.arrived[best] and not profiled.open.any():
+        status = EstimateStatus.not_converged
+    interval, covariance = np.where(logs[:, None], np.exp(profiled.ends), profiled.ends), shape.covariance
+    if surprise > _SURPRISED:
+        status = EstimateStatus.contradictory
+        interval, covariance = np.full_like(interval, np.nan), np.full_like(covariance, np.nan)
+        consistent = _consistent(evaluate, found.points[best])
+        names = problem.likelihood.observations.names
+        worst = np.argsort(np.asarray(probability))[:3]
+        worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
+        remarks = (f"Least probable under the best motion: {', '.join(worst)}.",)
+        if np.isfinite(consistent):
+            remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
+    per_point = problem.likelihood.observations.alpha.size * NODES
+    return Estimate(
+        names=problem.names,
+        values=jnp.stack(list(values.values())),
+        interval=jnp.asarray(interval),
+        open=jnp.asarray(profiled.open),
+        covariance=jnp.asarray(covariance),
+        directions=jnp.asarray(shape.directions),
+        deviations=jnp.asarray(shape.deviations),
+        log_likelihood=jnp.asarray(found.values[best]),
+        surprise=jnp.asarray(surprise),
+        probability=probability,
+        scatter=problem.likelihood.scatter,
+        consistent_scatter=jnp.asarray(consistent),
+        summits=jnp.stack(list(problem.values(places).values()), axis=-1),
+        summit_values=jnp.asarray(found.values),
+        responses=evaluate.count * per_point,
+        remarks=remarks,
+        status=status,
+    )
+
+
+def _surprise(facts: Sequence[np.ndarray]) -> float:
+    badness, mean, variance = (float(np.sum(x)) for x in facts)
+    # A quarter keeps near certainties, whose variance is nothing, from being surprised by rounding.
+    return (badness - mean) / np.sqrt(variance + 0.25)
+
+
+def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
+    """About the least scatter under which observations do not contradict each other."""
+    for factor in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0):
+        scatter = evaluate.problem.likelihood.scatter * factor
+        problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
+        again = Evaluator(problem)
+        starts = np.concatenate([point[None], again.points(_spread(_RETRIES, again))])
+        found = climb(again, starts)
+        evaluate.count += again.count
+        if _surprise(again.facts(found.points[np.argmax(found.values)])[1:]) <= _SURPRISED:
+            return float(scatter)
+    return np.inf
+
+
+def _remarks(problem: Problem, shape: Shape, profiled: Profile) -> tuple[str, ...]:
+    """Open intervals and flat directions in words."""
+    remarks = []
+    for name, (below, above) in zip(problem.names, profiled.open):
+        if below and above:
+            remarks.append(f"The observations do not determine {name}.")
+        elif below or above:
+            remarks.append(f"The observations do not bound {name} from {'below' if below else 'above'}.")
+    for direction, deviation in zip(shape.directions, shape.deviations):
+        if deviation > _FLAT and len(problem.names) > 1:
+            turned = direction * np.sign(direction[np.argmax(np.abs(direction))])
+            parts = [f"{x:+.2f} {name}" for x, name in zip(turned, problem.names) if abs(x) > 0.1]
+            remarks.append(f"Near the maximum the likelihood is flat along {', '.join(parts)} (shares of the ranges).")
+    return tuple(remarks)

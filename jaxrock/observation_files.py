@@ -1,0 +1,160 @@
+"""Rocks and what they have shown, from a CSV file.
+
+The first line that is not a comment (#) names the columns, with their units; the others hold a rock each. In any order:
+
+- `name`: optional.
+- `alpha_rad` or `alpha_deg`: slenderness angle; and `p_rad_per_s`, or `half_diagonal_m` of a rectangle (p = sqrt(3 g/4
+  R), g = 9.81 m/s^2). Or, instead of both, `width_m` and `height_m`, full sizes of a rectangle.
+- `restitution`: optional; empty is Housner's.
+- `observed`: survived, toppled, or rotation; then `rotation_rad` or `rotation_deg` holds the largest |rotation|.
+- `..._sd` of any of these but the names, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A
+  measured rotation needs one.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from jaxrock._text import file_error, text_lines
+from jaxrock.block import GRAVITY
+from jaxrock.observations import SEEN, Observations
+
+_DEGREE = np.pi / 180
+_FACTORS = {
+    "alpha_rad": 1.0, "alpha_deg": _DEGREE, "p_rad_per_s": 1.0, "half_diagonal_m": 1.0, "width_m": 1.0, "height_m": 1.0,
+    "restitution": 1.0, "rotation_rad": 1.0, "rotation_deg": _DEGREE,
+}  # fmt: skip
+_COLUMNS = {"name", "observed", *_FACTORS, *(f"{name}_sd" for name in _FACTORS)}
+
+
+def read_observations(path: str | Path) -> Observations:
+    """Read rocks and what they have shown from a CSV file.
+
+    **Arguments:**
+
+    - `path`: of the file; `jaxrock/observation_files.py` and `jaxrock invert --help` tell its columns.
+
+    **Returns:** an `Observations`.
+
+    **Raises:** ValueError, with the number of the line, for a file that is wrong, or a rock that cannot be.
+    """
+    path = Path(path)
+    lines = text_lines(path)
+    rows = [
+        (number, [field.strip() for field in next(csv.reader([line]))])
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(rows) < 2:
+        raise file_error(path.name, "holds no rocks: it must have a line of column names, and one for each rock.")
+    header = rows[0][1]
+    _check_header(path.name, header)
+    found = []
+    for number, fields in rows[1:]:
+        try:
+            if len(fields) != len(header):
+                raise ValueError(f"has {len(fields)} fields, but there are {len(header)} columns.")
+            rock = _rock(dict(zip(header, fields)))
+            Observations(*([rock[name]] for name in ("alpha", "p", "observed", "restitution")), **_more([rock]))
+        except ValueError as error:
+            raise file_error(path.name, f"line {number}: {error}") from None
+        found.append(rock)
+    columns = ([rock[name] for rock in found] for name in ("alpha", "p", "observed", "restitution"))
+    names = [rock["name"] or f"line {number}" for rock, (number, _) in zip(found, rows[1:])]
+    return Observations(*columns, **_more(found), names=names)
+
+
+def _more(rocks: list[dict]) -> dict:
+    names = ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
+    return {name: [rock[name] for rock in rocks] for name in names}
+
+
+def _check_header(file: str, header: list[str]) -> None:
+    unknown = [name for name in header if name not in _COLUMNS]
+    if unknown:
+        raise file_error(file, f"has a column `{unknown[0]}`, but known are {', '.join(sorted(_COLUMNS))}.")
+    twice = [name for name in header if header.count(name) > 1]
+    if twice:
+        raise file_error(file, f"has the column `{twice[0]}` twice.")
+    if "observed" not in header:
+        raise file_error(file, f"has no column `observed` ({', '.join(SEEN)}).")
+    ways = (("alpha_rad", "alpha_deg", "width_m"), ("p_rad_per_s", "half_diagonal_m", "height_m"))
+    for way in ways:
+        if sum(name in header for name in way) != 1:
+            raise file_error(file, f"must have one of the columns {', '.join(way)}.")
+    if ("width_m" in header) != ("height_m" in header):
+        raise file_error(file, "must have both columns width_m and height_m, or none of them.")
+
+
+def _rock(fields: dict[str, str]) -> dict:
+    """A rock from the fields of its line."""
+    values = {name: _number(name, fields.get(name, "")) for name in fields if name not in ("name", "observed")}
+
+    def get(name, empty):
+        """A value, or the first of several units of it that is there; and its standard deviation."""
+        for unit in (name, f"{name}_rad", f"{name}_deg"):
+            if unit in fields:
+                value, sd = values[unit], values.get(f"{unit}_sd")
+                return empty if value is None else value * _FACTORS[unit], (sd or 0.0) * _FACTORS[unit]
+        return empty, 0.0
+
+    if fields["observed"] not in SEEN:
+        raise ValueError(f"`observed` must be {', '.join(SEEN)}, but is {fields['observed']!r}.")
+    rock = {"name": fields.get("name", ""), "observed": fields["observed"]}
+    if "width_m" in fields:
+        rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))
+    else:
+        rock["alpha"], rock["alpha_sd"] = _given("alpha", get("alpha", None))
+        rock |= _size(fields, get)
+    rock["restitution"], rock["restitution_sd"] = get("restitution", np.nan)
+    rotation, deviation = get("rotation", None)
+    if rock["observed"] == "rotation" and (rotation is None or deviation <= 0):
+        raise ValueError("a measured rotation needs a value and a standard deviation.")
+    known = rock["observed"] == "rotation"
+    rock["rotation"], rock["rotation_sd"] = (rotation, deviation) if known else (1.0, 1.0)
+    return rock
+
+
+def _size(fields: dict[str, str], get) -> dict:
+    """Frequency parameter and its standard deviation."""
+    if "p_rad_per_s" in fields:
+        p, deviation = _given("p_rad_per_s", get("p_rad_per_s", None))
+        return {"p": p, "p_sd": deviation}
+    radius, deviation = _positive("half_diagonal_m", _given("half_diagonal_m", get("half_diagonal_m", None)))
+    p = np.sqrt(3 * GRAVITY / (4 * radius))
+    return {"p": p, "p_sd": p * deviation / (2 * radius)}
+
+
+def _rectangle(width: tuple[float, float], height: tuple[float, float]) -> dict:
+    """Slenderness and frequency parameter of a rectangle, with their standard deviations to first order."""
+    (b, b_sd), (h, h_sd) = _positive("width_m", width), _positive("height_m", height)
+    square = b**2 + h**2
+    p = np.sqrt(3 * GRAVITY / (2 * np.sqrt(square)))
+    return {
+        "alpha": np.arctan2(b, h),
+        "alpha_sd": np.hypot(h * b_sd, b * h_sd) / square,
+        "p": p,
+        "p_sd": p * np.hypot(b * b_sd, h * h_sd) / (2 * square),
+    }
+
+
+def _positive(name: str, pair: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < pair[0] < np.inf:
+        raise ValueError(f"`{name}` must be positive and finite, but is {pair[0]:g}.")
+    return pair
+
+
+def _given(name: str, pair: tuple) -> tuple[float, float]:
+    if pair[0] is None:
+        raise ValueError(f"`{name}` is empty.")
+    return pair
+
+
+def _number(name: str, text: str) -> float | None:
+    if not text:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"`{name}` must be a number, but is {text!r}.") from None

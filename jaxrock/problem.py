@@ -1,0 +1,152 @@
+"""What is looked for: unknown parameters of a motion, their ranges and priors, and the likelihood over them."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact
+
+from jaxrock._checks import finite, positive, scalar
+from jaxrock.likelihood import Likelihood
+
+Real = Inexact[Array, "..."]
+
+_LANES = 4  # points in one call of the compiled program
+_NEAR = 1e-4  # of a range: nearer to its ends nobody goes
+
+
+class Unknown(eqx.Module):
+    """A parameter that is looked for, and where.
+
+    **Arguments:**
+
+    - `low`, `high`: the range, in the unit of the parameter; positive if `log`.
+    - `log`: whether it is searched, and its prior is uniform, in its logarithm (default) or in itself.
+    - `prior`: median and standard deviation of a normal prior on the logarithm (or on itself); None: a uniform one,
+      with which the fit is that of maximum likelihood.
+
+    **Raises:** ValueError for values outside their ranges.
+    """
+
+    low: Real
+    high: Real
+    prior: tuple[Real, Real] | None
+    log: bool = eqx.field(static=True)
+
+    def __init__(
+        self, low: ArrayLike, high: ArrayLike, log: bool = True, prior: tuple[ArrayLike, ArrayLike] | None = None
+    ):
+        check = positive if log else finite
+        self.low, self.high = (scalar(name, check(name, x)) for name, x in (("low", low), ("high", high)))
+        if not self.low < self.high:
+            raise ValueError(f"Argument `high` must be above `low`, but is {high} with {low}.")
+        self.log = log
+        self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
+
+    @property
+    def ends(self) -> Float[Array, "2"]:
+        """Both ends of the range, as logarithms if `log`."""
+        ends = jnp.stack([self.low, self.high])
+        return jnp.log(ends) if self.log else ends
+
+    def log_prior(self, place: Real) -> Real:
+        """Logarithm of the prior's density at a place in the range, but for a constant."""
+        if self.prior is None:
+            return jnp.zeros_like(place)
+        middle = jnp.log(self.prior[0]) if self.log else self.prior[0]
+        return -(((place - middle) / self.prior[1]) ** 2) / 2
+
+
+class Problem(eqx.Module):
+    """A likelihood and the parameters that are unknown in it, in the coordinates in which they are searched.
+
+    Points are logits of the place in each range, so that all of space is allowed.
+    """
+
+    likelihood: Likelihood
+    unknowns: dict[str, Unknown]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The unknown parameters, in the order of coordinates."""
+        return tuple(self.unknowns)
+
+    @property
+    def ends(self) -> Float[Array, "parameters 2"]:
+        """Ranges of the places: logarithms of parameters, or parameters themselves."""
+        return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
+
+    def places(self, points: Real) -> Real:
+        """Places of points, (..., parameters)."""
+        low, high = self.ends.T
+        return low + (high - low) * jax.nn.sigmoid(points)
+
+    def points(self, places: Real) -> Real:
+        """Points of places, which are kept off the very ends."""
+        low, high = self.ends.T
+        share = jnp.clip((places - low) / (high - low), _NEAR, 1 - _NEAR)
+        return jnp.log(share) - jnp.log1p(-share)
+
+    def values(self, places: Real) -> dict[str, Real]:
+        """Parameters by name."""
+        return {
+            name: jnp.exp(places[..., i]) if unknown.log else places[..., i]
+            for i, (name, unknown) in enumerate(self.unknowns.items())
+        }
+
+    def log_prior(self, places: Real) -> Real:
+        """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
+        return sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
+
+    def log_density(self, points: Real) -> Real:
+        """Log-likelihood and log-prior (by the places) at points, (..., parameters); with first derivatives."""
+        places = self.places(points)
+        return jnp.sum(self.likelihood.log_terms(self.values(places)), axis=-1) + self.log_prior(places)
+
+
+@eqx.filter_jit
+def _batch(problem: Problem, points: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
+    def density(points):
+        places = problem.places(points)
+        terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
+        return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
+
+    # The points do not depend on one another, so that the slopes of the sum are those of each.
+    value, back, facts = jax.vjp(density, points, has_aux=True)
+    return value, back(jnp.ones_like(value))[0], facts
+
+
+class Evaluator:
+    """Values and slopes at any number of points, in batches of one compiled program; it counts."""
+
+    def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
+        self.problem, self.count, self.progress = problem, 0, progress
+        self.ends = np.asarray(problem.ends).T
+
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = []
+        for begin in range(0, len(points), _LANES):
+            part = points[begin : begin + _LANES]
+            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
+            found.append([np.asarray(x)[: len(part)] for x in _batch(self.problem, padded)[:2]])
+            self.progress(len(part))
+        self.count += len(points)
+        return tuple(np.concatenate(x) for x in zip(*found))
+
+    def facts(self, point: np.ndarray) -> tuple[np.ndarray, ...]:
+        """`survival` and `surprise` of the likelihood at a point, (rocks,) each."""
+        self.count += 1
+        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(point, (_LANES, 1)))[2])
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """As of the problem; outside JAX, which would compile it for every number of points."""
+        low, high = self.ends
+        return low + (high - low) / (1 + np.exp(-points))
+
+    def points(self, places: np.ndarray) -> np.ndarray:
+        """As of the problem."""
+        low, high = self.ends
+        share = np.clip((places - low) / (high - low), _NEAR, 1 - _NEAR)
+        return np.log(share) - np.log1p(-share)

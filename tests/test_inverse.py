@@ -1,0 +1,255 @@
+"""What rocks say about a motion: probabilities against counted verdicts, maxima against grids, honest refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.__main__ import main
+from jaxrock.climb import climb
+from jaxrock.likelihood import rocks_at
+from jaxrock.problem import Evaluator, Problem
+
+# All tests have twelve rocks and a sine pulse, so that they share one compiled program.
+ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])
+P = np.array([3.0, 2.2, 3.6, 2.6, 4.2, 3.1, 2.4, 5.0, 3.4, 2.8, 4.5, 3.8])
+TRUTH = {"amplitude": 0.35, "period": 0.8}
+UNKNOWNS = {"amplitude": rk.Unknown(0.05, 2.0), "period": rk.Unknown(0.2, 3.0)}
+SCATTER = 0.2
+
+
+def rocks(seen, alpha=ALPHA, p=P, **more):
+    return rk.Observations(alpha, p, seen, **({"alpha_sd": 0.04 * alpha, "p_sd": 0.02 * p} | more))
+
+
+def fallen(amplitude, period, alpha, p, restitution):
+    return {"fallen": rk.outcome(rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period)).overturned}
+
+
+def overturned(**scenes):
+    """The verdict on scenes given by lists that go together: no likelihood, no margin."""
+    lists = dict(zip(scenes, (np.ravel(x) for x in np.broadcast_arrays(*scenes.values()))))
+    shape = np.broadcast_shapes(*(np.shape(x) for x in scenes.values()))
+    return rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"].reshape(shape)
+
+
+@pytest.fixture(scope="module")
+def verdicts():
+    """Shares of 1,000 possible scenes in which each rock stands: from the verdict alone, at four motions."""
+    seen, rng = rocks(["survived"] * 12, restitution_sd=0.03), np.random.default_rng(0)
+    e = rng.normal(size=(4, 1000, 12))
+    sd = np.stack([seen.alpha_sd / seen.alpha, seen.p_sd / seen.p, seen.restitution_sd])[:, None]
+    alpha, p, restitution = (np.ravel(x) for x in rocks_at(seen, jnp.asarray(e[1:] * sd)))
+    motions = [(0.15, 0.4), (0.25, 0.8), (0.35, 0.8), (0.5, 1.6)]
+    size, length = np.array(motions).T[..., None]
+    factor = np.exp(SCATTER * e[0]).ravel()
+    lost = overturned(amplitude=size * factor, period=length, alpha=alpha, p=p, restitution=restitution)
+    return seen, motions, 1 - lost.reshape(4, 1000, 12).mean(axis=1)
+
+
+def test_probabilities_are_shares_of_verdicts(verdicts):
+    seen, motions, shares = verdicts
+    evaluate = evaluator(seen)
+    found = np.array([evaluate.facts(point)[0] for point in evaluate.points(np.log(motions))])
+    unsure = (shares > 0.02) & (shares < 0.98)
+    assert unsure.sum() > 12
+    assert np.max(np.abs(found - shares)) < 0.12
+    assert np.sqrt(np.mean((found - shares)[unsure] ** 2)) < 0.05
+    assert abs(np.mean(found - shares)) < 0.01
+
+
+def evaluator(seen, scatter=SCATTER):
+    return Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, scatter), UNKNOWNS))
+
+
+def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
+    words = ["survived", "toppled", "rotation"] * 4
+    evaluate = evaluator(rocks(["survived"] * 12))
+    weak = evaluate.points(np.log([[0.05001, 0.21]]))
+    assert abs(evaluate(weak)[0][0]) < 1e-12
+    evaluate = evaluator(rocks(words, rotation=0.05, rotation_sd=0.01))
+    points = np.random.default_rng(1).normal(size=(4, 2)) * 0.7
+    steps = 1e-6 * np.eye(2)
+    values = [[evaluate(points + s * step)[0] for s in (1, -1)] for step in steps]
+    differences = np.array([(up - down) / 2e-6 for up, down in values]).T
+    np.testing.assert_allclose(evaluate(points)[1], differences, rtol=1e-4, atol=1e-4)
+
+
+def truth(seed, scatter=SCATTER):
+    """What twelve rocks do under the true motion, with all that scatters."""
+    e = np.random.default_rng(seed).normal(size=(3, 12))
+    blocks = rk.Block(ALPHA * np.exp(0.04 * e[0]), P * np.exp(0.02 * e[1]))
+    motion = jax.vmap(rk.SinePulse)(TRUTH["amplitude"] * np.exp(scatter * e[2]), np.full(12, TRUTH["period"]))
+    fallen = jax.jit(jax.vmap(lambda b, m: rk.outcome(b, m).overturned))(blocks, motion)
+    return ["toppled" if x else "survived" for x in np.asarray(fallen)]
+
+
+@pytest.mark.slow
+def test_a_fit_finds_the_maximum_of_a_refined_grid():
+    seen = rocks(truth(3))
+    found = rk.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=24)
+    evaluate = evaluator(seen)
+    low, high = evaluate.ends[0].copy(), evaluate.ends[1].copy()
+    for _ in range(9):
+        axes = [np.linspace(a, b, 24) for a, b in zip(low, high)]
+        places = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=1)
+        values = evaluate(evaluate.points(places))[0]
+        best = places[np.argmax(values)]
+        size = (high - low) / 5
+        low, high = np.maximum(best - size, evaluate.ends[0]), np.minimum(best + size, evaluate.ends[1])
+    assert float(found.log_likelihood) >= values.max() - 1e-6
+    inside = [a <= TRUTH[name] <= b for name, (a, b) in zip(found.names, found.interval)]
+    assert all(inside)
+
+
+def test_survivors_bound_from_above_only():
+    found = rk.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    assert found.status == rk.EstimateStatus.open_interval
+    assert found.open[0, 0] and not found.open[0, 1] and found.open[1].all()
+    assert "do not bound amplitude from below" in " ".join(found.remarks)
+
+
+def test_rocks_that_no_motion_moves_tell_nothing():
+    unknowns = {"amplitude": rk.Unknown(0.05, 0.3), "period": rk.Unknown(0.2, 3.0)}
+    seen = rocks(["survived"] * 12, alpha=ALPHA + 1.0, restitution=0.5)
+    found = rk.estimate_motion(seen, rk.SinePulse, unknowns, 0.1, starts=8)
+    assert found.status == rk.EstimateStatus.no_information
+    np.testing.assert_allclose(found.interval, [[0.05, 0.3], [0.2, 3.0]])
+
+
+@pytest.mark.slow
+def test_contradictions_have_no_intervals():
+    # The sturdiest half fell, the slenderest stands.
+    found = rk.estimate_motion(rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0)), rk.SinePulse, UNKNOWNS,
+                               0.05, starts=8)  # fmt: skip
+    assert found.status == rk.EstimateStatus.contradictory
+    assert np.isnan(found.interval).all() and found.consistent_scatter > 0.05
+    assert "rock" in " ".join(found.remarks)
+
+
+def test_climbers_find_summits_and_hold_what_is_held():
+    def hills(x):
+        value = -np.sum((x - 1) ** 2 * np.array([1.0, 40.0]), axis=1)
+        return value, -2 * (x - 1) * np.array([1.0, 40.0])
+
+    starts = np.array([[0.0, 0.0], [3.0, -2.0]])
+    np.testing.assert_allclose(climb(hills, starts).points[0], 1.0, atol=1e-4)
+    held = climb(hills, starts, np.array([True, False]), together=False)
+    np.testing.assert_allclose(held.points, [[1.0, 0.0], [1.0, -2.0]], atol=1e-4)
+
+
+WORDS = ["toppled"] * 6 + ["survived"] * 6
+
+
+def test_regions_agree_with_verdicts():
+    """Rocks known exactly, hardly any scatter: a motion is allowed if it does to every rock what was seen."""
+    scatter = 0.002
+    over = {"amplitude": np.linspace(0.2, 0.5, 16), "period": np.linspace(0.5, 1.2, 16)}
+    known = {"alpha": ALPHA, "p": P, "restitution": np.asarray(rocks(WORDS).restitution)}
+    words = overturned(amplitude=over["amplitude"][7], period=over["period"][6], **known)
+    seen = rocks(["toppled" if x else "survived" for x in words], alpha_sd=0.0, p_sd=0.0)
+    found = rk.feasible_region(rk.Likelihood(seen, rk.SinePulse, scatter), over)
+    # Five standard deviations to both sides of the motion at each rock: (rows, columns, factors, rocks).
+    factors = np.exp(np.linspace(-5, 5, 21) * scatter)
+    lost = overturned(amplitude=over["amplitude"][:, None, None, None] * factors[:, None],
+                      period=over["period"][:, None, None], **known)  # fmt: skip
+    sure = (lost.all(axis=2) | ~lost.any(axis=2)).all(axis=-1)
+    as_seen = (lost[:, :, 10] == (np.asarray(seen.seen) == 1)).all(axis=-1)
+    assert (sure & as_seen).sum() >= 3 and (sure & ~as_seen).sum() > 100
+    assert np.min(found.log_likelihood[sure & as_seen]) > -0.02
+    assert np.max(found.log_likelihood[sure & ~as_seen]) < np.log(0.05)
+    assert not found.allowed[sure & ~as_seen].any()
+
+
+def test_up_to_the_unexceeded_motion_all_that_stand_stand():
+    seen, durations = rocks(WORDS), np.array([0.02, 0.3, 0.5, 0.8, 1.2, 2.0])  # as many as below: one program
+    found = rk.unexceeded_motion(seen, rk.SinePulse, durations, progress=False)
+    assert np.isinf(found.amplitude[0]) and found.weakest[0] == -1 and found.complete.all()
+    wall, weakest = np.asarray(found.amplitude[1:]), np.asarray(found.weakest[1:])
+    assert (weakest >= 6).all()  # those that toppled do not count
+    known = {"alpha": seen.alpha[6:], "p": seen.p[6:], "restitution": seen.restitution[6:]}
+    below = wall[:, None] * np.append(np.linspace(0.2, 0.999, 100), 1 - 1e-9)
+    assert not overturned(amplitude=below[..., None], period=durations[1:, None, None], **known).any()
+    above = overturned(amplitude=wall[:, None] * (1 + 1e-9), period=durations[1:, None], **known)
+    assert (above.sum(axis=1) == 1).all() and (above.argmax(axis=1) + 6 == weakest).all()
+
+
+def test_the_command_from_a_table_to_figures(tmp_path, capsys):
+    rows = [f"{a!r},{0.04 * a!r},{p!r},{0.02 * p!r},{word}" for a, p, word in zip(ALPHA.tolist(), P.tolist(), WORDS)]
+    rows = [f'"rock {i + 1}",{row}' for i, row in enumerate(rows)]
+    path = tmp_path / "rocks.csv"
+    path.write_text("\n".join(["name,alpha_rad,alpha_rad_sd,p_rad_per_s,p_rad_per_s_sd,observed", *rows]) + "\n")
+    ranges = ("--amplitude", "0.05", "2", "--duration", "0.2", "3", "--scatter", "0.2")
+    status = main(["invert", str(path), *ranges, "--starts", "8", "--points", "6", "--out", str(tmp_path)])
+    printed, errors = capsys.readouterr()
+    assert status == 0 and errors == ""
+    assert printed.startswith("12 rocks: 6 survived, 6 toppled, 0 rotation\n  amplitude ")
+    found = rk.estimate_motion(rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    lines = (tmp_path / "estimate.csv").read_text().splitlines()
+    for line, name, value, interval in zip(lines[1:], found.names, found.values, found.interval, strict=True):
+        fields = line.split(",")
+        assert fields[:2] == [name, {"amplitude": "g", "period": "s"}[name]]
+        np.testing.assert_allclose([float(x) for x in fields[2:5]], [value, *interval], rtol=2e-5)
+    shares = np.genfromtxt(tmp_path / "probabilities.csv", delimiter=",", skip_header=1, usecols=4)
+    np.testing.assert_allclose(shares, found.probability, rtol=1e-3, atol=1e-5)
+    region = np.loadtxt(tmp_path / "region.csv", delimiter=",", skiprows=1)
+    assert region.shape == (36, 4) and (region[:, 2] <= float(found.log_likelihood)).all()
+    wall = (tmp_path / "unexceeded.csv").read_text().splitlines()
+    assert wall[0] == "duration_s,amplitude_g,rock,complete" and len(wall) == 7
+    assert (tmp_path / "region.png").stat().st_size > 1000
+    assert len(path.read_text().splitlines()) == 13  # what was read is left alone
+
+
+HEADER = (
+    "name,alpha_deg,alpha_deg_sd,half_diagonal_m,half_diagonal_m_sd,restitution,observed,rotation_deg,rotation_deg_sd"
+)
+
+
+def test_a_file_of_rocks(tmp_path):
+    path = tmp_path / "rocks.csv"
+    path.write_text(f"# a comment\n{HEADER}\na,10,0.5,1.2,0.1,,toppled,,\n\nb,20,1,0.9,,0.8,rotation,3,0.5\n")
+    seen = rk.read_observations(path)
+    np.testing.assert_allclose(seen.alpha, np.deg2rad([10, 20]))
+    np.testing.assert_allclose(seen.p, np.sqrt(3 * 9.81 / 4 / np.array([1.2, 0.9])))
+    np.testing.assert_allclose(seen.p_sd / seen.p, [0.1 / 2.4, 0])
+    np.testing.assert_allclose(seen.restitution, [1 - 1.5 * np.sin(np.deg2rad(10)) ** 2, 0.8])
+    np.testing.assert_allclose(seen.rotation_sd[1], np.deg2rad(0.5))
+    assert seen.names == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("a,95,0.5,1,0,,toppled,,", r"line 2: Argument `alpha` must be in \(0, pi/2\)"),
+        ("a,10,0.5,-1,0,,toppled,,", "line 2: `half_diagonal_m` must be positive"),
+        ("a,10,0.5,1,0,1.5,toppled,,", r"line 2: Argument `restitution` must be in \[0, 1\]"),
+        ("a,70,0.5,1,0,,toppled,,", "line 2: Argument `alpha` must be at most 0.955"),
+        ("a,10,0.5,1,0,,fell,,", "line 2: `observed` must be survived, toppled, rotation, but is 'fell'"),
+        ("a,10,0.5,1,0,,rotation,3,", "line 2: a measured rotation needs a value and a standard deviation"),
+        ("a,ten,0.5,1,0,,toppled,,", "line 2: `alpha_deg` must be a number"),
+        ("a,10,0.5,1,0,,toppled,", "line 2: has 8 fields, but there are 9 columns"),
+        ("a,,0.5,1,0,,toppled,,", "line 2: `alpha` is empty"),
+    ],
+)
+def test_impossible_rocks_are_named_by_their_line(tmp_path, line, message):
+    path = tmp_path / "rocks.csv"
+    path.write_text(f"{HEADER}\n{line}\n")
+    with pytest.raises(ValueError, match=message):
+        rk.read_observations(path)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda: rk.Unknown(2.0, 1.0), "`high` must be above `low`"),
+        (lambda: rk.Unknown(0.0, 1.0), "`low` must be positive"),
+        (lambda: rk.Observations([0.1], [2.0], ["fell"]), "`seen` must hold only"),
+        (lambda: rk.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
+        (lambda: rk.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
+        (lambda: rk.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),
+    ],
+)
+def test_wrong_arguments_are_named(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong()
