@@ -27,7 +27,6 @@ from jaxrock.scene import check_single, peak_bound
 from jaxrock.series import Series
 from jaxrock.status import Status
 
-_STILL = RectangularPulse(0.0, 1.0)
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
 _GROWTH = 1.6  # from window to window
 _WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
@@ -195,9 +194,10 @@ class _Scene(eqx.Module):
     @classmethod
     def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "_Scene":
         """Check the names, and fill in what was left open."""
-        check_single(block, _STILL if motion is None else motion)
+        still = RectangularPulse(0.0, 1.0)
+        check_single(block, still if motion is None else motion)
         names, free = tuple(parameters), motion is None
-        motion = _STILL if free else motion
+        motion = still if free else motion
         if not free and not float(peak_bound(motion)) > 0:
             raise ValueError("Argument `motion` must move the ground; None is free rocking.")
         allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
