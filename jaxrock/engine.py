@@ -167,7 +167,7 @@ class AbstractStepper(eqx.Module):
         x = jnp.where(second, x2, jnp.where(met, x, jnp.minimum(at, at2)))
         full = (length >= room) & ~early
         piece, local, over = self.move_on(state, x * length * unit, full)
-        piece = jnp.where(full & ~over & ~self.history, scene.after_quiet(piece), piece)
+        piece = jnp.where(full & ~over & (not self.history), scene.after_quiet(piece), piece)
         waited = replace(state, piece=piece, local=local, done=over | (never & ~early))
         waited = self.lift(waited, jnp.where(second, -1.0, 1.0), met, met)
         (first, touching), (other, touching2) = lifted

@@ -203,6 +203,7 @@ OPERATIONS: dict[str, Callable] = {
     "asin": _by(arcsine),
     "atan": _by(lambda x: arctangent_of(x, jnp.ones_like(x))),
     "atan2": _by(arctangent_of),
+    "one_minus_square": _by(lambda x: (1 - x) * (1 + x)),  # of jax 0.11 and later, in derivatives
     "tanh": _by(hyperbolic_tangent),
     "asinh": _by(hyperbolic_arcsine),
     "atanh": _by(hyperbolic_arctangent),
