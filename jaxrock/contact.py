@@ -27,7 +27,8 @@ class Contact(eqx.Module):
     - `friction`: (samples,) coefficient of friction needed, |horizontal|/normal [-]; infinite without contact.
     - `friction_at_impact`: pair of those that the impacts need which end the stay on side 1, and on side 2 [-].
     - `largest_friction`, `least_normal`: extremes over the rocking below the unstable equilibrium, impacts not
-      included, to about six digits. A toppling block may need any friction in the end.
+      included, by parabolas through points of every step (1e-6 off where tests judge it). A toppling block may need
+      any friction in the end.
     - `keeps_contact`: whether `least_normal` is positive.
     """
 

@@ -133,8 +133,9 @@ class Likelihood(eqx.Module):
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
         For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
-        [1/rad]. It has first derivatives if `slopes`, and is computed faster without. Many motions at once take less
-        time than `jax.vmap` of one.
+        [1/rad]. It has first derivatives if `slopes`, and is computed faster without; those of second order
+        that JAX would give are wrong (take differences of slopes). Many motions at once take less time than `jax.vmap`
+        of one.
         """
         return self._terms(self._possible(values, slopes))
 
