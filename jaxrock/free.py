@@ -6,9 +6,12 @@ in the linear model; quadrature in `skewed` where a constant adds to the sinusoi
 from the energy.
 """
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
@@ -82,19 +85,23 @@ def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, 
     """Time from opening angle saddle - gap, moving inward, to the impact at speed `arrival`."""
     if not table.sinusoidal:
         return jnp.log((base + arrival) / (manifold + speed))
-    below = _time_to_peak(table, table.saddle, base, arrival) - _time_to_peak(table, gap, manifold, speed)
 
-    kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
+    def below():
+        return _time_to_peak(table, table.saddle, base, arrival) - _time_to_peak(table, gap, manifold, speed)
 
-    def from_saddle(angle):
-        if table.skew is not None:
-            return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
-        tangent = jnp.tan(angle / 2)
-        ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
-        return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
+    def above():
+        kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
 
-    above = from_saddle(table.saddle) - from_saddle(gap)
-    return jnp.where(speed > jnp.abs(manifold), above, below)
+        def from_saddle(angle):
+            if table.skew is not None:
+                return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
+            tangent = jnp.tan(angle / 2)
+            ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
+            return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
+
+        return from_saddle(table.saddle) - from_saddle(gap)
+
+    return jax.lax.cond(speed > jnp.abs(manifold), above, below)
 
 
 class Visit(NamedTuple):
@@ -104,7 +111,7 @@ class Visit(NamedTuple):
     restitution: Scalar  # of that impact
 
 
-def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving) -> FreeStage:
+def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar) -> FreeStage:
     """Follow an unforced block to its end.
 
     **Arguments:**
@@ -115,6 +122,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     - `opening`: opening angle [rad], 0 or more.
     - `velocity`: its derivative with respect to p t [rad], positive outward.
     - `moving`: whether the block rocks at all; if not, nothing comes.
+    - `known`: the largest opening angle so far [rad]: the time of a peak that is lower is not computed.
 
     **Returns:** a `FreeStage`.
 
@@ -122,26 +130,27 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     """
     present = _present(visits[0].table, opening, velocity, moving, comes_back=len(visits) > 2)
     outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
-    arrival, since = present.arrival, present.impact_time
-    found = [present]
+    arrival, found = present.arrival, [present]
     shares = [share]
     for i, visit in enumerate(visits[1:], 1):
         happens = moving & ~lost & ~outward if i == len(visits) - 1 else moving & ~lost
         rebound = visits[i - 1].restitution * arrival
         share = share * visits[i - 1].restitution ** 2
-        stay = _after_impact(visit.table, rebound, since, happens)
+        stay = _after_impact(visit.table, rebound, happens)
         lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
-        arrival, since = rebound, stay.impact_time
+        arrival = rebound
         found.append(stay)
         shares.append(share)
 
     # Of several peaks the highest, of equal ones the first.
-    peak, peak_time, steepness, peak_share = jnp.zeros_like(opening), present.peak_time, jnp.ones_like(opening), share
+    zero = jnp.zeros_like(opening)
+    peak, best, steepness, peak_share, highest = zero, known, jnp.ones_like(opening), share, []
     closeness = deficit = narrowest = jnp.full_like(opening, jnp.inf)
     decisive, fastest = share, jnp.zeros_like(opening)
     for stay, share in zip(found, shares):
         higher = stay.safe & surpasses(stay.peak, peak)
-        peak_time = jnp.where(higher, stay.peak_time, peak_time)
+        highest.append(stay.safe & surpasses(stay.peak, best))
+        best = jnp.where(highest[-1], stay.peak, best)
         steepness = jnp.where(higher, stay.steepness, steepness)
         peak_share = jnp.where(higher, share, peak_share)
         peak = jnp.where(stay.safe & (stay.peak > peak), stay.peak, peak)
@@ -152,6 +161,16 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
         narrow = stay.decides & (missing < narrowest)
         deficit, decisive = jnp.where(narrow, stay.deficit, deficit), jnp.where(narrow, share, decisive)
         narrowest = jnp.where(narrow, missing, narrowest)
+
+    def time():
+        at = since = zero
+        for stay, higher in zip(found, highest):
+            top, since = stay.times(since)
+            at = jnp.where(higher, top, at)
+        return at
+
+    # Elliptic integrals cost more than all the rest: most peaks come before the free stage.
+    peak_time = jax.lax.cond(functools.reduce(jnp.logical_or, highest), time, lambda: zero)
     return FreeStage(
         overturned=lost,
         impacts=impacts.astype(jnp.int32),
@@ -174,11 +193,10 @@ class _Stay(NamedTuple):
     decides: Flag  # whether it falls here is decided by its energy
     deficit: Scalar  # 2 (energy of the saddle - energy)
     peak: Scalar  # highest opening angle; zero if it only comes back
-    peak_time: Scalar
     steepness: Scalar  # -2 (change of energy with the peak)
     closeness: Scalar
     arrival: Scalar  # speed at the impact that ends it
-    impact_time: Scalar
+    times: Callable  # of the time at which it begins: those of its peak, and of the impact that ends it
 
 
 def _peak_of(table: Table, deficit: Scalar) -> Scalar:
@@ -217,16 +235,20 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, come
     safe = moving & ~lost
     arrival = jnp.sqrt(jnp.maximum(base**2 - deficit, 0.0))
     rises, falls = safe & outward, safe & ~outward
-    out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
-    back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
-    falling = _time_to_impact(
-        table,
-        jnp.where(falls, gap, table.saddle),
-        jnp.where(falls, manifold, base),
-        jnp.where(falls, -speed, 0.0),
-        base,
-        jnp.where(falls, arrival, 0.0),
-    )
+
+    def times(_):
+        out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
+        back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
+        falling = _time_to_impact(
+            table,
+            jnp.where(falls, gap, table.saddle),
+            jnp.where(falls, manifold, base),
+            jnp.where(falls, -speed, 0.0),
+            base,
+            jnp.where(falls, arrival, 0.0),
+        )
+        return out / rate, jnp.where(outward, out + back, falling) / rate
+
     # Closeness: crossing the saddle at a speed, or turning at an acceleration.
     crossing, turning = -deficit * _weight(table), _turning_closeness(table, jnp.abs(deficit))
     past_inward = (gap < 0) & (speed < 0)
@@ -240,22 +262,25 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, come
         decides=moving & (outward | past_inward),
         deficit=deficit * table.stiffness,
         peak=jnp.where(rises, peak, 0.0),
-        peak_time=out / rate,
         steepness=_steepness(table, peak),
         closeness=jnp.where(lost, lost_closeness, jnp.where(safe, safe_closeness, jnp.inf)),
         arrival=arrival * rate,
-        impact_time=jnp.where(outward, out + back, falling) / rate,
+        times=times,
     )
 
 
-def _after_impact(table: Table, rebound: Scalar, since: Scalar, happens: Flag) -> _Stay:
-    """The stay on a side on which the block comes to stand at time `since` with a velocity; if it happens at all."""
+def _after_impact(table: Table, rebound: Scalar, happens: Flag) -> _Stay:
+    """The stay on a side on which the block comes to stand with a velocity; if it happens at all."""
     rate = jnp.sqrt(table.stiffness)
     base, speed = table.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
     deficit = (base - speed) * (base + speed)
     lost = happens & (speed > base)
     safe = happens & ~lost
-    out = _time_to_peak(table, table.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+
+    def times(since):
+        out = _time_to_peak(table, table.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+        return since + out, since + 2 * out
+
     peak = _peak_of(table, jnp.where(safe, deficit, base**2))
     turning = _turning_closeness(table, jnp.abs(deficit))
     crossing = -deficit * _weight(table)
@@ -265,9 +290,8 @@ def _after_impact(table: Table, rebound: Scalar, since: Scalar, happens: Flag) -
         decides=happens,
         deficit=deficit * table.stiffness,
         peak=peak,
-        peak_time=since + out,
         steepness=_steepness(table, peak),
         closeness=jnp.where(lost, crossing, jnp.where(safe, turning, jnp.inf)),
         arrival=rebound,
-        impact_time=since + 2 * out,
+        times=times,
     )

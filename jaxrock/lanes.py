@@ -241,16 +241,20 @@ def _again(function: Callable, leaves, found, which, most: int = _LANES):
     """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first
     `count` are wanted."""
     lanes = _lanes(most, which.size)
-    count = which.sum()
-    order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
-    order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
 
-    def body(carry):
-        done, found = carry
-        places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
-        wanted = done + jnp.arange(lanes) < count
-        more = function(jax.tree.map(lambda x: x[places], leaves), jnp.minimum(count - done, lanes))
-        targets = jnp.where(wanted, places, which.size)  # nowhere
-        return done + lanes, jax.tree.map(lambda x, new: x.at[targets].set(new, mode="drop"), found, more)
+    def some(found):
+        count = which.sum()
+        order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
+        order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
 
-    return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
+        def body(carry):
+            done, found = carry
+            places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
+            wanted = done + jnp.arange(lanes) < count
+            more = function(jax.tree.map(lambda x: x[places], leaves), jnp.minimum(count - done, lanes))
+            targets = jnp.where(wanted, places, which.size)  # nowhere
+            return done + lanes, jax.tree.map(lambda x, new: x.at[targets].set(new, mode="drop"), found, more)
+
+        return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
+
+    return jax.lax.cond(which.any(), some, lambda found: found, found)

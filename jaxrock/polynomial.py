@@ -40,6 +40,15 @@ def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]
     return values
 
 
+def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
+    """Value and slope of a polynomial of degree 1 or more at x: even and odd powers side by side, where the last digit
+    does not matter."""
+    square = x * x
+    even, even_slope = jet(coefficients[::2], square, 1)
+    odd, odd_slope = jet(coefficients[1::2], square, 1)
+    return even + x * odd, odd + 2 * x * (even_slope + x * odd_slope)
+
+
 def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
     """Coefficients about a point `by` further on (synthetic division)."""
     terms = list(coefficients)

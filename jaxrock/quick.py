@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike, Bool, Inexact, Int
 
 from jaxrock._keep import keep, keep_by, keep_flag
 from jaxrock._pick import pick
-from jaxrock.polynomial import derivative, horner, jet, keeps_sign, step_length
+from jaxrock.polynomial import derivative, horner, jet, keeps_sign, step_length, tangent
 from jaxrock.series import TaylorStepper
 from jaxrock.state import State
 from jaxrock.status import Status
@@ -26,9 +26,9 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
 _SHORTER = (0.4, 0.1)  # shares of a step that are tried for a certificate, after the whole
-# Degrees of the polynomials whose roots Newton's iterations take: for a value that is stationary there, for the time of
-# a turning point, and for what meets a level.
-_FLAT, _TURN, _MEET = (5, 9, 99), (5, 9, 99, 99), (4, 7, 12, 99)
+# Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
+# proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
+_FLAT, _TURN, _MEET = (6, 10, 16), (5, 10, 16, 16), (5, 9, 13, 16)
 _STEPS = 1000
 
 
@@ -62,19 +62,33 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     return _if(~sure(1.0), shorter, jnp.ones_like(length))
 
 
-def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, at_start: Scalar, slope: Scalar, at_end: Scalar):
-    """The one root in [start, end], and Newton's last change of it; `slope`: at the start.
-
-    The iterations take polynomials of these `degrees`: the first need not be exact.
-    """
-    sign = jnp.where(at_start > 0, 1.0, -1.0)
-    value, slope, fall = sign * at_start, sign * slope * (end - start), sign * at_end
+def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Scalar, Scalar | None]) -> Scalar:
+    """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
+    sign = jnp.where(values[0] > 0, 1.0, -1.0)
+    value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
     bend = fall - value - slope
     root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * bend, 0.0))
     share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * bend, root - slope)
-    x = keep(start + jnp.clip(share, 0.0, 1.0) * (end - start), end)
+    share = jnp.clip(share, 0.0, 1.0)
+    if slopes[1] is None:
+        return share
+    twist = slope + sign * slopes[1] - 2 * (fall - value)
+    for _ in range(2):
+        off, rate = jet([value, slope, bend - twist, twist], share, 1)
+        share = jnp.clip(share - off / rate, 0.0, 1.0)
+    return share
+
+
+def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
+    """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
+
+    The iterations take polynomials of these `degrees`: the first need not be exact.
+    """
+    width, order = end - start, len(terms) - 1
+    degrees = degrees if order > 10 else (degrees[0], order, order)  # the short steps of records
+    x = keep(start + width * _guess(values, tuple(None if s is None else width * s for s in slopes)), end)
     for degree in degrees:
-        value, slope = jet(terms[: degree + 1], x, 1)
+        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
         change = value / slope
         x = jnp.clip(x - change, start, end)
     return x, jnp.abs(change)
@@ -147,7 +161,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
-        x, last = _root(_TURN, derivative(terms), zero, part.length, terms[1], 2 * terms[2], part.speed)
+        x, last = _root(_TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.bend))
         x = keep_by(x, one)
         opening, _, bend = (keep_by(value, one) for value in jet(terms, x, 2))
         return x, opening, bend, last <= 1e-6 * x
@@ -165,10 +179,10 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     low, high = jnp.where(early, 0.0, turn_at), jnp.where(early, turn_at, part.length)
     at_low = jnp.where(early, terms[0], top) - level
     at_high = jnp.where(early, top, part.opening) - level
-    slope = jnp.where(early, terms[1], 0.0)
+    slopes = jnp.where(early, terms[1], 0.0), jnp.where(early & turns, 0.0, part.speed)
 
     def meet():
-        x, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, at_low, slope, at_high)
+        x, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
         x = keep_by(x, one)
         return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
 
@@ -187,7 +201,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
-        x, last = _root(_FLAT, derivative(velocity), zero, part.length, 2 * terms[2], 6 * terms[3], part.bend)
+        x, last = _root(_FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.bend), (6 * terms[3], None))
         return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
 
     return _if(part.bends & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.bends)))
@@ -285,7 +299,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     missing[0] = jnp.where(second, drive2[0] - level2, drive[0] - level)
     slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
     ending = jnp.where(second, end2 - level2, end - level)
-    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, missing[0], slope, ending)
+    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
     both = (lifts | meets) & second
     lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
     elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit

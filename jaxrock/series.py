@@ -130,7 +130,7 @@ class TaylorStepper(AbstractStepper):
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
         here, there = Visit(table, scene.restitution), Visit(scene.tables[1], scene.far_restitution)
         visits = (here, there) if scene.far is None else (here, there, here)
-        start = visits, state.opening, state.velocity, moving
+        start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
             # In reverse mode what is not taken (roots of zero) would spoil what is.
             stage = differentiable(lambda start: free_stage(*start))(start)

@@ -86,9 +86,7 @@ def rocking_spectrum(
     Block(alpha, 1.0, restitution)  # raises here, where values are known
 
     scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
-    found = surface(_under_motion(model, engine), (period,), scene, "spectrum", progress)
-    scale = (scene[0], 2 * jnp.pi / period * scene[0])
-    return _spectrum(period, found, scale)
+    return Spectrum(period, **surface(_under_motion(model, engine), (period,), scene, "spectrum", progress))
 
 
 def self_similar_spectrum(
@@ -119,12 +117,9 @@ def self_similar_spectrum(
     **Source:** Dimitrakopoulos & DeJong (2012), section 4.
     """
     found, ratio, intensity = _over_pulses(
-        frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
+        _peaks, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
     )
-    alpha = as_real("alpha", alpha)
-    return eqx.tree_at(
-        lambda s: s.intensity, _spectrum(ratio, found, (alpha, alpha)), intensity, is_leaf=lambda x: x is None
-    )
+    return Spectrum(abscissa=ratio, intensity=intensity, **found)
 
 
 def overturning_map(
@@ -149,28 +144,20 @@ def overturning_map(
     **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
     """
     found, ratio, intensity = _over_pulses(
-        frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
+        _states, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
     )
-    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
-    return OverturningMap(
-        frequency_ratio=ratio,
-        intensity=intensity,
-        state=jnp.where(found.status == Status.successful, state, -1),
-        max_rotation=found.max_rotation / as_real("alpha", alpha),
-        impact_count=found.impact_count,
-        margin=found.margin,
-        status=found.status,
-    )
+    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **found)
 
 
-def _over_pulses(frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
+def _over_pulses(quantities, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
     """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
     ratio, intensity = axis("frequency_ratio", frequency_ratio), axis("intensity", intensity)
     Block(alpha, 1.0, restitution)
 
     scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
     # Neighbours in intensity share a chunk: they move alike.
-    found = surface(_under_pulse(pulse, model, engine), (ratio, intensity), scene, label, progress, turned=True)
+    function = _under_pulse(quantities, pulse, model, engine)
+    found = surface(function, (intensity, ratio), scene, label, progress, columns=True)
     return found, ratio, intensity
 
 
@@ -181,16 +168,22 @@ def axis(name: str, values: Values) -> Float[Array, " n"]:
     return array
 
 
-def _spectrum(abscissa, found: Outcome, scale) -> Spectrum:
-    return Spectrum(
-        abscissa=abscissa,
-        max_rotation=found.max_rotation / scale[0],
-        max_velocity=found.max_velocity / scale[1],
-        impact_count=found.impact_count,
-        overturned=found.overturned,
-        margin=found.margin,
-        status=found.status,
-    )
+# What a surface keeps of an outcome: computed with it, point by point.
+
+
+def _peaks(found: Outcome, block: Block) -> dict:
+    """Of a spectrum."""
+    rest = {name: getattr(found, name) for name in ("impact_count", "overturned", "margin", "status")}
+    velocity = found.max_velocity / (block.p * block.alpha)
+    return {"max_rotation": found.max_rotation / block.alpha, "max_velocity": velocity, **rest}
+
+
+def _states(found: Outcome, block: Block) -> dict:
+    """Of a map."""
+    rest = {name: getattr(found, name) for name in ("impact_count", "margin", "status")}
+    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
+    state = jnp.where(found.status == Status.successful, state, -1)
+    return {"state": state, "max_rotation": found.max_rotation / block.alpha, **rest}
 
 
 # One function for each kind of surface, so that a second surface of a kind is not compiled again.
@@ -200,17 +193,18 @@ def _spectrum(abscissa, found: Outcome, scale) -> Spectrum:
 def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
     def one(period, scene):
         alpha, motion, restitution = scene
-        return outcome(Block(alpha, 2 * jnp.pi / period, restitution), motion, model, engine=engine)
+        block = Block(alpha, 2 * jnp.pi / period, restitution)
+        return _peaks(outcome(block, motion, model, engine=engine), block)
 
     return one
 
 
 @functools.lru_cache(maxsize=32)
-def _under_pulse(pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
-    def one(ratio, intensity, scene):
+def _under_pulse(quantities: Callable, pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
+    def one(intensity, ratio, scene):
         alpha, restitution = scene
         block = Block(alpha, jnp.ones_like(alpha), restitution)
         motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
-        return outcome(block, motion, model, engine=engine)
+        return quantities(outcome(block, motion, model, engine=engine), block)
 
     return one

@@ -118,13 +118,13 @@ def surface(
     label: str,
     progress: bool | None,
     outer: bool = True,
-    turned: bool = False,
+    columns: bool = False,
 ):
-    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front
-    (`turned`: with its axes the other way round)."""
+    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
+    `columns`: neighbours along the last axis but one are computed together."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
-    found = compute(function, plan, scene, label, progress)[0]
-    return jax.tree.map(lambda x: jnp.asarray(x.T if turned else x), found)
+    found = compute(function, plan, scene, label, progress, columns=columns)[0]
+    return jax.tree.map(jnp.asarray, found)
 
 
 class Plan(NamedTuple):
@@ -185,6 +185,7 @@ def compute(
     *,
     store: Store | None = None,
     load: bool = True,
+    columns: bool = False,
 ) -> tuple[Any, int]:
     """`function(*point, scene)` on a grid: results as NumPy arrays, and how many points a store had already.
 
@@ -207,7 +208,7 @@ def compute(
     for number in mine:
         place = plan.place(number)
         shape = tuple(p.stop - p.start for p in place)
-        found = run(plan.points(number), bar.add, _tiles(shape))
+        found = run(plan.points(number), bar.add, _tiles(shape, columns))
         found = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in found]
         if store:
             store.write(place, found)
@@ -267,12 +268,14 @@ def _dealt(shape: tuple[int, int, int]) -> list[np.ndarray]:
 
 
 @functools.lru_cache(maxsize=16)
-def _tiles(shape: tuple[int, ...]) -> np.ndarray:
-    """The order of a block's flat points in which neighbours along both of its last axes are near each other."""
+def _tiles(shape: tuple[int, ...], columns: bool) -> np.ndarray:
+    """The order of a block's flat points in which neighbours along both of its last axes are near each other, those
+    along the last (`columns`: the last but one) nearest."""
     if len(shape) < 2:
         return np.arange(math.prod(shape))
     *rest, i, j = (x.ravel() for x in np.indices(shape))
-    return np.lexsort((j, i, j // _TILE, i // _TILE, *reversed(rest)))
+    within = (i, j) if columns else (j, i)
+    return np.lexsort((*within, j // _TILE, i // _TILE, *reversed(rest)))
 
 
 class Runner:
