@@ -107,7 +107,34 @@ def records(count):
     return [count, timed(run)[0]]
 
 
-TASKS = {task.__name__: task for task in (ladder, one_map, stored, records)}
+def gradients():
+    """A map of peaks, and with three derivatives each."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxrock as rk
+
+    def peak(alpha, intensity, ratio):
+        motion = rk.SinePulse(intensity * math.tan(0.2), 2 * jnp.pi / ratio)
+        return rk.outcome(rk.Block(alpha, 1.0, 0.9), motion).max_rotation
+
+    def value(ratio, intensity):
+        return {"peak": peak(0.2, intensity, ratio)}
+
+    def both(ratio, intensity):
+        value, slopes = jax.value_and_grad(peak, argnums=(0, 1, 2))(jnp.asarray(0.2), intensity, ratio)
+        return {"peak": value} | dict(zip(("of_alpha", "of_intensity", "of_ratio"), slopes))
+
+    axes = {"ratio": np.linspace(0.3, 8, SIDE), "intensity": np.linspace(1.05, 10, SIDE)}
+
+    def swept(function):
+        return timed(lambda: rk.sweep(function, progress=False, **axes), 7)[0]
+
+    return [swept(value), swept(both)]
+
+
+TASKS = {task.__name__: task for task in (ladder, one_map, stored, records, gradients)}
 
 
 def child(task, arguments, devices, cache=None):
@@ -150,6 +177,7 @@ def report(largest):
         rows = child("ladder", [largest], None)
         store = child("stored", [min(largest, 1e6), folder], None)
         record = child("records", [1024 if largest >= 1e6 else 256], None)
+        value, slopes = child("gradients", [], None)
     devices, kind = both[3:]
     lines = [
         "# What a sweep costs",
@@ -166,8 +194,8 @@ def report(largest):
         )
     lines += [
         "",
-        "Every sweep traces its function anew: some milliseconds, which small ones are made of. Memory: the results and "
-        "about 100 MiB, whatever the number of responses.",
+        "Every sweep traces its function anew: some milliseconds, which small ones are made of. "
+        "Memory: the results and about 100 MiB, whatever the number of responses.",
         "",
         f"| {SIDE} x {SIDE} points | first call | later calls | a response |",
         "| --- | --- | --- | --- |",
@@ -185,6 +213,9 @@ def report(largest):
         f"response, {files} files; read again in {nice(again)}.",
         "",
         f"{record[0]:,} blocks under the record of 5,690 samples: {1000 * record[1] / record[0]:.2f} ms a response.",
+        "",
+        f"Peaks of {SIDE} x {SIDE} pulses: {nice(value)}; with their derivatives by slenderness, intensity and "
+        f"frequency ratio {nice(slopes)}, {slopes / value:.1f} times as long.",
         "",
         "From these numbers, without compiling:",
         "",
