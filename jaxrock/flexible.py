@@ -52,7 +52,8 @@ class FlexibleResponse(eqx.Module):
         """Moment of the base over m g R sin(alpha), at which it unlocks [-].
 
         Locked: the column's elastic and damping forces times their heights. Rocking: the spring's own moment,
-        side - rotation/alpha.
+        side - rotation/alpha; because the base has no mass, the same forces balance it. (Without their damping part
+        they would not: the elastic ones alone differ from it wherever the column is damped.)
         """
         return self._rows(time)[3] / self.scene.numbers.strength
 

@@ -314,6 +314,32 @@ def test_derivatives_and_finite_differences():
 
 
 @pytest.mark.slow
+def test_derivatives_and_an_independent_integration():
+    """The same against central differences of SciPy's peaks, after an impact; compiled and not, the value is one."""
+    optimize = pytest.importorskip("scipy.optimize")
+
+    def block(x):
+        return rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2], masses=3)
+
+    def peak(x):
+        return rk.outcome(block(x), PULSE, duration=7.0).max_rotation
+
+    def judged(x):
+        at, _ = independent(block(x), PULSE, 7.0)
+        times = np.linspace(2.5, 7.0, 451)[:-1]
+        top = times[np.argmax([abs(at(t)[0]) for t in times])]
+        return -optimize.minimize_scalar(lambda t: -abs(at(t)[0]), bounds=(top - 0.01, top + 0.01)).fun
+
+    x = jnp.array([30.0, 2.5, 0.02, 5.0, 50.0])
+    value, jitted = peak(x), jax.jit(jax.value_and_grad(peak))(x)
+    assert float(value) == pytest.approx(float(jitted[0]), rel=1e-13)
+    assert float(value) == pytest.approx(judged(x), rel=1e-7)
+    steps = 1e-4 * np.diag(x)
+    slopes = np.array([(judged(x + d) - judged(x - d)) / 2e-4 for d in steps])  # times the parameter
+    np.testing.assert_allclose(jitted[1] * x, slopes, rtol=1e-3, atol=1e-4 * np.abs(slopes).max())
+
+
+@pytest.mark.slow
 def test_a_thousand_blocks_at_once():
     """One call, with the answers of single calls; reverse mode agrees with forward mode."""
     moduli = jnp.linspace(10e9, 60e9, 1000)
