@@ -151,7 +151,7 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
     project = (
         jnp.concatenate([numbers.rotation * square * (at + decay) / denominator, shape, along_rotation], axis=1) / slope
     )
-    whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-6
+    whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-4  # squared by the correction below
     # Without damping the base has no motion of its own: it follows the column.
     relaxing = (rates.imag == 0) & (rates.real == jnp.min(rates.real))
     dropped = relaxing & ~numbers.damped

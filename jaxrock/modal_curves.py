@@ -199,7 +199,7 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
     x, _, least, place, _ = jax.lax.while_loop(
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
-    at_end = ~nowhere & (still.jet(last)[0] > least)
+    at_end = ~nowhere & (still.jet(last)[0] >= least)
     place = jnp.where(at_end, end, place)
     return jnp.where(place >= 0, curve.jet(place)[0], best), x >= last
 
