@@ -19,6 +19,7 @@ from jaxrock.critical import (
     critical_durations as critical_durations,
 )
 from jaxrock.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.dispatch import outcome as outcome, simulate as simulate
 from jaxrock.feasible import (
     FeasibleRegion as FeasibleRegion,
     Unexceeded as Unexceeded,
@@ -26,12 +27,12 @@ from jaxrock.feasible import (
     unexceeded_motion as unexceeded_motion,
 )
 from jaxrock.flexible import (
-    FlexibleOutcome as FlexibleOutcome,
     FlexibleResponse as FlexibleResponse,
     outcome_flexible as outcome_flexible,
     simulate_flexible as simulate_flexible,
 )
 from jaxrock.flexible_block import FlexibleBlock as FlexibleBlock
+from jaxrock.flexible_scene import FlexibleOutcome as FlexibleOutcome
 from jaxrock.fragility import (
     AbstractFragility as AbstractFragility,
     FitStatus as FitStatus,
@@ -73,7 +74,7 @@ from jaxrock.pulses import (
     TriangularPulse as TriangularPulse,
 )
 from jaxrock.records import example_record as example_record, read_record as read_record
-from jaxrock.response import Outcome as Outcome, Response as Response, outcome as outcome, simulate as simulate
+from jaxrock.response import Outcome as Outcome, Response as Response
 from jaxrock.sensitivity import (
     Sensitivity as Sensitivity,
     SensitivityMap as SensitivityMap,

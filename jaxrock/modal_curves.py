@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
-_MOST_STRIDES = 10_000
+_MOST_STRIDES, _MOST_STRIDES_TO_THE_TOP = 10_000, 100_000
 
 
 def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count ..."]:
@@ -60,10 +60,10 @@ class _Tables(eqx.Module):
     """What a march along a curve needs at every point, as products with few exponentials and powers."""
 
     rates: Complex[Array, " modes"]
-    waves: Complex[Array, "five modes"]  # value, slope, curvature; value and slope of what does not vibrate
-    sizes: Inexact[Array, "four modes"]  # of second and third derivative; of the steady part's second; of the rest
-    smooth: Inexact[Array, "five terms"]
-    largest: Inexact[Array, "four terms"]
+    waves: Complex[Array, "three modes"]  # value, slope, curvature
+    sizes: Inexact[Array, "three modes"]  # of value, second and third derivative
+    smooth: Inexact[Array, "three terms"]
+    largest: Inexact[Array, "two terms"]  # of second and third derivative
     errors: Inexact[Array, "two modes"]  # of value and slope, from rounding: of modes, which fade with them
     floor: Inexact[Array, " two"]  # and of what stays
 
@@ -71,21 +71,25 @@ class _Tables(eqx.Module):
     def of(cls, curve: Curve, level: Scalar) -> "_Tables":
         """Tables of a curve that is compared with numbers of the size `level`."""
         amplitudes, rates = curve.amplitudes, curve.rates
-        steady = jnp.where(rates.imag == 0, amplitudes, 0.0)
-        turned = [amplitudes * rates**k for k in range(4)]
+        turned = jnp.stack([amplitudes * rates**k for k in range(4)])
         smooth = _derivatives(curve.coefficients.size) @ curve.coefficients
         eps = 8 * jnp.finfo(smooth.dtype).eps
         errors = eps * jnp.abs(amplitudes) + curve.errors
         sides = eps * jnp.abs(smooth[:2]).sum(1)
         return cls(
             rates=rates,
-            waves=jnp.stack([*turned[:3], steady, steady * rates]),
-            sizes=jnp.abs(jnp.stack([turned[2], turned[3], steady * rates**2, amplitudes - steady])),
-            smooth=smooth[np.array([0, 1, 2, 0, 1])],
-            largest=jnp.abs(smooth[np.array([2, 3, 2, 3])]) * np.array([[1.0], [1], [1], [0]]),
+            waves=turned[:3],
+            sizes=jnp.abs(turned[np.array([0, 2, 3])]),
+            smooth=smooth[:3],
+            largest=jnp.abs(smooth[2:]),
             errors=jnp.stack([errors, errors * jnp.abs(rates)]),
             floor=sides.at[0].add(eps * jnp.abs(level)),
         )
+
+
+def _partial_sums(terms: Inexact[Array, "*rows modes"]) -> Inexact[Array, "*rows sums"]:
+    """Sums of the first 0, 1, ... modes."""
+    return terms @ np.tri(terms.shape[-1] + 1, terms.shape[-1], -1).T
 
 
 class _View:
@@ -94,11 +98,15 @@ class _View:
     def __init__(self, tables: _Tables, x: Scalar, radius: Scalar):
         count = tables.smooth.shape[1]
         turned = jnp.exp(tables.rates * x)
-        here = (tables.waves @ turned).real + tables.smooth @ powers(x, count)
+        terms, smooth = (tables.waves * turned).real, tables.smooth @ powers(x, count)
         grown = jnp.abs(turned) * jnp.exp(jnp.maximum(tables.rates.real, 0.0) * radius)
-        bounds = tables.sizes @ grown + tables.largest @ powers(x + radius, count)
-        self.value, self.slope, self.curvature, self.steady, self.drift = here
-        self.second, self.third, self.bend, self.swing = bounds
+        sizes, largest = tables.sizes * grown, tables.largest @ powers(x + radius, count)
+        self.value, self.slope, self.curvature = smooth + terms.sum(1)
+        self.third = largest[1] + sizes[2].sum()
+        # The curve without its fastest modes, and how far these swing, for every choice of what is fast.
+        self.slow, self.drift = smooth[:2, None] + _partial_sums(terms[:2])
+        swing, bend = _partial_sums(sizes[:2])
+        self.swing, self.bend = swing[-1] - swing, largest[0] + bend
         self.noise = tables.errors @ jnp.abs(turned) + tables.floor
         # What cannot leave the noise may be passed over.
         still = jnp.maximum(jnp.abs(self.slope), self.noise[1])
@@ -108,8 +116,8 @@ class _View:
     def clear(self, level: Scalar, sign: float) -> tuple[Flag, Scalar]:
         """Whether the curve touches the level, and a length on which it stays on this side (sign 1: above it).
 
-        The longer of two: by parabolas below the whole curve, and below its steady part, less the swing of the rest.
-        It is zero where the curve touches the level and leaves this side, certainly in spite of rounding.
+        The longest of many: by parabolas below the slower modes, less the swing of the faster ones. It is zero where
+        the curve touches the level and leaves this side, certainly in spite of rounding.
         """
         value, slope = sign * (self.value - level), sign * self.slope
         touching = value <= self.noise[0]
@@ -117,11 +125,10 @@ class _View:
         up = jnp.where(slope <= self.noise[1], 0.0, slope)
         leaving = _below_parabola(up, sign * self.curvature / 2, self.third / 3)
         leaving = jnp.where(slope < -self.noise[1], 0.0, jnp.maximum(leaving, self.within))
-        above = sign * (self.steady - level) - self.swing
+        above = sign * (self.slow - level) - self.swing
         apart = _below_parabola(jnp.maximum(above, 0.0), sign * self.drift, self.bend)
-        apart = jnp.where(above > self.noise[0], apart, 0.0)
-        near = _below_parabola(jnp.maximum(value, 0.0), slope, self.second)
-        return touching, jnp.where(touching, leaving, jnp.maximum(near, apart))
+        apart = jnp.max(jnp.where(above > self.noise[0], apart, 0.0))
+        return touching, jnp.where(touching, leaving, apart)
 
 
 def _below_parabola(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
@@ -165,8 +172,8 @@ def first_exit(curve: Curve, low: Scalar, high: Scalar, end: Scalar) -> tuple[Sc
     return x, below, above
 
 
-def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
-    """The largest value on [0, end], or `best` if that is larger; with derivatives."""
+def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
+    """The largest value on [0, end], or `best` if that is larger, with derivatives; whether the search was finished."""
     still, least, last = jax.lax.stop_gradient((curve, best, end))
     tables, eps = _Tables.of(still, least), jnp.finfo(last.dtype).eps
 
@@ -183,10 +190,33 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> Scalar:
         return jnp.minimum(x + stride, last), jnp.minimum(4 * stride, last), least, place, count + 1
 
     nowhere = still.ceiling() <= least
-    start = (jnp.where(nowhere, last, 0.0), last, least, -jnp.ones_like(last), jnp.zeros((), jnp.int32))
-    _, _, least, place, _ = jax.lax.while_loop(
+    # High from the start: else all ripples of a rising curve would be records.
+    first = _top_of_steady(still, last)
+    value = still.jet(first)[0]
+    place = jnp.where(~nowhere & (value > least), first, -1.0)
+    least = jnp.where(place >= 0, value, least)
+    start = (jnp.where(nowhere, last, 0.0), last, least, place, jnp.zeros((), jnp.int32))
+    x, _, least, place, _ = jax.lax.while_loop(
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
-    at_end = ~nowhere & (still.jet(last)[0] > least)
+    at_end = ~nowhere & (still.jet(last)[0] >= least)
     place = jnp.where(at_end, end, place)
-    return jnp.where(place >= 0, curve.jet(place)[0], best)
+    return jnp.where(place >= 0, curve.jet(place)[0], best), x >= last
+
+
+def _top_of_steady(curve: Curve, end: Scalar) -> Scalar:
+    """Nearly where on [0, end] the curve without its vibrations is highest."""
+    amplitudes, rates = jnp.where(curve.rates.imag == 0, curve.amplitudes, 0.0).real, curve.rates.real
+    count = curve.coefficients.size
+    smooth = (_derivatives(count) @ curve.coefficients)[:3]
+    waves = amplitudes * jnp.stack([jnp.ones_like(rates), rates, rates**2])
+
+    def jet(x):
+        return waves @ jnp.exp(rates * x) + smooth @ powers(x, count)
+
+    x = end * np.linspace(0, 1, 9)
+    x = x[jnp.argmax(jax.vmap(jet)(x)[:, 0])]
+    for _ in range(4):
+        _, slope, curvature = jet(x)
+        x = jnp.clip(x - jnp.where(curvature < 0, slope / curvature, 0.0), 0.0, end)
+    return x

@@ -179,20 +179,7 @@ def outcome(
     initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     engine: AbstractEngine | None = None,
 ) -> Outcome:
-    """Tell what becomes of a block under a motion and in the free stage after it.
-
-    **Arguments:**
-
-    - `block`: a `Block` or `AsymmetricBlock` of scalars (use `jax.vmap` for many).
-    - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
-    - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, or an `Equation` of your own.
-    - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
-    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
-
-    **Returns:** an `Outcome`.
-
-    **Raises:** ValueError for arguments outside their ranges; arrays where scalars are wanted.
-    """
+    """What becomes of a rigid block under a motion and in the free stage after it: `jaxrock.outcome` tells more."""
     return _outcome(block, motion, model, _start(initial), _engine(engine, model))
 
 
@@ -206,19 +193,7 @@ def simulate(
     engine: AbstractEngine | None = None,
     samples: int = 2001,
 ) -> Response:
-    """Compute the history of a block under a motion.
-
-    **Arguments:**
-
-    - `block`, `motion`, `model`, `initial`, `engine`: as in `outcome`.
-    - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
-    - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had
-      by calling the result.
-
-    **Returns:** a `Response`.
-
-    **Raises:** ValueError for arguments outside their ranges.
-    """
+    """The history of a rigid block under a motion: `jaxrock.simulate` tells more."""
     if samples < 2:
         raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
     if duration is not None:
@@ -247,7 +222,7 @@ def _start(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
         warnings.warn(
             "jaxrock runs in single precision here: expect 5 digits. For 13, put "
             '`jax.config.update("jax_enable_x64", True)` before the first computation.',
-            stacklevel=3,
+            stacklevel=4,
         )
     rotation, velocity = initial
     rotation = checked(

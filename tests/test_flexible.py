@@ -154,9 +154,8 @@ def test_peaks_and_impacts(case):
     """Peaks of the source are those of 8001 samples: never above the true ones, and a little below them."""
     shape, more, peaks, impacts = HISTORIES[case]
     amplitude = 5.2974 / 9.81 if shape is SHORT else 0.5
-    response = rk.simulate_flexible(
-        rk.FlexibleBlock(**shape, **more), rk.SinePulse(amplitude, 1.6), duration=20.0, samples=2
-    )
+    block = rk.FlexibleBlock(**shape, **more)
+    response = rk.simulate(block, rk.SinePulse(amplitude, 1.6), duration=20.0, samples=2)
     assert response.status == rk.Status.successful
     found = response.outcome
     alpha = float(response.scene.block.alpha)
@@ -265,16 +264,33 @@ def rigid_peak(block, amplitude, period):
 def test_the_rigid_limit(amplitude):
     """As the modulus grows the peak tends to the rigid block's, as 1/modulus.
 
-    So do the column's bending under the motion and the time for which an impact locks the base. The factor varies
-    with the modulus, because the column trembles when the base uplifts; at 0.25 g it may touch down again, which must
-    not use up the impact.
+    So do the column's bending under the motion and the time for which an impact locks the base. Without damping the
+    factor varies with the modulus, because the column trembles when the base uplifts; at 0.25 g it may touch down
+    again, which must not use up the impact. With damping the factor is a constant.
     """
-    blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, 0.0) for E in (1e11, 1e12, 1e13, 1e14)]
-    pulse, rigid = rk.SinePulse(amplitude, 0.8), rigid_peak(blocks[0], amplitude, 0.8)
-    errors = np.array([float(rk.outcome_flexible(b, pulse, duration=1.6).max_rotation) / rigid - 1 for b in blocks])
-    order = np.polyfit(np.log(10) * np.arange(4), np.log(np.abs(errors)), 1)[0]
-    assert order == pytest.approx(-1, abs=0.1)
-    assert np.abs(errors[-1]) < 2e-5
+    moduli, pulse = np.array([1e11, 1e12, 1e13, 1e14, 1e15, 1e17]), rk.SinePulse(amplitude, 0.8)
+
+    def errors(moduli, damping):
+        blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, damping) for E in moduli]
+        rigid = rigid_peak(blocks[0], amplitude, 0.8)
+        found = [rk.outcome_flexible(b, pulse, duration=1.1) for b in blocks]
+        assert all(f.status == rk.Status.successful for f in found)
+        return np.array([float(f.max_rotation) / rigid - 1 for f in found])
+
+    trembling = errors(moduli[:4], 0.0)
+    assert np.polyfit(np.log(moduli[:4]), np.log(np.abs(trembling)), 1)[0] == pytest.approx(-1, abs=0.1)
+    calm = errors(moduli, 0.01)
+    np.testing.assert_allclose(calm[3:] * moduli[3:], calm[-1] * moduli[-1], rtol=1e-2)
+    assert np.abs(calm[-1]) < 1e-8
+
+
+@pytest.mark.slow
+def test_vibrations_do_not_hide_the_peak():
+    """A million turns of the fastest mode within a step: the greatest rotation is found all the same."""
+    block = rk.FlexibleBlock(1.0, 5.0, 1e16, 2500.0, 0.0)
+    found = rk.outcome_flexible(block, rk.SinePulse(0.3, 0.8), duration=1.6)
+    assert float(found.max_rotation) == pytest.approx(rigid_peak(block, 0.3, 0.8), rel=1e-7)
+    assert found.status == rk.Status.successful
 
 
 # ------------------------------------------------------- many, and derivatives
@@ -298,6 +314,32 @@ def test_derivatives_and_finite_differences():
 
 
 @pytest.mark.slow
+def test_derivatives_and_an_independent_integration():
+    """The same against central differences of SciPy's peaks, after an impact; compiled and not, the value is one."""
+    optimize = pytest.importorskip("scipy.optimize")
+
+    def block(x):
+        return rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2], masses=3)
+
+    def peak(x):
+        return rk.outcome(block(x), PULSE, duration=7.0).max_rotation
+
+    def judged(x):
+        at, _ = independent(block(x), PULSE, 7.0)
+        times = np.linspace(2.5, 7.0, 451)[:-1]
+        top = times[np.argmax([abs(at(t)[0]) for t in times])]
+        return -optimize.minimize_scalar(lambda t: -abs(at(t)[0]), bounds=(top - 0.01, top + 0.01)).fun
+
+    x = jnp.array([30.0, 2.5, 0.02, 5.0, 50.0])
+    value, jitted = peak(x), jax.jit(jax.value_and_grad(peak))(x)
+    assert float(value) == pytest.approx(float(jitted[0]), rel=1e-13)
+    assert float(value) == pytest.approx(judged(x), rel=1e-7)
+    steps = 1e-4 * np.diag(x)
+    slopes = np.array([(judged(x + d) - judged(x - d)) / 2e-4 for d in steps])  # times the parameter
+    np.testing.assert_allclose(jitted[1] * x, slopes, rtol=1e-3, atol=1e-4 * np.abs(slopes).max())
+
+
+@pytest.mark.slow
 def test_a_thousand_blocks_at_once():
     """One call, with the answers of single calls; reverse mode agrees with forward mode."""
     moduli = jnp.linspace(10e9, 60e9, 1000)
@@ -316,13 +358,19 @@ def test_a_thousand_blocks_at_once():
 
 
 @pytest.mark.slow
-def test_stiff_columns():
-    """300 GPa, 5 m, 20 masses: the fastest mode turns 1e5 times a second, and steps do not notice it."""
-    block = rk.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, 0.0, 20)
-    response = rk.simulate_flexible(block, rk.SinePulse(0.5, 0.8), duration=8.0, samples=2)
+@pytest.mark.parametrize("damping", [0.0, 0.01, 0.05])
+def test_stiff_columns(damping):
+    """300 GPa, 5 m, 20 masses: the fastest mode turns 1e5 times a second, and steps do not notice it.
+
+    The peak is within 0.1 % of a rigid block's on the same spring. With damping in proportion to stiffness the rates
+    of many modes come close to one number; what rounding does there must not make the base chatter.
+    """
+    block = rk.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, damping, 20)
+    response = rk.simulate_flexible(block, rk.SinePulse(0.15, 0.8), duration=1.6, samples=2)
     assert float(block.frequencies[-1]) > 1e5
     assert response.status == rk.Status.successful
     assert int(response.nodes.steps.max()) < 200
+    assert float(response.max_rotation) == pytest.approx(rigid_peak(block, 0.15, 0.8), rel=1e-3)
 
 
 # ----------------------------------------------------------------- arguments
@@ -343,7 +391,7 @@ def test_small_budgets_have_a_status():
         (dict(damping_ratio=1.0), r"`damping_ratio` must be in \[0, 1\), but is 1.0"),
         (dict(damping="viscous"), "`damping` must be one of"),
         (dict(youngs_modulus=1e5), "stiffer than its base"),
-        (dict(youngs_modulus=1e17), "at most 1e8 times as stiff"),
+        (dict(youngs_modulus=1e21), "at most 1e12 times as stiff"),
         (dict(width=80.0), "at most 1.41 times the height"),
     ],
 )
@@ -358,3 +406,8 @@ def test_wrong_durations():
         rk.simulate_flexible(block, PULSE, duration=0.0)
     with pytest.raises(ValueError, match="`samples` must be at least 2"):
         rk.simulate_flexible(block, PULSE, samples=1)
+
+
+def test_vertical_motions_raise():
+    with pytest.raises(ValueError, match="`motion` must not be vertical for a FlexibleBlock"):
+        rk.outcome(rk.FlexibleBlock(**TALL, damping_ratio=0.01), PULSE.with_vertical(PULSE))
