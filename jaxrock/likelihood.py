@@ -22,6 +22,9 @@ each interval just so far that the sum is smooth. Beyond the last nodes, 3.6 sta
 straight, so that an observation that is all but impossible still says in which direction it is less so. The nodes also
 lie off the main direction, in such a pattern that all four add their variance. Detail below about 0.3 scatter is not
 resolved. No derivatives are needed for the likelihood, and only first ones for its slope.
+
+Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
+both ways.
 """
 
 import math

@@ -52,6 +52,7 @@ class Observations(eqx.Module):
     - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive;
       not read for rocks without one.
     - `names`: of the rocks; None numbers them.
+    - `other`: what `Observations.asymmetric` knows of their second sides; None: symmetric ones.
 
     **Raises:** ValueError for values outside their ranges, or of different lengths.
     """
