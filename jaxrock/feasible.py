@@ -10,7 +10,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._checks import Values, positive
 from jaxrock._progress import Progress
-from jaxrock.block import Block
 from jaxrock.critical import critical_amplitudes
 from jaxrock.engine import AbstractEngine
 from jaxrock.likelihood import Likelihood
@@ -111,7 +110,8 @@ def unexceeded_motion(
     """Find the largest motion up to which all rocks that stand would have stood, for every duration.
 
     Rocks are taken as they are stated, and the motion as the same at all of them: no scatter. Overturning intervals
-    above the first one do not count as safe between them: the motion was not exceeded.
+    above the first one do not count as safe between them: the motion was not exceeded. A rock of which it is not known
+    which way round it stood counts with the way in which it stands more.
 
     **Arguments:**
 
@@ -128,20 +128,20 @@ def unexceeded_motion(
     standing = np.flatnonzero(np.asarray(observations.seen) != TOPPLED)
     if standing.size == 0:
         raise ValueError("Argument `observations` must hold a rock that stands.")
-    rocks = [np.asarray(x)[standing] for x in (observations.alpha, observations.p, observations.restitution)]
-    alpha, p, restitution = (np.repeat(x, durations.size) for x in rocks)
-    every = np.tile(np.asarray(durations), standing.size)
+    seen = observations.of(standing)
+    ways, size = seen.ways, durations.size
+    blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, size), len(ways)), seen.blocks)
     found = critical_amplitudes(
-        Block(alpha, p, restitution),
-        jax.vmap(motion)(jnp.ones(every.size), positive("durations", every)),
+        blocks,
+        jax.vmap(motion)(jnp.repeat(ways.ravel(), size), jnp.tile(positive("durations", durations), ways.size)),
         model,
         intensity=intensity,
         derivatives=False,
         engine=engine,
         progress=progress,
     )
-    by_rock = found.lowest.reshape(standing.size, durations.size)
+    by_rock = found.lowest.reshape(*ways.shape, size).max(axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
-    complete = found.complete.reshape(by_rock.shape).all(axis=0)
+    complete = found.complete.reshape(-1, size).all(axis=0)
     return Unexceeded(durations, amplitude, by_rock, weakest, complete)

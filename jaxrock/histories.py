@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxrock._checks import Values, checked, finite, positive, put_down
 from jaxrock.arcs import Diffrax
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
 from jaxrock.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
@@ -34,11 +35,16 @@ _WIDE = 0.25  # relative standard error, from which on straight lines in the par
 # Open intervals that parameters stay in; of a motion by the last part of their names. Those that begin at zero are
 # fitted by their logarithms: combinations that data do not tell apart are products of powers.
 _BOUNDS = {
-    "alpha": (0.0, np.pi / 2),
-    "restitution": (0.0, 1.0),
+    **dict.fromkeys(("alpha", "alpha1", "alpha2"), (0.0, np.pi / 2)),
+    **dict.fromkeys(("restitution", "inertia_ratio"), (0.0, 1.0)),
     "initial": (-np.pi / 2, np.pi / 2),
     "oscillations": (1.0, np.inf),
-    **dict.fromkeys(("p", "duration", "period", "dt", "center"), (0.0, np.inf)),
+    **dict.fromkeys(("p", "p1", "radius_ratio", "duration", "period", "dt", "center"), (0.0, np.inf)),
+    **dict.fromkeys(("restitution1", "restitution2"), (0.0, np.inf)),
+}
+_USUAL = {
+    Block: ("alpha", "p", "restitution", "initial"),
+    AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
 }
 
 
@@ -82,7 +88,7 @@ class HistoryFit(eqx.Module):
     correlated: bool
     misfit: float
     agreement: float
-    block: Block
+    block: Block | AsymmetricBlock
     motion: AbstractMotion
     initial: tuple[float, float]
     status: HistoryStatus
@@ -121,11 +127,11 @@ class HistoryFit(eqx.Module):
 def fit_history(
     time: Values,
     rotation: Values,
-    block: Block,
+    block: Block | AsymmetricBlock,
     motion: AbstractMotion | None = None,
     model: Model = Housner(),
     *,
-    parameters: Sequence[str] = ("alpha", "p", "restitution", "initial"),
+    parameters: Sequence[str] | None = None,
     initial: tuple[float, float] | None = None,
     scatter: Values | None = None,
     spread: float = 0.2,
@@ -141,9 +147,11 @@ def fit_history(
     - `rotation`: (n,) measured [rad].
     - `block`, `motion`: where to start, and what is not fitted; a motion of None rests (free rocking).
     - `model`: as in `outcome`.
-    - `parameters`: names of what is fitted: "alpha", "p", "restitution"; those of the motion ("amplitude" [g] also of
-      a record, whose peak it is); "initial" [rad] and "velocity" [rad/s] at time 0; and of the measurement its
-      "delay" [s] behind the motion (before it, the block is as it was at time 0) and its "offset" [rad].
+    - `parameters`: names of what is fitted: "alpha", "p", "restitution" (of an asymmetric block "alpha1", "alpha2",
+      "p1", "inertia_ratio", "radius_ratio", "restitution1", "restitution2"); those of the motion ("amplitude" [g] also
+      of a record, whose peak it is); "initial" [rad] and "velocity" [rad/s] at time 0; and of the measurement its
+      "delay" [s] behind the motion (before it, the block is as it was at time 0) and its "offset" [rad]. None: angles,
+      frequency parameter and restitutions of the block, and "initial".
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0, to start from. None: (0, 0) under a motion, the
       first measured rotation without.
     - `scatter`: standard deviation of the errors of measurement [rad], one number or (n,); None: from the residuals.
@@ -151,7 +159,7 @@ def fit_history(
     - `starts`: how many, at least 1; the first is what is given. `seed`: of the others.
     - `engine`: as in `outcome`; None: series of order 8 to a tolerance of 1e-10, ample for data.
 
-    **Returns:** a `HistoryFit`. Restitution that is not fitted follows alpha if it is Housner's.
+    **Returns:** a `HistoryFit`. Restitution that is not fitted follows the angles if it is not given.
 
     **Raises:** ValueError for arguments outside their ranges, or names that the scene does not have.
 
@@ -185,7 +193,7 @@ class _Scene(eqx.Module):
     """What is simulated: what is fitted, and what is not."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    block: Block
+    block: Block | AsymmetricBlock
     motion: AbstractMotion
     model: Model
     initial: tuple[Array, Array]
@@ -196,7 +204,7 @@ class _Scene(eqx.Module):
         """Check the names, and fill in what was left open."""
         still = RectangularPulse(0.0, 1.0)
         check_single(block, still if motion is None else motion)
-        names, free = tuple(parameters), motion is None
+        names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
         motion = still if free else motion
         if not free and not float(peak_bound(motion)) > 0:
             raise ValueError("Argument `motion` must move the ground; None is free rocking.")
@@ -208,8 +216,7 @@ class _Scene(eqx.Module):
             raise ValueError(f"Argument `parameters` must {wanted}, but is {parameters!r}.")
         if initial is None:
             initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
-        if "restitution" in names:  # no longer Housner's
-            block = Block(block.alpha, block.p, block.restitution)
+        block = _given(block, names)
         if engine is None:
             engine = Diffrax() if isinstance(model, Equation) else Series(order=8, tolerance=1e-10)
         return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
@@ -221,7 +228,7 @@ class _Scene(eqx.Module):
 
     def coordinates(self) -> tuple[np.ndarray, ...]:
         """Where the fit starts, natural sizes of its coordinates, and lower and upper ends of their open intervals."""
-        alpha, p, reach = float(self.block.alpha), float(self.block.p), float(self._reach)
+        alpha, p, reach = *map(float, _size(self.block)), float(self._reach)
         sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha, "shape": 1.0, "phase": 1.0}
         known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
         values = np.array([float(known.get(name, 0.0)) for name in self.names])
@@ -239,9 +246,9 @@ class _Scene(eqx.Module):
     @property
     def _reach(self) -> Array:
         """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
-        return 2 / self.block.p
+        return 2 / _size(self.block)[1]
 
-    def at(self, values: dict) -> tuple[Block, AbstractMotion, tuple]:
+    def at(self, values: dict) -> tuple[Block | AsymmetricBlock, AbstractMotion, tuple]:
         """Block, motion and initial state with other parameters."""
         before = named(self.block, self.motion)
         block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
@@ -262,6 +269,24 @@ class _Scene(eqx.Module):
         for _, failed in checks:
             known &= ~failed
         return rotation + values.get("offset", 0.0), known
+
+
+def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
+    """Slenderness angle, of the weaker side, and frequency parameter."""
+    if isinstance(block, Block):
+        return block.alpha, block.p
+    return jnp.minimum(block.alpha1, block.alpha2), block.p1
+
+
+def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
+    """The block with values of its own for what is fitted, and no longer follows from the rest."""
+    if isinstance(block, Block):
+        return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
+    radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
+    pair = None if block.given_restitution1 is None else (block.given_restitution1, block.given_restitution2)
+    if "restitution1" in names or "restitution2" in names:
+        pair = block.restitution1, block.restitution2
+    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, pair)
 
 
 def _last(name: str) -> str:

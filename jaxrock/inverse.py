@@ -184,7 +184,7 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
         remarks = (f"Least probable under the best motion: {', '.join(worst)}.",)
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
-    per_point = problem.likelihood.observations.alpha.size * NODES
+    per_point = problem.likelihood.observations.ways.size * NODES
     return Estimate(
         names=problem.names,
         values=jnp.stack(list(values.values())),

@@ -29,7 +29,9 @@ _PULSES = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument(
-        "rocks", help="CSV file of rocks; columns such as alpha_deg,alpha_deg_sd,half_diagonal_m,observed"
+        "rocks",
+        help="CSV file of rocks; columns such as alpha_deg,alpha_deg_sd,half_diagonal_m,observed; of two unlike "
+        "sides alpha1_deg,alpha2_deg,radius1_m,radius2_m,facing,observed",
     )
     parser.add_argument("--pulse", choices=tuple(_PULSES), default="sine", help="kind of motion (default sine)")
     ends = {"type": float, "nargs": 2, "metavar": ("FROM", "TO")}
@@ -85,11 +87,12 @@ def _write(
             flags = ",".join(str(int(x)) for x in open_)
             print(f"{name},{_UNITS[name]},{float(value):.6g},{ends},{flags}", file=file)
     with files[1].open("w") as file:
-        print("name,alpha_rad,p_rad_per_s,observed,probability", file=file)
-        rows = zip(observations.names, observations.alpha, observations.p, observations.seen, found.probability)
-        for name, alpha, p, seen, probability in rows:
-            numbers = f"{float(alpha):.6g},{float(p):.6g},{SEEN[int(seen)]},{float(probability):.4g}"
-            print(f"{_quoted(name)},{numbers}", file=file)
+        shapes = _shapes(observations)
+        print(f"name,{','.join(shapes)},observed,probability", file=file)
+        rows = zip(observations.names, zip(*shapes.values()), observations.seen, found.probability)
+        for name, shape, seen, probability in rows:
+            numbers = ",".join(f"{float(x):.6g}" for x in shape)
+            print(f"{_quoted(name)},{numbers},{SEEN[int(seen)]},{float(probability):.4g}", file=file)
     rows, columns = np.meshgrid(*region.values, indexing="ij")
     header = ",".join(f"{name}_{_UNITS[name]}" for name in region.names) + ",log_likelihood,allowed"
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
@@ -103,6 +106,14 @@ def _write(
                 print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
     draw(region, found, wall).figure.savefig(files[3], dpi=150)
     return files
+
+
+def _shapes(observations: Observations) -> dict[str, np.ndarray]:
+    """Slenderness angles and frequency parameters by column."""
+    blocks = observations.blocks
+    names = ("alpha", "p") if observations.other is None else ("alpha1", "alpha2", "p1", "p2")
+    units = {"a": "rad", "p": "rad_per_s"}
+    return {f"{name}_{units[name[0]]}": np.asarray(getattr(blocks, name)) for name in names}
 
 
 def _quoted(name: str) -> str:
@@ -154,6 +165,9 @@ def draw(region: FeasibleRegion, found: Estimate | None = None, wall: Unexceeded
 def _text(observations: Observations, found: Estimate) -> str:
     seen = np.asarray(observations.seen)
     lines = [f"{seen.size} rocks: " + ", ".join(f"{int(np.sum(seen == k))} {word}" for k, word in enumerate(SEEN))]
+    unknown = int(np.sum(observations.ways[0] != observations.ways[-1]))
+    if unknown:
+        lines.append(f"  {unknown} of them may stand either way round in the direction of the shaking")
     for name, value, (low, high), (below, above) in zip(found.names, found.values, found.interval, found.open):
         ends = f"{'<' if below else ''}{float(low):.4g} to {'>' if above else ''}{float(high):.4g}"
         ends = ends if np.isfinite(float(low)) else "no interval"

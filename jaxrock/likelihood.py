@@ -22,6 +22,9 @@ each interval just so far that the sum is smooth. Beyond the last nodes, 3.6 sta
 straight, so that an observation that is all but impossible still says in which direction it is less so. The nodes also
 lie off the main direction, in such a pattern that all four add their variance. Detail below about 0.3 scatter is not
 resolved. No derivatives are needed for the likelihood, and only first ones for its slope.
+
+Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
+both ways.
 """
 
 import math
@@ -36,6 +39,7 @@ from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import positive, put_down
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
 from jaxrock.models import Housner, Model
@@ -175,10 +179,11 @@ class Likelihood(eqx.Module):
         mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2
 
         weight = jnp.where(nodes.measurable, _along(_WEIGHTS[1:-1], nodes.y), 0.0)
-        total = jnp.maximum(jnp.sum(weight, axis=0), 1e-9)
-        centre = jnp.sum(weight * nodes.rotation, axis=0) / total
-        spread = nodes.rotation_width**2 + (nodes.rotation - centre) ** 2
-        spread = seen.rotation_sd**2 + jnp.sum(weight * spread, axis=0) / total
+        weight = weight / nodes.y.shape[-2]
+        total = jnp.maximum(jnp.sum(weight, axis=(0, -2)), 1e-9)
+        centre = jnp.sum(weight * nodes.rotation, axis=(0, -2)) / total
+        spread = nodes.rotation_width**2 + (nodes.rotation - centre[..., None, :]) ** 2
+        spread = seen.rotation_sd**2 + jnp.sum(weight * spread, axis=(0, -2)) / total
         measured = jnp.where((seen.seen == ROTATION) & (total > 1e-6), 0.5, 0.0)
         return badness + measured * (seen.rotation - centre) ** 2 / spread, mean + measured, variance + measured
 
@@ -188,11 +193,11 @@ class Likelihood(eqx.Module):
         scenes = possible_scenes(self.observations, self.scatter)
         shape = (*parameters[0].shape, *scenes[0].shape)
 
-        def one(parameters, factor, alpha, p, restitution):
+        def one(parameters, factor, block):
             def results(parameters):
                 with put_down():  # known to be good; a check in the program would cost more than it
                     motion = self.motion(**dict(zip(names, parameters))) * factor
-                    found = outcome(Block(alpha, p, restitution), motion, self.model, engine=self.engine)
+                    found = outcome(block, motion, self.model, engine=self.engine)
                 rotation = jnp.where(found.overturned, 0.0, found.max_rotation)
                 real = jnp.stack([found.margin, rotation])
                 return real, (real, found.overturned, found.status == Status.successful)
@@ -203,17 +208,19 @@ class Likelihood(eqx.Module):
             _, back, found = jax.vjp(results, parameters, has_aux=True)
             return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
 
-        parameters = jnp.stack([jnp.broadcast_to(x[..., None, None], shape).ravel() for x in parameters], axis=-1)
+        parameters = [jnp.broadcast_to(x[..., None, None, None], shape).ravel() for x in parameters]
+        parameters = jnp.stack(parameters, axis=-1)
+        scenes = jax.tree.map(lambda x: jnp.broadcast_to(x, shape).ravel(), scenes)
         # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
         fixed = jax.lax.stop_gradient(parameters)
-        rows, (real, lost, known) = jax.vmap(one)(fixed, *(jnp.broadcast_to(x, shape).ravel() for x in scenes))
+        rows, (real, lost, known) = jax.vmap(one)(fixed, *scenes)
         if slopes:
             real += jnp.sum(jnp.where(jnp.isfinite(rows), rows, 0.0) * (parameters - fixed)[:, None], axis=-1)
-        return _Possible.of(*(jnp.moveaxis(x.reshape(shape), -2, 0) for x in (*real.T, lost, known)))
+        return _Possible.of(*(jnp.moveaxis(x.reshape(shape), -3, 0) for x in (*real.T, lost, known)))
 
 
 class _Possible(NamedTuple):
-    """What becomes of rocks in possible scenes, (scenes, ..., rocks): the quarter points of intervals."""
+    """What becomes of rocks in possible scenes, (scenes, ..., ways, rocks): the quarter points of intervals."""
 
     y: Real  # the margin, straightened
     width: Real  # what it is smeared by
@@ -225,7 +232,7 @@ class _Possible(NamedTuple):
 
     @classmethod
     def of(cls, margin, rotation, lost, known) -> "_Possible":
-        """From the results at nodes, (nodes, ..., rocks)."""
+        """From the results at nodes, (nodes, ..., ways, rocks)."""
         y = _straightened(jnp.where(known, margin, 0.0))
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
         slope = jnp.stack([y[0] - y[3], y[-4] - y[-1]]) / (3 * _APART)
@@ -256,7 +263,13 @@ class _Possible(NamedTuple):
         parts = jnp.concatenate([jnp.stack([beyond, other]), inner + _along(np.log(_WEIGHTS[1:-1]), inner)])
         if jnp.ndim(density):  # that beyond the ends first, as here
             parts = parts + jnp.concatenate([density[:1], density[-1:], density[1:-1]])
-        return logsumexp(parts, axis=0)
+        return _mean_of_ways(logsumexp(parts, axis=0))
+
+
+def _mean_of_ways(logarithms: Real) -> Real:
+    """Of probabilities, by their logarithms (..., ways, rocks): which way a rock was shaken is anybody's guess."""
+    count = logarithms.shape[-2]
+    return logarithms[..., 0, :] if count == 1 else logsumexp(logarithms, axis=-2) - np.log(count)
 
 
 def _along(values: np.ndarray, like: Real) -> np.ndarray:
@@ -275,8 +288,8 @@ def _straightened(margin: Real) -> Real:
     return jnp.where(lost, -jnp.log1p(-jnp.where(lost, margin, 0.0)) / 2, margin / 2 + margin**2 / 4)
 
 
-def possible_scenes(observations: Observations, scatter: ArrayLike) -> tuple[Real, Real, Real, Real]:
-    """Factor on the motion, alpha, p and restitution of rocks at the nodes, (nodes, rocks) each."""
+def possible_scenes(observations: Observations, scatter: ArrayLike) -> tuple[Real, Block | AsymmetricBlock]:
+    """Factor on the motion, with its sign, (nodes, ways, rocks), and the rocks at the nodes, (nodes, 1, rocks)."""
     deviation = jnp.stack(
         [
             jnp.broadcast_to(scatter, observations.alpha.shape),
@@ -285,17 +298,17 @@ def possible_scenes(observations: Observations, scatter: ArrayLike) -> tuple[Rea
             observations.restitution_sd,
         ]
     )
-    offsets = jnp.einsum("ki,jir->kjr", _DESIGN, _directions(observations.alpha, deviation)) * deviation
-    return (jnp.exp(offsets[:, 0]), *rocks_at(observations, offsets[:, 1:].swapaxes(0, 1)))
+    offsets = jnp.einsum("ki,jir->kjr", _DESIGN, _directions(observations.weaker_alpha, deviation)) * deviation
+    blocks = observations.blocks_at(*rocks_at(observations, offsets[:, 1:].swapaxes(0, 1)))
+    return jnp.exp(offsets[:, :1]) * observations.ways, jax.tree.map(lambda x: x[:, None], blocks)
 
 
 def rocks_at(observations: Observations, offsets: Real) -> tuple[Real, Real, Real]:
     """Alpha, p and restitution of rocks that are off by (3, ..., rocks) in ln alpha, ln p and restitution."""
-    most = jnp.where(observations.follows, 0.955, 1.55)
+    most = observations.widest
     alpha = jnp.minimum(observations.alpha * jnp.exp(offsets[0]), jnp.maximum(most, observations.alpha))
     p = observations.p * jnp.exp(offsets[1])
-    housner = jnp.maximum(1 - 1.5 * jnp.sin(alpha) ** 2, 0.0)  # Housner (1963)
-    restitution = jnp.where(observations.follows, housner, observations.restitution)
+    restitution = jnp.where(observations.follows, observations.by_momentum(alpha), observations.restitution)
     # At 1 impacts never die out.
     high = jnp.maximum(jnp.where(observations.restitution_sd > 0, 0.99, 1.0), restitution)
     return alpha, p, jnp.clip(restitution + offsets[2], 0.0, high)

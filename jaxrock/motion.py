@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._checks import Values, checked, finite, positive
+from jaxrock._label import Label
 from jaxrock.polynomial import horner, rescaled, shifted
 
 Scalar = Inexact[ArrayLike, ""]
@@ -140,19 +141,6 @@ class AbstractMotion(eqx.Module):
         return Summed(self, -other)
 
 
-class _Label:
-    """A name that compiled functions do not see: all labels are equal, so that a new name compiles nothing."""
-
-    def __init__(self, text: str):
-        self.text = text
-
-    def __eq__(self, other):
-        return isinstance(other, _Label)
-
-    def __hash__(self):
-        return 0
-
-
 class Record(AbstractMotion):
     """An accelerogram: straight lines between equally spaced samples.
 
@@ -169,7 +157,7 @@ class Record(AbstractMotion):
 
     samples: Inexact[Array, "*batch n"]
     dt: Inexact[Array, "..."]
-    label: _Label = eqx.field(static=True)
+    label: Label = eqx.field(static=True)
 
     def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
         samples = finite("acceleration", acceleration)
@@ -177,12 +165,12 @@ class Record(AbstractMotion):
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
         self.samples = samples
         self.dt = positive("dt", dt)
-        self.label = _Label(name)
+        self.label = Label(name)
 
     @property
     def name(self) -> str:
         """Where the record comes from."""
-        return self.label.text
+        return self.label.value
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:

@@ -5,10 +5,15 @@ The first line that is not a comment (#) names the columns, with their units; th
 - `name`: optional.
 - `alpha_rad` or `alpha_deg`: slenderness angle; and `p_rad_per_s`, or `half_diagonal_m` of a rectangle (p = sqrt(3 g/4
   R), g = 9.81 m/s^2). Or, instead of both, `width_m` and `height_m`, full sizes of a rectangle.
-- `restitution`: optional; empty is Housner's.
+- Of rocks whose sides differ, in place of these: `alpha1_rad` and `alpha2_rad`, or `alpha1_deg` and `alpha2_deg`; with
+  `p1_rad_per_s` and `p2_rad_per_s`, or `radius1_m` and `radius2_m`, the distances from the corners to the centre of
+  mass. `inertia_ratio` is m R1^2/I1, optional; empty is 3/4, that of a rectangle. `facing`, optional: 1 where positive
+  ground acceleration drives the rock from side 1 to side 2, -1 where it stands the other way round; empty is not known.
+- `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the energy that two impacts keep;
+  empty is by angular momentum.
 - `observed`: survived, toppled, or rotation; then `rotation_rad` or `rotation_deg` holds the largest |rotation|.
-- `..._sd` of any of these but the names, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A
-  measured rotation needs one.
+- `..._sd` of the measured ones, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A measured
+  rotation needs one. Those of side 1 are for both sides, which are off by the same factor.
 """
 
 import csv
@@ -17,15 +22,29 @@ from pathlib import Path
 import numpy as np
 
 from jaxrock._text import file_error, text_lines
+from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import GRAVITY
 from jaxrock.observations import SEEN, Observations
 
 _DEGREE = np.pi / 180
 _FACTORS = {
     "alpha_rad": 1.0, "alpha_deg": _DEGREE, "p_rad_per_s": 1.0, "half_diagonal_m": 1.0, "width_m": 1.0, "height_m": 1.0,
-    "restitution": 1.0, "rotation_rad": 1.0, "rotation_deg": _DEGREE,
+    "restitution": 1.0, "rotation_rad": 1.0, "rotation_deg": _DEGREE, "alpha1_rad": 1.0, "alpha1_deg": _DEGREE,
+    "p1_rad_per_s": 1.0, "radius1_m": 1.0,
 }  # fmt: skip
-_COLUMNS = {"name", "observed", *_FACTORS, *(f"{name}_sd" for name in _FACTORS)}
+_EXACT = {
+    "alpha2_rad": 1.0, "alpha2_deg": _DEGREE, "p2_rad_per_s": 1.0, "radius2_m": 1.0, "inertia_ratio": 1.0, "facing": 1.0
+}  # fmt: skip
+_COLUMNS = {"name", "observed", *_FACTORS, *(f"{name}_sd" for name in _FACTORS), *_EXACT}
+# One column of each row must be there; and all or none of each pair.
+_WAYS = (
+    ("alpha_rad", "alpha_deg", "width_m", "alpha1_rad", "alpha1_deg"),
+    ("p_rad_per_s", "half_diagonal_m", "height_m", "p1_rad_per_s", "radius1_m"),
+)
+_PAIRS = (
+    ("width_m", "height_m"), ("alpha1_rad", "alpha2_rad"), ("alpha1_deg", "alpha2_deg"),
+    ("p1_rad_per_s", "p2_rad_per_s"), ("radius1_m", "radius2_m"),
+)  # fmt: skip
 
 
 def read_observations(path: str | Path) -> Observations:
@@ -56,18 +75,23 @@ def read_observations(path: str | Path) -> Observations:
             if len(fields) != len(header):
                 raise ValueError(f"has {len(fields)} fields, but there are {len(header)} columns.")
             rock = _rock(dict(zip(header, fields)))
-            Observations(*([rock[name]] for name in ("alpha", "p", "observed", "restitution")), **_more([rock]))
+            _observations([rock])
         except ValueError as error:
             raise file_error(path.name, f"line {number}: {error}") from None
         found.append(rock)
-    columns = ([rock[name] for rock in found] for name in ("alpha", "p", "observed", "restitution"))
-    names = [rock["name"] or f"line {number}" for rock, (number, _) in zip(found, rows[1:])]
-    return Observations(*columns, **_more(found), names=names)
+    return _observations(found, [rock["name"] or f"line {number}" for rock, (number, _) in zip(found, rows[1:])])
 
 
-def _more(rocks: list[dict]) -> dict:
-    names = ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
-    return {name: [rock[name] for rock in rocks] for name in names}
+def _observations(rocks: list[dict], names: list[str] | None = None) -> Observations:
+    def column(name):
+        return [rock[name] for rock in rocks]
+
+    known = ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
+    rest = (column("observed"), column("restitution")), {name: column(name) for name in known} | {"names": names}
+    if "alpha2" not in rocks[0]:
+        return Observations(column("alpha"), column("p"), *rest[0], **rest[1])
+    shape = [np.array(column(name)) for name in ("alpha", "alpha2", "p", "inertia_ratio", "radius_ratio")]
+    return Observations.asymmetric(AsymmetricBlock(*shape), *rest[0], facing=column("facing"), **rest[1])
 
 
 def _check_header(file: str, header: list[str]) -> None:
@@ -79,12 +103,14 @@ def _check_header(file: str, header: list[str]) -> None:
         raise file_error(file, f"has the column `{twice[0]}` twice.")
     if "observed" not in header:
         raise file_error(file, f"has no column `observed` ({', '.join(SEEN)}).")
-    ways = (("alpha_rad", "alpha_deg", "width_m"), ("p_rad_per_s", "half_diagonal_m", "height_m"))
-    for way in ways:
+    for way in _WAYS:
         if sum(name in header for name in way) != 1:
             raise file_error(file, f"must have one of the columns {', '.join(way)}.")
-    if ("width_m" in header) != ("height_m" in header):
-        raise file_error(file, "must have both columns width_m and height_m, or none of them.")
+    for pair in _PAIRS:
+        if (pair[0] in header) != (pair[1] in header):
+            raise file_error(file, f"must have both columns {pair[0]} and {pair[1]}, or none of them.")
+    if any(name in header for name in _WAYS[0][3:]) != any(name in header for name in _WAYS[1][3:]):
+        raise file_error(file, "must have columns of both sides (1 and 2) for angles and sizes alike.")
 
 
 def _rock(fields: dict[str, str]) -> dict:
@@ -96,7 +122,8 @@ def _rock(fields: dict[str, str]) -> dict:
         for unit in (name, f"{name}_rad", f"{name}_deg"):
             if unit in fields:
                 value, sd = values[unit], values.get(f"{unit}_sd")
-                return empty if value is None else value * _FACTORS[unit], (sd or 0.0) * _FACTORS[unit]
+                factor = (_FACTORS | _EXACT)[unit]
+                return empty if value is None else value * factor, (sd or 0.0) * factor
         return empty, 0.0
 
     if fields["observed"] not in SEEN:
@@ -104,6 +131,8 @@ def _rock(fields: dict[str, str]) -> dict:
     rock = {"name": fields.get("name", ""), "observed": fields["observed"]}
     if "width_m" in fields:
         rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))
+    elif "alpha1_rad" in fields or "alpha1_deg" in fields:
+        rock |= _two_sides(fields, get)
     else:
         rock["alpha"], rock["alpha_sd"] = _given("alpha", get("alpha", None))
         rock |= _size(fields, get)
@@ -124,6 +153,20 @@ def _size(fields: dict[str, str], get) -> dict:
     radius, deviation = _positive("half_diagonal_m", _given("half_diagonal_m", get("half_diagonal_m", None)))
     p = np.sqrt(3 * GRAVITY / (4 * radius))
     return {"p": p, "p_sd": p * deviation / (2 * radius)}
+
+
+def _two_sides(fields: dict[str, str], get) -> dict:
+    """Angles and sizes of a rock whose sides differ; deviations are those of side 1."""
+    (alpha1, deviation), (alpha2, _) = (_given(name, get(name, None)) for name in ("alpha1", "alpha2"))
+    facing, inertia = (get(name, empty)[0] for name, empty in (("facing", 0.0), ("inertia_ratio", 0.75)))
+    rock = {"alpha": alpha1, "alpha_sd": deviation, "alpha2": alpha2, "inertia_ratio": inertia, "facing": facing}
+    if "p1_rad_per_s" in fields:
+        (p1, p_sd), (p2, _) = (_given(name, get(name, None)) for name in ("p1_rad_per_s", "p2_rad_per_s"))
+        block = AsymmetricBlock.from_frequencies(alpha1, alpha2, p1, p2, inertia)
+        return rock | {"p": p1, "p_sd": p_sd, "radius_ratio": float(block.radius_ratio)}
+    first, second = (_positive(name, _given(name, get(name, None))) for name in ("radius1_m", "radius2_m"))
+    p1 = np.sqrt(inertia * GRAVITY / first[0])
+    return rock | {"p": p1, "p_sd": p1 * first[1] / (2 * first[0]), "radius_ratio": second[0] / first[0]}
 
 
 def _rectangle(width: tuple[float, float], height: tuple[float, float]) -> dict:

@@ -209,8 +209,10 @@ class SimulatedFragility(eqx.Module):
         - `bound`: as in `counts`.
 
         **Returns:** a `FragilityFit`. Its covariance takes motions as what is random: what one motion does at one level
-        and to one block goes with what it does at others (a sandwich of clusters; two motions or more). Blocks are
-        taken as drawn often enough. Look at `monotone` and `falls` before a curve that only rises is used.
+        and to one block goes with what it does at others (a sandwich of clusters; two motions or more). It is too
+        narrow for few of them: 95 % intervals of median and dispersion held the truth in 91 and 79 % of suites of 10
+        motions, 94 and 90 % of 40. Blocks are taken as drawn often enough. Look at `monotone` and `falls` before a
+        curve that only rises is used.
 
         **Raises:** ValueError if a bound is needed.
 

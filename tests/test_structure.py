@@ -83,7 +83,7 @@ BELOW = dict.fromkeys(BOTTOM, set()) | {
     "surfaces": {"suites"},
     "least_squares": set(),
     "histories": {"response", "pulses", "parameters", "least_squares"},
-    "observations": {"block"},
+    "observations": {"asymmetric"},
     "observation_files": {"observations"},
     "likelihood": {"response", "observations"},
     "climb": set(),

@@ -1,0 +1,19 @@
+"""Names that programs carry along without reading them."""
+
+from typing import Any
+
+
+class Label:
+    """A name, or several, that compiled functions do not see.
+
+    All labels are equal, so that a new one compiles nothing.
+    """
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other):
+        return isinstance(other, Label)
+
+    def __hash__(self):
+        return 0
