@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
+Values = Inexact[ArrayLike, "*values"]
 
 _MOST_STRIDES, _MOST_STRIDES_TO_THE_TOP = 10_000, 100_000
 
@@ -131,8 +132,8 @@ class _View:
         return touching, jnp.where(touching, leaving, apart)
 
 
-def _below_parabola(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
-    """Length on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
+def _below_parabola(value: Values, slope: Values, fall: Values) -> Values:
+    """Lengths on which value + slope x - fall x^2/2 stays positive, for a value of 0 or more."""
     root = jnp.sqrt(slope**2 + 2 * fall * value)
     rising = slope > 0
     above = jnp.where(rising, slope + root, 2 * value)

@@ -118,7 +118,8 @@ def test_modes_span_the_motion_and_solve_the_equations(damping):
     n = numbers.rotation.size
     assert whole
     np.testing.assert_allclose(rocking.project @ rocking.modes, np.eye(2 * n + 1), atol=1e-11)
-    np.testing.assert_allclose((locked.project @ locked.modes)[:-1, :-1], np.eye(2 * n), atol=1e-11)
+    real = np.abs(locked.project).sum(1) > 0  # not the one that only fills up
+    np.testing.assert_allclose((locked.project @ locked.modes)[real][:, real], np.eye(2 * n), atol=1e-11)
     q, v, theta = np.split(np.asarray(rocking.modes), [n, 2 * n])
     rate, column = np.asarray(rocking.rates), np.asarray(numbers.rotation)[:, None]
     bend, bend_rate = q - column * theta, v - column * theta * rate
