@@ -3,6 +3,7 @@
     python benchmarks/inverse.py coverage --repetitions 400 [--spanning]
     python benchmarks/inverse.py times
     python benchmarks/inverse.py grid
+    python benchmarks/inverse.py posterior --rocks 20
 
 Each adds what it measured to inverse.json and writes inverse.md from all of it; what is done of a coverage is kept,
 and goes on from there. Synthetic rocks are drawn anew in every repetition: sizes and shapes, then their true alpha, p
@@ -101,6 +102,22 @@ def times(kept: dict, rocks: int, starts: int) -> None:
         write(kept)
 
 
+def posterior(kept: dict, rocks: int) -> None:
+    """Samples of the same posterior: with compilation, but without the fit in whose maxima they begin."""
+    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
+    found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
+    begun, used = time.monotonic(), time.process_time()
+    drawn = rk.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
+    kept.setdefault("posterior", {})[f"{rocks} rocks"] = {
+        "wall": time.monotonic() - begun,
+        "cpu": time.process_time() - used,
+        "samples": int(np.prod(drawn.samples.shape[:3])),
+        "size": float(drawn.effective_size.min()),
+        "r_hat": float(drawn.r_hat.max()),
+    }
+    write(kept)
+
+
 def grid(kept: dict, rocks: int, points: int) -> None:
     """The maximum of the likelihood by the fit, and by two grids.
 
@@ -151,6 +168,16 @@ def write(kept: dict) -> None:
             for key, row in kept["times"].items()
         ]
         lines += ["", "The first fit compiles. Where processor time is less than time, other work took the machine."]
+    if "posterior" in kept:
+        lines += ["", "## Exponential pulses, three parameters: samples of the posterior", ""]
+        lines += ["| rocks | time [s] | processor time [s] | samples kept | smallest effective size | largest R-hat |"]
+        lines += ["| --- | ---: | ---: | ---: | ---: | ---: |"]
+        lines += [
+            f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['samples']:,} | {row['size']:.0f} | "
+            f"{row['r_hat']:.4f} |"
+            for key, row in kept["posterior"].items()
+        ]
+        lines += ["", "Compilation is in it, the fit in whose maxima it begins is not."]
     if "grid" in kept:
         lines += ["", "## Beside a grid", "", *_grid_text(kept["grid"])]
     KEPT.with_suffix(".md").write_text("\n".join(lines) + "\n")
@@ -211,7 +238,7 @@ def _coverage_text(rows: list[dict]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("coverage", "times", "grid"))
+    parser.add_argument("what", choices=("coverage", "times", "grid", "posterior"))
     parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
     parser.add_argument("--repetitions", type=int, default=400)
     parser.add_argument("--scatter", type=float, default=0.1)
@@ -225,6 +252,8 @@ def main() -> None:
         coverage(kept, given.rocks or 20, given.repetitions, given.scatter, given.starts or 8, given.spanning)
     elif given.what == "times":
         times(kept, given.rocks or 100, given.starts or 64)
+    elif given.what == "posterior":
+        posterior(kept, given.rocks or 20)
     else:
         grid(kept, given.rocks or 20, given.points)
 

@@ -1,5 +1,7 @@
 """What rocks say about a motion: probabilities against counted verdicts, maxima against grids, honest refusals."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +31,12 @@ def fallen(amplitude, period, alpha, p, restitution):
 
 def overturned(**scenes):
     """The verdict on scenes given by lists that go together: no likelihood, no margin."""
-    lists = dict(zip(scenes, (np.ravel(x) for x in np.broadcast_arrays(*scenes.values()))))
-    shape = np.broadcast_shapes(*(np.shape(x) for x in scenes.values()))
-    return rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"].reshape(shape)
+    arrays = np.broadcast_arrays(*scenes.values())
+    count = arrays[0].size
+    # As many as of the largest test, over and over: one compiled program.
+    lists = {name: np.resize(x, max(count, 48_000)) for name, x in zip(scenes, arrays)}
+    found = rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"]
+    return found[:count].reshape(arrays[0].shape)
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +117,41 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
         assert ratio < 3.84 + 0.01 if is_open else abs(ratio - 3.84) < 0.3
     assert np.sum(found.open) < 4
     assert all(low <= TRUTH[name] <= high for name, (low, high) in ends.items())
+
+
+@pytest.mark.slow
+def test_a_posterior_is_that_of_a_grid():
+    pytest.importorskip("numpyro", reason="samples need NumPyro")
+    seen = rocks(truth(3))
+    found = rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, effective_size=2000)
+    assert found.status != rk.PosteriorStatus.not_converged
+    assert found.effective_size.min() > 2000 and found.r_hat.max() < 1.01
+    # Uniform in logarithms: so is the grid, of middles of cells.
+    axes = [np.linspace(np.log(float(x.low)), np.log(float(x.high)), 161) for x in UNKNOWNS.values()]
+    middles = [np.exp((axis[1:] + axis[:-1]) / 2) for axis in axes]
+    values = along(seen, amplitude=middles[0], period=middles[1])
+    weights = np.exp(values - values.max()) / np.exp(values - values.max()).sum()
+    for i, (name, axis, middle) in enumerate(zip(found.names, axes, middles)):
+        share = weights.sum(axis=1 - i)
+        mean = np.sum(share * middle)
+        sd = np.sqrt(np.sum(share * (middle - mean) ** 2))
+        error = sd / np.sqrt(float(found.effective_size[i]))
+        assert abs(float(found[name].mean()) - mean) < 4 * error
+        assert abs(float(found[name].std()) / sd - 1) < 0.3  # most of it may come from a lobe of one in a thousand
+        for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+            level = np.exp(np.interp(probability, np.append(0, np.cumsum(share)), axis))
+            within = float(np.mean(found[name] < level))
+            expected = 4 * np.sqrt(probability * (1 - probability) / float(found.effective_size[i]))
+            assert abs(within - probability) < expected + 0.002
+    top = values.max()
+    assert top - 0.1 < float(found.log_density.max()) <= float(found.estimate.log_likelihood) + 1e-6
+
+
+def test_samples_need_numpyro_and_good_arguments(monkeypatch):
+    seen = rocks(["survived"] * 12)
+    monkeypatch.setitem(sys.modules, "numpyro.infer", None)
+    with pytest.raises(ImportError, match=r"jaxrock\[posterior\]"):
+        rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER)
 
 
 def test_survivors_bound_from_above_only():
