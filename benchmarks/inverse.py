@@ -125,9 +125,9 @@ def grid(kept: dict, rocks: int, points: int) -> None:
     maximum wherever that lies between its points: its spacing comes from the covariance at the maximum. Of that grid
     only the points around the maximum are computed.
     """
-    seen = synthetic(rocks, np.random.default_rng(4), 0.2)
-    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.2, starts=16, progress=False)
-    problem = Problem(rk.Likelihood(seen, rk.SinePulse, 0.2), unknowns())
+    seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
+    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.1, starts=16, progress=False)
+    problem = Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns())
     density = jax.jit(lambda problem, places: problem.log_density(places, slopes=False))
     low, high = np.asarray(problem.ends).T
 

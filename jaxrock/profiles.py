@@ -138,7 +138,7 @@ class _Sides:
                 rows.append(_Row(places[i, j], np.sqrt(2 * max(self.best - values[i], 0.0)), places[i]))
 
     def _nearby(self, j: int, value: float, reach: float, otherwise: np.ndarray) -> np.ndarray:
-        """The best place known with parameter `j` within reach of a value, farther from others than the last."""
+        """The best place known with parameter `j` nearer to a value than to that of a row so far away."""
         places, values = self.evaluate.known
         near = np.abs(places[:, j] - value) <= reach / 2
         return places[near][np.argmax(values[near])] if near.any() else otherwise
