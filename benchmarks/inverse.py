@@ -1,13 +1,15 @@
 """What the inverse estimates are worth: coverage of intervals, errors, times, and the fit beside a brute-force grid.
 
-    python benchmarks/inverse.py coverage --repetitions 400
+    python benchmarks/inverse.py coverage --repetitions 400 [--spanning]
     python benchmarks/inverse.py times
     python benchmarks/inverse.py grid
+    python benchmarks/inverse.py posterior --rocks 20
 
 Each adds what it measured to inverse.json and writes inverse.md from all of it; what is done of a coverage is kept,
 and goes on from there. Synthetic rocks are drawn anew in every repetition: sizes and shapes, then their true alpha, p
 and the factor on the motion at each of them, by the same rules by which the likelihood takes them to scatter. Truth is
-judged by the verdict of `outcome` alone.
+judged by the verdict of `outcome` alone. Rocks that span the boundary are those, of many drawn like this, that stand
+under 3/4 of the true amplitude and fall under 4/3 of it, as they are stated.
 """
 
 import argparse
@@ -20,7 +22,7 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.likelihood import NODES
-from jaxrock.problem import Evaluator, Problem
+from jaxrock.problem import Problem
 
 TRUTH = {"amplitude": 0.35, "period": 0.8}
 KEPT = Path(__file__).with_suffix(".json")
@@ -35,29 +37,33 @@ def _fallen(alpha, p, amplitude, period):
     return {"fallen": rk.outcome(rk.Block(alpha, p), rk.SinePulse(amplitude, period)).overturned}
 
 
-def synthetic(count: int, rng: np.random.Generator, scatter: float) -> rk.Observations:
+def fallen(alpha: np.ndarray, p: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """The verdict on rocks under so many times the true motion."""
+    lists = {"alpha": alpha, "p": p, "amplitude": TRUTH["amplitude"] * factor}
+    lists["period"] = np.full(alpha.size, TRUTH["period"])
+    return rk.sweep(_fallen, outer=False, progress=False, **lists).values["fallen"]
+
+
+def synthetic(count: int, rng: np.random.Generator, scatter: float, spanning: bool = False) -> rk.Observations:
     """Rocks of many shapes and sizes, and what became of them."""
-    alpha, p = rng.uniform(0.08, 0.35, count), rng.uniform(1.8, 5.0, count)
+    drawn = 20 * count if spanning else count
+    alpha, p = rng.uniform(0.08, 0.35, drawn), rng.uniform(1.8, 5.0, drawn)
+    if spanning:
+        falls = [fallen(alpha, p, np.full(drawn, factor)) for factor in (3 / 4, 4 / 3)]
+        kept = np.flatnonzero(~falls[0] & falls[1])[:count]
+        alpha, p = alpha[kept], p[kept]
     e = rng.normal(size=(3, count))
-    found = rk.sweep(
-        _fallen,
-        outer=False,
-        progress=False,
-        alpha=alpha * np.exp(0.03 * e[0]),
-        p=p * np.exp(0.02 * e[1]),
-        amplitude=TRUTH["amplitude"] * np.exp(scatter * e[2]),
-        period=np.full(count, TRUTH["period"]),
-    )
-    words = ["toppled" if x else "survived" for x in found.values["fallen"]]
+    lost = fallen(alpha * np.exp(0.03 * e[0]), p * np.exp(0.02 * e[1]), np.exp(scatter * e[2]))
+    words = ["toppled" if x else "survived" for x in lost]
     return rk.Observations(alpha, p, words, alpha_sd=0.03 * alpha, p_sd=0.02 * p)
 
 
-def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: int) -> None:
+def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: int, spanning: bool) -> None:
     """Fit until there are so many repetitions; a number seeds each, so that they can go on later."""
-    key = f"{rocks} rocks, scatter {scatter:g}, {starts} starts"
+    key = f"{rocks} rocks{' that span the boundary' if spanning else ''}, scatter {scatter:g}, {starts} starts"
     rows = kept.setdefault("coverage", {}).setdefault(key, [])
     for number in range(len(rows), repetitions):
-        seen = synthetic(rocks, np.random.default_rng([number, rocks]), scatter)
+        seen = synthetic(rocks, np.random.default_rng([number, rocks]), scatter, spanning)
         begun = time.process_time()
         found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), scatter, starts=starts, progress=False)
         # The first one compiles.
@@ -76,40 +82,74 @@ def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: i
             write(kept)
 
 
-def times(kept: dict, rocks: int, starts: int) -> None:
-    """A full fit of an exponential pulse, three parameters: with compilation, then without."""
-    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
-    three = {
+def three() -> dict[str, rk.Unknown]:
+    """What is looked for of an exponential pulse."""
+    return {
         "amplitude": rk.Unknown(0.05, 2.0),
         "duration": rk.Unknown(0.1, 3.0),
         "shape": rk.Unknown(-6, 6, log=False),
     }
+
+
+def times(kept: dict, rocks: int, starts: int) -> None:
+    """A full fit of an exponential pulse, three parameters: with compilation, then without."""
+    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
     for name in ("first", "again"):
         begun, used = time.monotonic(), time.process_time()
-        found = rk.estimate_motion(seen, rk.ExponentialPulse, three, 0.2, starts=starts, progress=False)
+        found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=starts, progress=False)
         row = {"wall": time.monotonic() - begun, "cpu": time.process_time() - used, "responses": found.responses}
         kept.setdefault("times", {})[f"{rocks} rocks, {starts} starts, {name}"] = row
         write(kept)
 
 
+def posterior(kept: dict, rocks: int) -> None:
+    """Samples of the same posterior: with compilation, but without the fit in whose maxima they begin."""
+    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
+    found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
+    begun, used = time.monotonic(), time.process_time()
+    drawn = rk.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
+    kept.setdefault("posterior", {})[f"{rocks} rocks"] = {
+        "wall": time.monotonic() - begun,
+        "cpu": time.process_time() - used,
+        "samples": int(np.prod(drawn.samples.shape[:3])),
+        "size": float(drawn.effective_size.min()),
+        "r_hat": float(drawn.r_hat.max()),
+    }
+    write(kept)
+
+
 def grid(kept: dict, rocks: int, points: int) -> None:
-    """The maximum of the likelihood by the fit, and by a grid that is refined around its best point."""
-    seen = synthetic(rocks, np.random.default_rng(4), 0.2)
-    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.2, starts=16, progress=False)
-    evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.2), unknowns()))
-    low, high = (x.copy() for x in evaluate.ends)
-    for _ in range(9):
-        axes = [np.linspace(a, b, points) for a, b in zip(low, high)]
+    """The maximum of the likelihood by the fit, and by two grids.
+
+    A plain one of so many points along each axis. And one so fine that its best point is no more than 1e-6 below the
+    maximum wherever that lies between its points: its spacing comes from the covariance at the maximum. Of that grid
+    only the points around the maximum are computed.
+    """
+    seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
+    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.1, starts=16, progress=False)
+    problem = Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns())
+    density = jax.jit(lambda problem, places: problem.log_density(places, slopes=False))
+    low, high = np.asarray(problem.ends).T
+
+    def best(axes):
         places = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=1)
-        values = evaluate(evaluate.points(places))[0]
-        best, size = places[np.argmax(values)], (high - low) / 5
-        low, high = np.maximum(best - size, evaluate.ends[0]), np.minimum(best + size, evaluate.ends[1])
+        parts = places.reshape(-1, places.shape[0] // points, places.shape[1])
+        return max(float(density(problem, part).max()) for part in parts)
+
+    plain = best([np.linspace(a, b, points) for a, b in zip(low, high)])
+    curvature = np.linalg.inv(np.asarray(found.covariance))
+    spacing = 2 * np.sqrt(2e-6 / curvature.sum())  # from the middle of a cell to its corners 1e-6
+    summit = np.log(np.asarray(found.values))
+    near = [a + spacing * (np.round((x - a) / spacing) + np.arange(points) - points // 2) for a, x in zip(low, summit)]
     kept["grid"] = {
         "rocks": rocks,
+        "points": points,
         "fit": float(found.log_likelihood),
-        "grid": float(values.max()),
+        "plain": plain,
+        "fine": best(near),
         "fit_points": found.responses // (NODES * rocks),
-        "grid_points": evaluate.count,
+        "fine_points": float(np.prod((high - low) / spacing)),
+        "spacing": float(spacing),
     }
     write(kept)
 
@@ -128,16 +168,38 @@ def write(kept: dict) -> None:
             for key, row in kept["times"].items()
         ]
         lines += ["", "The first fit compiles. Where processor time is less than time, other work took the machine."]
-    if "grid" in kept:
-        row = kept["grid"]
+    if "posterior" in kept:
+        lines += ["", "## Exponential pulses, three parameters: samples of the posterior", ""]
+        lines += ["| rocks | time [s] | processor time [s] | samples kept | smallest effective size | largest R-hat |"]
+        lines += ["| --- | ---: | ---: | ---: | ---: | ---: |"]
         lines += [
-            "",
-            "## Beside a grid",
-            "",
-            f"{row['rocks']} rocks: the fit reached a log-likelihood of {row['fit']:.9f} with {row['fit_points']:,} "
-            f"points, intervals included; a grid refined eight times {row['grid']:.9f} with {row['grid_points']:,}.",
+            f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['samples']:,} | {row['size']:.0f} | "
+            f"{row['r_hat']:.4f} |"
+            for key, row in kept["posterior"].items()
         ]
+        lines += ["", "Compilation is in it, the fit in whose maxima it begins is not."]
+    if "grid" in kept:
+        lines += ["", "## Beside a grid", "", *_grid_text(kept["grid"])]
     KEPT.with_suffix(".md").write_text("\n".join(lines) + "\n")
+
+
+def _grid_text(row: dict) -> list[str]:
+    plain, fine = row["points"] ** 2, row["fine_points"]
+    return [
+        f"{row['rocks']} rocks and a sine pulse; log-likelihoods of the best point, and the points that it took "
+        f"({NODES} responses a rock each):",
+        "",
+        "| | log-likelihood | below the best | points | fit's share of them |",
+        "| --- | ---: | ---: | ---: | ---: |",
+        f"| fit, with its intervals | {row['fit']:.7f} | {max(row['fine'], row['plain']) - row['fit']:+.1e} | "
+        f"{row['fit_points']:,} | |",
+        f"| plain grid, {row['points']} x {row['points']} | {row['plain']:.7f} | {row['fit'] - row['plain']:.1e} | "
+        f"{plain:,} | 1/{plain / row['fit_points']:.0f} |",
+        f"| grid for 1e-6, steps of {100 * row['spacing']:.2g} % | {row['fine']:.7f} | "
+        f"{row['fit'] - row['fine']:.1e} | {fine:.2g} | 1/{fine / row['fit_points']:.2g} |",
+        "",
+        f"Of the last grid the {plain:,} points around the maximum were computed; the number is that of all.",
+    ]
 
 
 def _coverage_text(rows: list[dict]) -> list[str]:
@@ -176,19 +238,22 @@ def _coverage_text(rows: list[dict]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("coverage", "times", "grid"))
+    parser.add_argument("what", choices=("coverage", "times", "grid", "posterior"))
     parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
     parser.add_argument("--repetitions", type=int, default=400)
     parser.add_argument("--scatter", type=float, default=0.1)
     parser.add_argument("--starts", type=int, help="default 8; 64 for times")
-    parser.add_argument("--points", type=int, default=24)
+    parser.add_argument("--spanning", action="store_true", help="rocks near the boundary")
+    parser.add_argument("--points", type=int, default=256, help="of the plain grid, along each axis")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     kept = json.loads(KEPT.read_text()) if KEPT.exists() else {}
     if given.what == "coverage":
-        coverage(kept, given.rocks or 20, given.repetitions, given.scatter, given.starts or 8)
+        coverage(kept, given.rocks or 20, given.repetitions, given.scatter, given.starts or 8, given.spanning)
     elif given.what == "times":
         times(kept, given.rocks or 100, given.starts or 64)
+    elif given.what == "posterior":
+        posterior(kept, given.rocks or 20)
     else:
         grid(kept, given.rocks or 20, given.points)
 

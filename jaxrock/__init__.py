@@ -62,6 +62,7 @@ from jaxrock.models import Equation as Equation, Housner as Housner, Linear as L
 from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
 from jaxrock.observation_files import read_observations as read_observations
 from jaxrock.observations import Observations as Observations
+from jaxrock.posterior import Posterior as Posterior, PosteriorStatus as PosteriorStatus, sample_motion as sample_motion
 from jaxrock.problem import Unknown as Unknown
 from jaxrock.pulses import (
     CosinePulse as CosinePulse,

@@ -24,7 +24,10 @@ from jaxrock.profiles import Profile, Shape, profile, shape_at
 
 Real = Inexact[Array, "..."]
 
-_RETRIES = 15  # starts with another scatter
+_SCREENED = 4  # points for each start, of which the best are taken
+_LEAST_SCREENED = 64
+_AROUND = 0.15  # of the ranges
+_RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
 _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
@@ -101,6 +104,7 @@ def estimate_motion(
     unknowns: dict[str, Unknown],
     scatter: ArrayLike = 0.3,
     *,
+    lapse: ArrayLike = 0.02,
     starts: int = 64,
     model: Model = Housner(),
     engine: AbstractEngine | None = None,
@@ -114,9 +118,10 @@ def estimate_motion(
     - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
       own.
     - `unknowns`: an `Unknown` for each of these parameters.
-    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; see `Likelihood`. It is not
-      estimated.
-    - `starts`: points spread over the ranges from which the maximum is looked for, at least 1.
+    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
+      observation says nothing; see `Likelihood`. They are not estimated.
+    - `starts`: points from which the maximum is looked for, at least 1: the best of four times as many, spread over the
+      ranges.
     - `model`, `engine`: as in `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -128,10 +133,10 @@ def estimate_motion(
         raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
     if not unknowns:
         raise ValueError("Argument `unknowns` must name at least one parameter.")
-    problem = Problem(Likelihood(observations, motion, scatter, model, engine), dict(unknowns))
-    bar = Progress(starts * 80, "fit", progress)
+    problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
+    bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
-    found = climb(evaluate, evaluate.points(_spread(starts, evaluate)))
+    found = climb(evaluate, _starts(starts, evaluate))
     for _ in range(3):
         best = int(np.argmax(found.values))
         shape = shape_at(evaluate, found.points[best])
@@ -144,6 +149,17 @@ def estimate_motion(
     result = _conclude(evaluate, found, shape, profiled)
     bar.add(bar.total - bar.done)
     return result
+
+
+def _starts(count: int, evaluate: Evaluator) -> np.ndarray:
+    """The best of several times as many points that are spread over the ranges; first those that are best around."""
+    places = _spread(max(_SCREENED * count, _LEAST_SCREENED), evaluate)
+    order = np.argsort(-evaluate.at(places)[0], kind="stable")
+    low, high = evaluate.ends
+    share = (places[order] - low) / (high - low)
+    near = np.max(np.abs(share[:, None] - share[None]), axis=2) < _AROUND
+    beside = np.tril(near, -1).any(axis=1)
+    return evaluate.points(places[np.concatenate([order[~beside], order[beside]])[:count]])
 
 
 def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
@@ -162,7 +178,7 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
     places = jnp.asarray(evaluate.places(found.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     values = {name: x[best] for name, x in problem.values(places).items()}
-    stands, *facts = evaluate.facts(found.points[best])
+    stands, *facts = evaluate.facts(evaluate.places(found.points[best]))
     surprise = _surprise(facts)
     probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
     remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
@@ -218,10 +234,10 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         scatter = evaluate.problem.likelihood.scatter * factor
         problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
         again = Evaluator(problem)
-        starts = np.concatenate([point[None], again.points(_spread(_RETRIES, again))])
+        starts = np.concatenate([point[None], _starts(_RETRIES, again)])
         found = climb(again, starts)
         evaluate.count += again.count
-        if _surprise(again.facts(found.points[np.argmax(found.values)])[1:]) <= _SURPRISED:
+        if _surprise(again.facts(again.places(found.points[np.argmax(found.values)]))[1:]) <= _SURPRISED:
             return float(scatter)
     return np.inf
 

@@ -17,8 +17,8 @@ moves it most (a larger amplitude, a slenderer or a smaller rock all act alike),
     P(stands) = sum_k w_k Phi(y_k/s_k),
 
 over the quarter points of the 12 intervals, with y a function of the margin that is nearly straight in ln amplitude,
-w_k the normal probability, and s_k a little over a quarter of what y changes by from node to node: a probit that smears
-each interval just so far that the sum is smooth. Beyond the last nodes, 3.6 standard deviations away, y goes on
+w_k the normal probability, and s_k half of what y changes by from node to node: a probit that smears each interval so
+far that the sum is smooth. Beyond the last nodes, 3.6 standard deviations away, y goes on
 straight, so that an observation that is all but impossible still says in which direction it is less so. The nodes also
 lie off the main direction, in such a pattern that all four add their variance. Detail below about 0.3 scatter is not
 resolved. No derivatives are needed for the likelihood, and only first ones for its slope.
@@ -38,7 +38,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import positive, put_down
+from jaxrock._checks import checked, positive, put_down
 from jaxrock.asymmetric import AsymmetricBlock
 from jaxrock.block import Block
 from jaxrock.engine import AbstractEngine
@@ -52,7 +52,7 @@ Real = Inexact[Array, "..."]
 NODES = 13  # scenes that are computed for each rock
 _NODES = np.arange(NODES) - NODES // 2
 _APART = 0.6  # distance of nodes, in standard deviations
-_SMEAR = 0.28  # of the difference between nodes
+_SMEAR = 0.5  # of the difference between nodes
 _LEAST_WIDTH = 1e-3
 _LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the last nodes
 _END_WIDTH = 0.1  # of y there, so that the probability is smooth
@@ -112,12 +112,16 @@ class Likelihood(eqx.Module):
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
+    - `lapse`: probability that what was seen of a rock says nothing, in [0, 1): somebody moved it, it was misjudged, or
+      it stands in a gap between two ways of overturning that is too narrow to be resolved. One rock can then speak
+      against a motion no more strongly than 2/lapse to 1.
 
     **Raises:** ValueError for a value outside its range.
     """
 
     observations: Observations
     scatter: Real
+    lapse: Real
     motion: Callable = eqx.field(static=True)
     model: Model
     engine: AbstractEngine | None
@@ -129,17 +133,18 @@ class Likelihood(eqx.Module):
         scatter: ArrayLike = 0.3,
         model: Model = Housner(),
         engine: AbstractEngine | None = None,
+        lapse: ArrayLike = 0.02,
     ):
         self.observations, self.motion, self.model, self.engine = observations, motion, model, engine
         self.scatter = positive("scatter", scatter)
+        self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
 
     def log_terms(self, values: dict[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
         For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
-        [1/rad]. It has first derivatives if `slopes`, and is computed faster without; those of second order
-        that JAX would give are wrong (take differences of slopes). Many motions at once take less time than `jax.vmap`
-        of one.
+        [1/rad]. It has first derivatives if `slopes`, and is computed faster without; those of second order raise
+        NotImplementedError (take differences of slopes). Many motions at once take less time than `jax.vmap` of one.
         """
         return self._terms(self._possible(values, slopes))
 
@@ -152,7 +157,12 @@ class Likelihood(eqx.Module):
         ends = jnp.full_like(density[:1], _FLAT)
         density = jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0)
         stands, topples = possible.log_probability(True, density), possible.log_probability(False)
-        return jnp.where(seen.seen == TOPPLED, topples, stands)
+        found = jnp.where(seen.seen == TOPPLED, topples, stands)
+        return self._or_lapse(found, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
+
+    def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
+        """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
+        return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
 
     def survival(self, values: dict[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks)."""
@@ -173,7 +183,8 @@ class Likelihood(eqx.Module):
 
     def _surprise(self, nodes: "_Possible") -> tuple[Real, Real, Real]:
         seen = self.observations
-        stands, topples = (jnp.maximum(nodes.log_probability(which), -1e3) for which in (True, False))
+        both = (self._or_lapse(nodes.log_probability(which)) for which in (True, False))
+        stands, topples = (jnp.maximum(x, -1e3) for x in both)
         share, lost = jnp.exp(stands), jnp.exp(topples)
         badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
         mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2
@@ -215,8 +226,31 @@ class Likelihood(eqx.Module):
         fixed = jax.lax.stop_gradient(parameters)
         rows, (real, lost, known) = jax.vmap(one)(fixed, *scenes)
         if slopes:
-            real += jnp.sum(jnp.where(jnp.isfinite(rows), rows, 0.0) * (parameters - fixed)[:, None], axis=-1)
+            real = _sloping(real, jnp.where(jnp.isfinite(rows), rows, 0.0), parameters)
         return _Possible.of(*(jnp.moveaxis(x.reshape(shape), -3, 0) for x in (*real.T, lost, known)))
+
+
+@jax.custom_jvp
+def _sloping(values: Real, rows: Real, parameters: Real) -> Real:
+    """Values, (..., results), with the rows of their Jacobian by parameters, (..., results, parameters)."""
+    return values
+
+
+@_sloping.defjvp
+def _(primals, tangents):
+    values, rows, parameters = primals
+    return values, jnp.einsum("...ij,...j->...i", _constant(rows, parameters), tangents[2])
+
+
+@jax.custom_jvp
+def _constant(rows: Real, parameters: Real) -> Real:
+    """Rows that are known at these parameters only."""
+    return rows
+
+
+@_constant.defjvp
+def _(primals, tangents):
+    raise NotImplementedError("A likelihood has first derivatives only: for second ones take differences of slopes.")
 
 
 class _Possible(NamedTuple):

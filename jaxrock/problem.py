@@ -14,7 +14,6 @@ from jaxrock.likelihood import Likelihood
 Real = Inexact[Array, "..."]
 
 _LANES = 4  # points in one call of the compiled program
-_NEAR = 1e-4  # of a range: nearer to its ends nobody goes
 
 
 class Unknown(eqx.Module):
@@ -60,10 +59,7 @@ class Unknown(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """A likelihood and the parameters that are unknown in it, in the coordinates in which they are searched.
-
-    Points are logits of the place in each range, so that all of space is allowed.
-    """
+    """A likelihood and the parameters that are unknown in it; places are their logarithms, or they themselves."""
 
     likelihood: Likelihood
     unknowns: dict[str, Unknown]
@@ -78,17 +74,6 @@ class Problem(eqx.Module):
         """Ranges of the places: logarithms of parameters, or parameters themselves."""
         return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
 
-    def places(self, points: Real) -> Real:
-        """Places of points, (..., parameters)."""
-        low, high = self.ends.T
-        return low + (high - low) * jax.nn.sigmoid(points)
-
-    def points(self, places: Real) -> Real:
-        """Points of places, which are kept off the very ends."""
-        low, high = self.ends.T
-        share = jnp.clip((places - low) / (high - low), _NEAR, 1 - _NEAR)
-        return jnp.log(share) - jnp.log1p(-share)
-
     def values(self, places: Real) -> dict[str, Real]:
         """Parameters by name."""
         return {
@@ -100,53 +85,64 @@ class Problem(eqx.Module):
         """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
         return sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
 
-    def log_density(self, points: Real) -> Real:
-        """Log-likelihood and log-prior (by the places) at points, (..., parameters); with first derivatives."""
-        places = self.places(points)
-        return jnp.sum(self.likelihood.log_terms(self.values(places)), axis=-1) + self.log_prior(places)
+    def log_density(self, places: Real, slopes: bool = True) -> Real:
+        """Log-likelihood and log-prior (by the places) at places, (..., parameters); with first derivatives."""
+        terms = self.likelihood.log_terms(self.values(places), slopes)
+        return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
 
 @eqx.filter_jit
-def _batch(problem: Problem, points: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
-    def density(points):
-        places = problem.places(points)
+def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
+    def density(places):
         terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
         return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
 
-    # The points do not depend on one another, so that the slopes of the sum are those of each.
-    value, back, facts = jax.vjp(density, points, has_aux=True)
+    # The places do not depend on one another, so that the slopes of the sum are those of each.
+    value, back, facts = jax.vjp(density, places, has_aux=True)
     return value, back(jnp.ones_like(value))[0], facts
 
 
 class Evaluator:
-    """Values and slopes at any number of points, in batches of one compiled program; it counts."""
+    """Values and slopes at any number of points, in batches of one compiled program; it counts.
+
+    Points are angles, with places at low + (high - low) (1 + sin angle)/2: all of space is allowed, and a maximum at
+    the end of a range is one like others, where the slope vanishes and the curvature does not.
+    """
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
         self.problem, self.count, self.progress = problem, 0, progress
         self.ends = np.asarray(problem.ends).T
+        self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, slopes = self.at(self.places(points))
+        low, high = self.ends
+        return values, slopes * (high - low) * np.cos(points) / 2
+
+    def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and slopes at places, and by them."""
         found = []
-        for begin in range(0, len(points), _LANES):
-            part = points[begin : begin + _LANES]
+        for begin in range(0, len(places), _LANES):
+            part = places[begin : begin + _LANES]
             padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
             found.append([np.asarray(x)[: len(part)] for x in _batch(self.problem, padded)[:2]])
             self.progress(len(part))
-        self.count += len(points)
-        return tuple(np.concatenate(x) for x in zip(*found))
+        self.count += len(places)
+        values, slopes = (np.concatenate(x) for x in zip(*found))
+        self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
+        return values, slopes
 
-    def facts(self, point: np.ndarray) -> tuple[np.ndarray, ...]:
-        """`survival` and `surprise` of the likelihood at a point, (rocks,) each."""
+    def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
+        """`survival` and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
-        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(point, (_LANES, 1)))[2])
+        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(place, (_LANES, 1)))[2])
 
     def places(self, points: np.ndarray) -> np.ndarray:
-        """As of the problem; outside JAX, which would compile it for every number of points."""
+        """Places of points."""
         low, high = self.ends
-        return low + (high - low) / (1 + np.exp(-points))
+        return low + (high - low) * (1 + np.sin(points)) / 2
 
     def points(self, places: np.ndarray) -> np.ndarray:
-        """As of the problem."""
+        """Points of places, and of those outside the ranges the points at their ends."""
         low, high = self.ends
-        share = np.clip((places - low) / (high - low), _NEAR, 1 - _NEAR)
-        return np.log(share) - np.log1p(-share)
+        return np.arcsin(np.clip(2 * (places - low) / (high - low) - 1, -1.0, 1.0))

@@ -9,7 +9,7 @@ from jaxrock.problem import Evaluator
 
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _ROOT = np.sqrt(2 * _RATIO)
-_NEAR = 1e-4  # of a range, from its end
+_AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
 
 class Shape(NamedTuple):
@@ -25,17 +25,14 @@ def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
     """The Hessian by differences of slopes over a third of a standard deviation: on a finer scale there are steps."""
     place = evaluate.places(point)
     low, high = evaluate.ends
-    size = high - low
-    step = np.full(place.size, 0.02)  # of the range
+    size, count = high - low, place.size
+    step = np.full(count, 0.02)  # of the range
     for _ in range(2):
         moves = np.concatenate([np.diag(step), -np.diag(step)]) * size
-        at = evaluate.points(np.clip(place + moves, low, high))
-        at_places = evaluate.places(at)
-        share = (at_places - low) / size
-        slopes = evaluate(at)[1] / (share * (1 - share))  # by places in ranges
-        half = place.size
-        distance = np.diagonal(at_places[:half] - at_places[half:]) / size
-        hessian = (slopes[:half] - slopes[half:]) / np.maximum(distance, 1e-12)[:, None]
+        at = np.clip(place + moves, low, high)
+        slopes = evaluate.at(at)[1] * size
+        distance = np.diagonal(at[:count] - at[count:]) / size
+        hessian = (slopes[:count] - slopes[count:]) / np.maximum(distance, 1e-12)[:, None]
         hessian = -(hessian + hessian.T) / 2
         spread = 1 / np.sqrt(np.maximum(np.diagonal(hessian), 1e-6))
         step = np.clip(spread / 3, 1e-4, 0.05)
@@ -71,14 +68,15 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
     root of the likelihood ratio, which is nearly straight, by secants in the outermost bracket.
     """
     low, high = evaluate.ends
-    size, near = high - low, _NEAR * (high - low)
+    size = high - low
     sides = _Sides(evaluate, found.values.max(), shape.place)
     variance = np.diagonal(shape.covariance)
     spread = np.minimum(np.sqrt(np.where(np.isfinite(variance), variance, np.inf)), size / 8)
     for multiple in (1.0, 2.0, 3.5, np.inf):
         values = [shape.place[j] + s * multiple * spread[j] for j, s in sides.rows]
-        inside = [np.clip(v, low[j] + near[j], high[j] - near[j]) for v, (j, _) in zip(values, sides.rows)]
+        inside = [np.clip(v, low[j], high[j]) for v, (j, _) in zip(values, sides.rows)]
         sides.follow(dict(zip(sides.rows, inside)))
+    sides.recall()
     for _ in range(4):
         brackets = {side: sides.bracket(side) for side in sides.rows}
         sides.follow({side: _secant(*pair, 0.05) for side, pair in brackets.items() if pair is not None})
@@ -87,9 +85,6 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
         pair = sides.bracket((j, s))
         if pair is not None:
             ends[j, (s + 1) // 2], open_[j, (s + 1) // 2] = _secant(*pair, 0.0), False
-    others = evaluate.places(found.points[found.values > sides.best - _RATIO])
-    ends[:, 0] = np.minimum(ends[:, 0], others.min(axis=0))
-    ends[:, 1] = np.maximum(ends[:, 1], others.max(axis=0))
     better = sides.highest[1] if sides.highest[0] > sides.best + 1e-6 else None
     return Profile(ends, open_, better, min(sides.lowest, found.values.min()))
 
@@ -109,23 +104,44 @@ class _Sides:
         self.highest, self.lowest = (-np.inf, None), np.inf
 
     def follow(self, wanted: dict[tuple[int, int], float]) -> None:
-        """Climb with one parameter held at a value, from the nearest place that is known; for each of some sides."""
+        """Climb with one parameter held at a value, for each of some sides: from the nearest place on the profile, and
+        from the best of all places nearby."""
         if not wanted:
             return
         begin, free = [], []
-        for side, value in wanted.items():
-            nearest = min(self.rows[side], key=lambda row: abs(row.value - value))
-            held = np.arange(nearest.place.size) == side[0]
-            begin.append(np.where(held, value, nearest.place))
-            free.append(~held)
-        points = self.evaluate.points(np.array(begin))
+        for (j, s), value in wanted.items():
+            nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
+            for place in (nearest.place, self._nearby(j, value, abs(nearest.value - value), nearest.place)):
+                held = np.arange(place.size) == j
+                begin.append(np.where(held, value, place))
+                free.append(~held)
+        low, high = self.evaluate.ends
+        inner = np.clip(begin, low + _AWAY * (high - low), high - _AWAY * (high - low))
+        points = self.evaluate.points(np.where(free, inner, begin))
         reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-4, together=False)
-        places = self.evaluate.places(reached.points)
-        for side, place, value in zip(wanted, places, reached.values):
-            self.rows[side].append(_Row(place[side[0]], np.sqrt(2 * max(self.best - value, 0.0)), place))
-        top = int(np.argmax(reached.values))
-        self.highest = max(self.highest, (reached.values[top], reached.points[top]), key=lambda pair: pair[0])
-        self.lowest = min(self.lowest, reached.values.min())
+        places, values = self.evaluate.places(reached.points), reached.values
+        for number, (side, value) in enumerate(wanted.items()):
+            best = 2 * number + int(values[2 * number + 1] > values[2 * number])
+            self.rows[side].append(_Row(value, np.sqrt(2 * max(self.best - values[best], 0.0)), places[best]))
+        top = int(np.argmax(values))
+        self.highest = max(self.highest, (values[top], reached.points[top]), key=lambda pair: pair[0])
+        self.lowest = min(self.lowest, values.min())
+
+    def recall(self) -> None:
+        """Add to each side the outermost of all known places that are within 95 %: it may lie beyond a valley."""
+        places, values = self.evaluate.known
+        within = values > self.best - _RATIO
+        places, values = places[within], values[within]
+        for (j, s), rows in self.rows.items():
+            if values.size:
+                i = np.argmax(s * places[:, j])
+                rows.append(_Row(places[i, j], np.sqrt(2 * max(self.best - values[i], 0.0)), places[i]))
+
+    def _nearby(self, j: int, value: float, reach: float, otherwise: np.ndarray) -> np.ndarray:
+        """The best place known with parameter `j` nearer to a value than to that of a row so far away."""
+        places, values = self.evaluate.known
+        near = np.abs(places[:, j] - value) <= reach / 2
+        return places[near][np.argmax(values[near])] if near.any() else otherwise
 
     def bracket(self, side: tuple[int, int]) -> tuple[_Row, _Row] | None:
         """The outermost neighbours between which the root passes 1.96; None if the last is below it."""

@@ -1,5 +1,7 @@
 """What rocks say about a motion: probabilities against counted verdicts, maxima against grids, honest refusals."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +31,12 @@ def fallen(amplitude, period, alpha, p, restitution):
 
 def overturned(**scenes):
     """The verdict on scenes given by lists that go together: no likelihood, no margin."""
-    lists = dict(zip(scenes, (np.ravel(x) for x in np.broadcast_arrays(*scenes.values()))))
-    shape = np.broadcast_shapes(*(np.shape(x) for x in scenes.values()))
-    return rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"].reshape(shape)
+    arrays = np.broadcast_arrays(*scenes.values())
+    count = arrays[0].size
+    # As many as of the largest test, over and over: one compiled program.
+    lists = {name: np.resize(x, max(count, 48_000)) for name, x in zip(scenes, arrays)}
+    found = rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"]
+    return found[:count].reshape(arrays[0].shape)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +56,7 @@ def verdicts():
 def test_probabilities_are_shares_of_verdicts(verdicts):
     seen, motions, shares = verdicts
     evaluate = evaluator(seen)
-    found = np.array([evaluate.facts(point)[0] for point in evaluate.points(np.log(motions))])
+    found = np.array([evaluate.facts(place)[0] for place in np.log(motions)])
     unsure = (shares > 0.02) & (shares < 0.98)
     assert unsure.sum() > 12
     assert np.max(np.abs(found - shares)) < 0.12
@@ -67,7 +72,8 @@ def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
     words = ["survived", "toppled", "rotation"] * 4
     evaluate = evaluator(rocks(["survived"] * 12))
     weak = evaluate.points(np.log([[0.05001, 0.21]]))
-    assert abs(evaluate(weak)[0][0]) < 1e-12
+    assert abs(evaluate(weak)[0][0] - 12 * np.log(0.99)) < 1e-12  # one in a hundred is wrong about it
+    assert abs(evaluator(rocks(["toppled"] * 12))(weak)[0][0] - 12 * np.log(0.01)) < 1e-9
     evaluate = evaluator(rocks(words, rotation=0.05, rotation_sd=0.01))
     points = np.random.default_rng(1).normal(size=(4, 2)) * 0.7
     steps = 1e-6 * np.eye(2)
@@ -76,31 +82,76 @@ def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
     np.testing.assert_allclose(evaluate(points)[1], differences, rtol=1e-4, atol=1e-4)
 
 
+def test_second_derivatives_are_refused():
+    likelihood = rk.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.eval_shape(
+            jax.hessian(lambda x: likelihood.log_terms(dict(amplitude=x[0], period=x[1])).sum()), jnp.ones(2)
+        )
+
+
 def truth(seed, scatter=SCATTER):
     """What twelve rocks do under the true motion, with all that scatters."""
     e = np.random.default_rng(seed).normal(size=(3, 12))
-    blocks = rk.Block(ALPHA * np.exp(0.04 * e[0]), P * np.exp(0.02 * e[1]))
-    motion = jax.vmap(rk.SinePulse)(TRUTH["amplitude"] * np.exp(scatter * e[2]), np.full(12, TRUTH["period"]))
-    fallen = jax.jit(jax.vmap(lambda b, m: rk.outcome(b, m).overturned))(blocks, motion)
-    return ["toppled" if x else "survived" for x in np.asarray(fallen)]
+    alpha, p = ALPHA * np.exp(0.04 * e[0]), P * np.exp(0.02 * e[1])
+    size = TRUTH["amplitude"] * np.exp(scatter * e[2])
+    known = {"alpha": alpha, "p": p, "restitution": np.asarray(rk.Block(alpha, p).restitution)}
+    return ["toppled" if x else "survived" for x in overturned(amplitude=size, period=TRUTH["period"], **known)]
+
+
+def along(seen, **over):
+    """The log-likelihood over lists of both parameters, which neither climbs nor interpolates."""
+    found = rk.feasible_region(rk.Likelihood(seen, rk.SinePulse, SCATTER), over, progress=False)
+    return np.asarray(found.log_likelihood)
+
+
+def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
+    seen = rocks(truth(3))
+    found = rk.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    lists = {name: np.geomspace(float(x.low), float(x.high), 512) for name, x in UNKNOWNS.items()}
+    assert along(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
+    ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}
+    below = 2 * (float(found.log_likelihood) - along(seen, **lists | {"amplitude": ends["amplitude"]}).max(axis=1))
+    ratios = [below, 2 * (float(found.log_likelihood) - along(seen, **lists | {"period": ends["period"]}).max(axis=0))]
+    for ratio, is_open in zip(np.ravel(ratios), np.ravel(found.open)):
+        assert ratio < 3.84 + 0.01 if is_open else abs(ratio - 3.84) < 0.3
+    assert np.sum(found.open) < 4
+    assert all(low <= TRUTH[name] <= high for name, (low, high) in ends.items())
 
 
 @pytest.mark.slow
-def test_a_fit_finds_the_maximum_of_a_refined_grid():
+def test_a_posterior_is_that_of_a_grid():
+    pytest.importorskip("numpyro", reason="samples need NumPyro")
     seen = rocks(truth(3))
-    found = rk.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=24)
-    evaluate = evaluator(seen)
-    low, high = evaluate.ends[0].copy(), evaluate.ends[1].copy()
-    for _ in range(9):
-        axes = [np.linspace(a, b, 24) for a, b in zip(low, high)]
-        places = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=1)
-        values = evaluate(evaluate.points(places))[0]
-        best = places[np.argmax(values)]
-        size = (high - low) / 5
-        low, high = np.maximum(best - size, evaluate.ends[0]), np.minimum(best + size, evaluate.ends[1])
-    assert float(found.log_likelihood) >= values.max() - 1e-6
-    inside = [a <= TRUTH[name] <= b for name, (a, b) in zip(found.names, found.interval)]
-    assert all(inside)
+    found = rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, effective_size=2000)
+    assert found.status != rk.PosteriorStatus.not_converged
+    assert found.effective_size.min() > 2000 and found.r_hat.max() < 1.01
+    # Uniform in logarithms: so is the grid, of middles of cells.
+    axes = [np.linspace(np.log(float(x.low)), np.log(float(x.high)), 161) for x in UNKNOWNS.values()]
+    middles = [np.exp((axis[1:] + axis[:-1]) / 2) for axis in axes]
+    values = along(seen, amplitude=middles[0], period=middles[1])
+    weights = np.exp(values - values.max()) / np.exp(values - values.max()).sum()
+    for i, (name, axis, middle) in enumerate(zip(found.names, axes, middles)):
+        share = weights.sum(axis=1 - i)
+        mean = np.sum(share * middle)
+        sd = np.sqrt(np.sum(share * (middle - mean) ** 2))
+        error = sd / np.sqrt(float(found.effective_size[i]))
+        assert abs(float(found[name].mean()) - mean) < 4 * error
+        assert abs(float(found[name].std()) / sd - 1) < 0.3  # most of it may come from a lobe of one in a thousand
+        for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+            level = np.exp(np.interp(probability, np.append(0, np.cumsum(share)), axis))
+            within = float(np.mean(found[name] < level))
+            expected = 4 * np.sqrt(probability * (1 - probability) / float(found.effective_size[i]))
+            assert abs(within - probability) < expected + 0.002
+    top = values.max()
+    assert top - 0.1 < float(found.log_density.max()) <= float(found.estimate.log_likelihood) + 1e-6
+
+
+def test_samples_need_numpyro_and_good_arguments(monkeypatch):
+    seen = rocks(["survived"] * 12)
+    monkeypatch.setitem(sys.modules, "numpyro.infer", None)
+    with pytest.raises(ImportError, match=r"jaxrock\[posterior\]"):
+        rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER)
 
 
 def test_survivors_bound_from_above_only():
@@ -157,7 +208,7 @@ def test_regions_agree_with_verdicts():
     sure = (lost.all(axis=2) | ~lost.any(axis=2)).all(axis=-1)
     as_seen = (lost[:, :, 10] == (np.asarray(seen.seen) == 1)).all(axis=-1)
     assert (sure & as_seen).sum() >= 3 and (sure & ~as_seen).sum() > 100
-    assert np.min(found.log_likelihood[sure & as_seen]) > -0.02
+    assert np.min(found.log_likelihood[sure & as_seen]) > 12 * np.log(0.99) - 0.02
     assert np.max(found.log_likelihood[sure & ~as_seen]) < np.log(0.05)
     assert not found.allowed[sure & ~as_seen].any()
 
