@@ -170,7 +170,7 @@ def test_free_stage(spring):
 
     def stage(alpha, e, x, v):
         visit = Visit(rk.Spring(*spring).table(rk.Block(alpha, 1.0, e)), e)
-        return free_stage((visit, visit), x, v, jnp.array(True), 0.0)
+        return free_stage((visit, visit), x, v, jnp.array(True), jnp.array(0.0))
 
     follow = jax.jit(stage)
     for alpha, share, speed in [
