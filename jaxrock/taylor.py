@@ -71,13 +71,9 @@ def _total(terms: list):
 
 
 def _product(first: list, second: list, k: int):
-    """Coefficient k of a product of series, of which coefficients may be missing (zero).
-
-    The terms with the last coefficients of the second series, which are known last, are added last.
-    """
+    """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
     terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
-    late, early = terms[:2], terms[2:]
-    return sum(reversed(late), start=_total(early)) if early else sum(reversed(late)) if late else 0.0
+    return _total(terms) if terms else 0.0
 
 
 def expand(start: Start, order: int) -> Expansion:
