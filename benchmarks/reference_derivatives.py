@@ -391,6 +391,17 @@ def main():
             print(f"{len(scenes)} scenes, {time.time() - begin:.0f} s, dropped {dict(dropped)}", flush=True)
 
 
+def deviations(a, known, scene, path, rows):
+    """Relative differences of the values of a path, and of their gradients, from those that are stored."""
+    values = (path.peak, path.fastest, path.peak_time + 0 * path.peak)
+    errors = [float(abs(v / a.number(known[name]["value"]) - 1)) for v, name in zip(values, OUTPUTS)]
+    for row, value, name in zip(rows, values, OUTPUTS):
+        pairs = zip(row, known[name]["gradient"], scene.parameters)
+        floor = [(abs(b - a.number(c)), max(abs(b), abs(value / (x or 1)) * 1e-4)) for b, c, x in pairs]
+        errors += [float(e / s) for e, s in floor]
+    return errors
+
+
 def check(count=20):
     """Some of the stored scenes in 60 digits with another order and step: prints the worst relative differences."""
     samples, scenes, a = record(), json.loads(ANSWERS.read_text())["scenes"], Arithmetic(60)
@@ -401,12 +412,7 @@ def check(count=20):
             scene = Scene(a, known["model"], known["kind"], known["block"] + known["motion"], samples, 44)
             path = scene.run()
             rows, runs, worst = gradient(scene, path, -12)
-            values = (path.peak, path.fastest, path.peak_time + 0 * path.peak)
-            errors = [float(abs(v / a.number(known[name]["value"]) - 1)) for v, name in zip(values, OUTPUTS)]
-            for row, value, name in zip(rows, values, OUTPUTS):
-                pairs = zip(row, known[name]["gradient"], scene.parameters)
-                floor = [(abs(b - a.number(c)), max(abs(b), abs(value / (x or 1)) * 1e-4)) for b, c, x in pairs]
-                errors += [float(e / s) for e, s in floor]
+            errors = deviations(a, known, scene, path, rows)
             words = f"{known['model']} {known['kind']}: values and gradients {max(errors):.1e}"
             if "hessian" in known:
                 table, _ = hessian(scene, path, runs, -12)

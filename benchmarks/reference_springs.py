@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import reference_derivatives
 import reference_taylor
-from reference_derivatives import AGREE, OUTPUTS, Scene, draw, gradient, judge, record, texts
+from reference_derivatives import AGREE, OUTPUTS, Scene, deviations, draw, gradient, judge, record, texts
 from reference_motions import Arithmetic, Lines, motion
 from reference_taylor import Block, dot, respond
 
@@ -180,12 +180,7 @@ def check():
             scene = SpringScene(a, tuple(known["spring"]), known["kind"], known["block"] + known["motion"], samples, 44)
             path = scene.run()
             rows, _, _ = gradient(scene, path, -12)
-            values = (path.peak, path.fastest, path.peak_time + 0 * path.peak)
-            errors = [float(abs(v / a.number(known[name]["value"]) - 1)) for v, name in zip(values, OUTPUTS)]
-            for row, value, name in zip(rows, values, OUTPUTS):
-                pairs = zip(row, known[name]["gradient"], scene.parameters)
-                floor = [(abs(b - a.number(c)), max(abs(b), abs(value / (x or 1)) * 1e-4)) for b, c, x in pairs]
-                errors += [float(e / s) for e, s in floor]
+            errors = deviations(a, known, scene, path, rows)
             print(f"{known['spring']} {known['kind']}: values and gradients {max(errors):.1e}", flush=True)
 
 

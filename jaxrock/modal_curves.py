@@ -14,7 +14,7 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 Values = Inexact[ArrayLike, "*values"]
 
-_MOST_STRIDES, _MOST_STRIDES_TO_THE_TOP = 10_000, 100_000
+_MOST_STRIDES = 10_000
 
 
 def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count ..."]:
