@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.lanes import Passes, in_lanes
+from jaxrock.late import late
 
 _MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
 
@@ -24,7 +25,12 @@ def _(primals, tangents):
     return with_derivatives_of(*primals), tangents[1]
 
 
-def differentiable(function: Callable, on_tape: Callable | None = None, passes: Passes | None = None) -> Callable:
+def differentiable(
+    function: Callable,
+    on_tape: Callable | None = None,
+    passes: Passes | None = None,
+    alone: Callable | None = None,
+) -> Callable:
     """`function(tree)` with derivatives of every order, forward and reverse, from forward mode alone.
 
     The derivative is a small Jacobian times the change of the inputs: one column for every number that is
@@ -32,9 +38,9 @@ def differentiable(function: Callable, on_tape: Callable | None = None, passes: 
     function that makes value and Jacobian is `differentiable` in its turn, so second derivatives do, too.
 
     `on_tape`: the same function, through whose own code reverse mode goes; for derivatives by very many numbers.
-    `passes`: as in `in_lanes`; under `jax.vmap` all this runs in lanes.
+    `passes`, `alone`: as in `in_lanes`; under `jax.vmap` all this runs in lanes.
     """
-    in_lanes_ = in_lanes(function, passes)
+    in_lanes_ = in_lanes(function, passes, alone)
 
     @eqx.filter_custom_jvp
     def evaluate(tree):
@@ -50,7 +56,8 @@ def differentiable(function: Callable, on_tape: Callable | None = None, passes: 
             return eqx.filter_jvp(on_tape, (tree,), (change,))
         along = _Along(structure, moves)
         more = None if passes is None else along.passes(passes)
-        value, jacobian = differentiable(along.value_and_jacobian(function), passes=more)(leaves)
+        both = along.value_and_jacobian(function)
+        value, jacobian = differentiable(both, passes=more, alone=along.late(both, function, leaves))(leaves)
 
         def contracted(columns):
             return sum(jnp.tensordot(c, d, axes=d.ndim) for c, d in zip(columns, changes))
@@ -104,6 +111,21 @@ class _Along(NamedTuple):
             return value, self._columns(value, tangents, leaves)
 
         return both
+
+    def late(self, both: Callable, function: Callable, leaves: list) -> Callable:
+        """`both`, value and Jacobian, traced where it is compiled: what it returns is known from the value."""
+        program, value = jax.make_jaxpr(function, return_shape=True)(self.structure.unflatten(leaves))
+        if any(isinstance(x, jax.core.Tracer) for x in program.consts):
+            return both  # it must be traced within what these belong to
+        moving = [leaf for leaf, moves in zip(leaves, self.moves) if moves]
+
+        def of(out):
+            if not jnp.issubdtype(out.dtype, jnp.inexact):
+                return None
+            return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
+
+        told = f"value and derivatives by {[int(moves) for moves in self.moves]}"
+        return late(both, program, told, (value, [of(out) for out in jax.tree.leaves(value)]))
 
     def passes(self, passes: Passes) -> Passes:
         """The same in parts. Only the careful pass has derivatives, so there is no quick one."""

@@ -1,6 +1,7 @@
 """Functions of LLVM that run a program over arrays of many lanes, a vector of lanes at a time. Needs llvmlite.
 
 In arrays the axis of lanes is the last, but for lists of which single numbers are looked up: there it is the first.
+Several threads may call such a function with the same arguments: each takes lanes that nobody has taken before.
 """
 
 import math
@@ -23,17 +24,18 @@ def is_long(shape: tuple[int, ...]) -> bool:
 
 
 class _Frame:
-    """A function `void name(void **outputs, void **inputs)`; the first input tells for how many lanes there is room in
-    the arrays, and how many are wanted (int32 both)."""
+    """A function `void name(void **outputs, void **inputs, int64 *next)`; the first input tells for how many lanes there
+    is room in the arrays, and how many are wanted (int32 both), `next` the first that nobody has taken."""
 
     def __init__(self, jaxpr, lanes: int, name: str):
         self.module = ir.Module(name)
         table = _I8.as_pointer().as_pointer()
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [table, table]), name)
+        kinds = [table, table, _I64.as_pointer()]
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
         # Or else LLVM spills vectors across the lines of the cache, which takes twice as long.
         function.attributes.add("nounwind")  # llvmlite writes the alignment only after another attribute
         function.attributes.alignstack = 64
-        outputs, inputs = function.args
+        outputs, inputs, self.next = function.args
         self.b = ir.IRBuilder(function.append_basic_block("entry"))
         self.e = Emitter(self.b, lanes)
         self.sources = [self._array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
@@ -44,6 +46,10 @@ class _Frame:
     def _array(self, of, index: int, dtype):
         kind = _I8 if dtype == np.bool_ else self.e.kind(dtype)
         return self.b.bitcast(self.b.load(self.b.gep(of, [_I32(index)])), kind.as_pointer())
+
+    def take(self, more: int):
+        """The first of some lanes that nobody else takes."""
+        return self.b.atomic_rmw("add", self.next, _I64(more), "monotonic")
 
     def place(self, number: int, lane):
         """Where the number of a lane lies in an array."""
@@ -83,7 +89,7 @@ class _Frame:
 
 
 def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
-    """A function `void name(void **outputs, void **inputs)` that runs a program over arrays of many lanes.
+    """A function `void name(void **outputs, void **inputs, int64 *next)` that runs a program over arrays of many lanes.
 
     Before the inputs of the program stands how many lanes there are (a multiple of `lanes`), and how many are wanted
     (at least 1). What is not `shared` has an axis of lanes.
@@ -91,10 +97,10 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     jaxpr = program.jaxpr
     f = _Frame(jaxpr, lanes, name)
     b, e = f.b, f.e
-    entry, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("lanes", "program", "end"))
+    head, inside, after = (b.append_basic_block(name) for name in ("lanes", "program", "end"))
     b.branch(head)
     b.position_at_end(head)
-    first = b.phi(_I64)
+    first = f.take(lanes)
     b.cbranch(b.icmp_signed("<", first, f.count), inside, after)
     b.position_at_end(inside)
 
@@ -109,8 +115,6 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     for values, target in zip(found, f.targets):
         for number, value in enumerate(flat([values])):
             f.store(value, target, f.place(number, first))
-    first.add_incoming(_I64(0), entry)
-    first.add_incoming(b.add(first, _I64(lanes)), b.block)
     b.branch(head)
     b.position_at_end(after)
     b.ret_void()
@@ -138,7 +142,6 @@ class _Refilled:
         # Before all loops, where what only depends on them goes, too.
         given = dict.fromkeys(v for v in self.consts if not isinstance(v, Literal) and self.shared[v])
         self.known = {v: frame.argument(v, self.of[v], True, None, None) for v in given}
-        self.next = self.b.alloca(_I64)
         self.scene, self.active, self.ready = (self._room(kind) for kind in (_I64, _I8, _I8))
         # Stack of every number that is a lane's own: (source in memory, number in it, room).
         own = dict.fromkeys(v for v in self.consts if self._is_own(v))
@@ -162,7 +165,6 @@ class _Refilled:
     def module(self) -> ir.Module:
         """The function."""
         f, b, e = self.f, self.b, self.e
-        b.store(_I64(0), self.next)
         for i in range(e.lanes):
             b.store(_I64(-1), b.gep(self.scene, [_I64(i)]))
             b.store(_I8(1), b.gep(self.ready, [_I64(i)]))
@@ -175,7 +177,7 @@ class _Refilled:
         b.cbranch(e.any(active), run, end)
         b.position_at_end(run)
         carry = like([self._like(v) for v in self.carry], [self._take(room) for *_, room in self.changing])
-        more = b.icmp_signed("<", b.load(self.next), f.count)
+        more = b.icmp_signed("<", b.load_atomic(f.next, "monotonic", 8), f.count)
 
         def leaves(going):
             return b.and_(more, e.any(b.and_(active, b.not_(going))))
@@ -234,10 +236,9 @@ class _Refilled:
             targets = [t for v, t in zip(self.carry, self.f.targets) for _ in range(math.prod(v.aval.shape))]
             for (_, k, room), target in zip(self.changing, targets, strict=True):
                 b.store(b.load(b.gep(room, [lane])), b.gep(target, [self.f.place(k, old)]))
-        new = b.load(self.next)
+        new = self.f.take(1)
         there = b.icmp_signed("<", new, count)
         b.store(b.zext(there, _I8), active)
-        b.store(b.select(there, b.add(new, _I64(1)), new), self.next)
         new = b.select(there, new, b.sub(count, _I64(1)))
         b.store(new, scene)
         for variable, k, room in self.own + self.changing:

@@ -49,12 +49,13 @@ def _lanes(most: int, size: int) -> int:
     return min(most if jax.default_backend() == "cpu" else _WIDE, size)
 
 
-def in_lanes(function: Callable, passes: Passes | None = None) -> Callable:
-    """`function(tree)`, which under `jax.vmap` runs in chunks of lanes, quickly where it can."""
+def in_lanes(function: Callable, passes: Passes | None = None, alone: Callable | None = None) -> Callable:
+    """`function(tree)`, which under `jax.vmap` runs in chunks of lanes, quickly where it can; `alone`: the same for one
+    scene without `jax.vmap`."""
 
     @custom_vmap
     def one(tree):
-        return function(tree)
+        return (alone or function)(tree)
 
     @one.def_vmap
     def _(size, batched, tree):

@@ -9,6 +9,7 @@ import ctypes
 import functools
 import hashlib
 import math
+import os
 import threading
 from collections.abc import Callable
 
@@ -22,6 +23,8 @@ from jaxrock.emitter import SMALL, is_known
 from jaxrock.kernels import emit, emit_loop, is_long
 from jaxrock.programs import ahead, around_loop, computed
 
+_ROOM, _WANTED, _THREADS = range(3)  # what the first input of a program tells
+_SHARE = 64  # lanes that are worth a thread
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
@@ -43,7 +46,8 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
 
     size = next(x.shape[0] for x, same in zip(leaves, shared) if not same)
     more = -size % _machine().lanes
-    sizes = jnp.stack([jnp.int32(size + more), jnp.asarray(size if count is None else count, jnp.int32)])
+    told = size + more, size if count is None else count, _threads()
+    sizes = jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
     own = {v for v, same in zip(program.jaxpr.invars, shared) if not same} | set(each.outputs)
     for v in [v for v in rest.inputs if v in own]:
         x = values[v]
@@ -58,6 +62,14 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
         values.update((v, x) for v, x in zip(part.outputs, found) if not isinstance(v, Literal))
         own.update(v for v in part.outputs if not isinstance(v, Literal))
     return [jnp.moveaxis(x, -1, 0)[:size] for x in found]
+
+
+def _threads() -> int:
+    """How many threads run a program: all cores of this process that are no devices of their own."""
+    if not _HAS_THREADS:
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // len(jax.local_devices(backend="cpu")))
 
 
 class _Machine:
@@ -85,6 +97,7 @@ class _Machine:
         return self._engine.get_function_address(name)
 
 
+_HAS_THREADS = os.name == "posix"
 _one_at_a_time = threading.RLock()
 
 
@@ -148,5 +161,74 @@ def _add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
             for i in range(count):
                 b.store(at(at(at(frame, offset), 8 * i), 24), b.gep(table, [_I32(i)]))
             tables.append(table)
-        b.call(program, tables)
+        _in_threads(b, program, *tables)
     b.ret(done)
+
+
+def _in_threads(b: ir.IRBuilder, program: ir.Function, outputs, inputs) -> None:
+    """Call a program in this thread and, where there are many lanes, at the same time in others."""
+    module = b.module
+    worker = ir.Function(module, ir.FunctionType(_POINTER, [_POINTER]), "worker")
+    worker.linkage = "internal"
+    inner = ir.IRBuilder(worker.append_basic_block("entry"))
+    passed = inner.bitcast(worker.args[0], _POINTER.as_pointer())
+    given = [inner.load(inner.gep(passed, [_I32(i)])) for i in range(3)]
+    inner.call(program, [inner.bitcast(x, kind) for x, kind in zip(given, program.ftype.args)])
+    inner.ret(ir.Constant(_POINTER, None))
+
+    message, following = b.alloca(_POINTER, 3), b.alloca(_I64)
+    b.store(_I64(0), following)
+    for i, x in enumerate((outputs, inputs, following)):
+        b.store(b.bitcast(x, _POINTER), b.gep(message, [_I32(i)]))
+    message = b.bitcast(message, _POINTER)
+    if not _HAS_THREADS:
+        b.call(worker, [message])
+        return
+    sizes = b.bitcast(b.load(inputs), _I32.as_pointer())
+    wanted, threads = (b.sext(b.load(b.gep(sizes, [_I32(i)])), _I64) for i in (_WANTED, _THREADS))
+    most = b.sdiv(b.sub(wanted, _I64(1)), _I64(_SHARE))
+    threads = b.sub(threads, _I64(1))
+    helpers = b.select(b.icmp_signed("<", most, threads), most, threads)
+    handles = b.alloca(_I64, helpers)
+    create = _outside(module, "pthread_create", _I64.as_pointer(), _POINTER, worker.type, _POINTER)
+    join = _outside(module, "pthread_join", _I64, _POINTER.as_pointer())
+    nothing = ir.Constant(_POINTER, None)
+
+    def begin(number):
+        # If there is no thread to be had, the others do its work.
+        failed = b.call(create, [b.gep(handles, [number]), nothing, worker, message])
+        return b.icmp_signed("==", failed, _I32(0))
+
+    def end(number):
+        b.call(join, [b.load(b.gep(handles, [number])), ir.Constant(_POINTER.as_pointer(), None)])
+        return ir.Constant(ir.IntType(1), True)
+
+    begun = _count_up(b, helpers, begin)
+    b.call(worker, [message])
+    _count_up(b, begun, end)
+
+
+def _outside(module: ir.Module, name: str, *kinds) -> ir.Function:
+    """A function of the system that returns an int."""
+    return ir.Function(module, ir.FunctionType(_I32, kinds), name)
+
+
+def _count_up(b: ir.IRBuilder, size, act: Callable):
+    """`act(number)` from 0 to `size`, or until it is false; the number where it ends."""
+    before, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("next", "act", "done"))
+    b.branch(head)
+    b.position_at_end(head)
+    number = b.phi(_I64)
+    b.cbranch(b.icmp_signed("<", number, size), inside, after)
+    b.position_at_end(inside)
+    goes_on = act(number)
+    following = b.add(number, _I64(1))
+    number.add_incoming(_I64(0), before)
+    number.add_incoming(following, b.block)
+    last = b.block
+    b.cbranch(goes_on, head, after)
+    b.position_at_end(after)
+    found = b.phi(_I64)
+    found.add_incoming(number, head)
+    found.add_incoming(number, last)
+    return found

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxrock.lanes
+from jaxrock.derivatives import differentiable
 from jaxrock.lanes import Passes, in_lanes
 
 
@@ -89,3 +90,29 @@ def test_more_axes(fast):
     np.testing.assert_array_equal(
         found, np.broadcast_to(np.asarray(numbers)[:, None] * np.asarray(samples[:3]).sum(1)[:, None], shape)
     )
+
+
+def test_a_jacobian_is_traced_where_it_is_compiled():
+    """Not where `vmap` puts something else in its place: tracing one takes seconds."""
+    slopes = []
+
+    @jax.custom_jvp
+    def marked(x):
+        return x
+
+    @marked.defjvp
+    def _(primals, tangents):
+        slopes.append(1)
+        return primals[0], tangents[0]
+
+    run = differentiable(lambda x: jax.lax.while_loop(lambda y: y < 100, lambda y: y * x, marked(x) + 1))
+    x = jnp.linspace(2.0, 3.0, 5)
+    jax.make_jaxpr(jax.grad(run))(2.0)
+    assert not slopes
+    many = jax.vmap(jax.grad(run))(x)
+    assert len(slopes) == 1
+    one = jnp.stack([jax.jit(jax.grad(run))(each) for each in x])
+    steps = jnp.ceil(jnp.log(100 / (x + 1)) / jnp.log(x))
+    exact = x**steps + (x + 1) * steps * x ** (steps - 1)
+    np.testing.assert_allclose(many, exact, rtol=1e-14)
+    np.testing.assert_allclose(one, exact, rtol=1e-14)

@@ -181,6 +181,30 @@ def test_lanes_are_filled_again(count):
         np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
+@pytest.mark.parametrize("refilled", [False, True], ids=["together", "refilled"])
+@pytest.mark.parametrize("threads", [2, 7])
+def test_threads_share_lanes(monkeypatch, threads, refilled):
+    """Each lane is done by one of them, once; of those that are not wanted nothing is asked."""
+
+    def function(leaves):
+        x, turns = leaves
+        found = jax.lax.while_loop(lambda s: s[0] < turns, lambda s: (s[0] + 1, s[1] * 1.01 + x), (0, x))
+        return [found[1], found[0]]
+
+    random = np.random.default_rng(0)
+    x, turns = jnp.asarray(random.random(3001)), jnp.asarray(random.integers(0, 2000, 3001))
+
+    def run(number, count=None):
+        monkeypatch.setattr(native, "_threads", lambda: number)
+        return jax.jit(lambda *v: native.run(function, list(v), [False, False], refilled, count))(x, turns)
+
+    alone, together, some = run(1), run(threads), run(threads, 1111)
+    for one, other, part in zip(alone, together, some, strict=True):
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(one[:1111], part[:1111])
+    np.testing.assert_array_equal(alone[1], turns)
+
+
 def test_exponential_less_one():
     x = np.concatenate([np.linspace(-3, 3, 61), [-1e-300, 1e-12, -800.0]])
     found, expected = both(lambda x: [jnp.expm1(x)], x)
