@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 import jaxrock as rk
-from jaxrock.likelihood import NODES
+from jaxrock.possible import NODES
 from jaxrock.problem import Problem
 
 TRUTH = {"amplitude": 0.35, "period": 0.8}

@@ -16,9 +16,10 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._progress import Progress
 from jaxrock.climb import Summits, climb
 from jaxrock.engine import AbstractEngine
-from jaxrock.likelihood import NODES, Likelihood
+from jaxrock.likelihood import Likelihood
 from jaxrock.models import Housner, Model
 from jaxrock.observations import TOPPLED, Observations
+from jaxrock.possible import NODES
 from jaxrock.problem import Evaluator, Problem, Unknown
 from jaxrock.profiles import Profile, Shape, profile, shape_at
 
@@ -178,7 +179,7 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
     places = jnp.asarray(evaluate.places(found.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     values = {name: x[best] for name, x in problem.values(places).items()}
-    stands, *facts = evaluate.facts(evaluate.places(found.points[best]))
+    stands, _, *facts = evaluate.facts(evaluate.places(found.points[best]))
     surprise = _surprise(facts)
     probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
     remarks, consistent = _remarks(problem, shape, profiled), jnp.inf

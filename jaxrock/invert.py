@@ -44,6 +44,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--scatter", type=float, default=0.3, help="standard deviation of ln amplitude from rock to rock (default 0.3)"
     )
     parser.add_argument(
+        "--lapse",
+        type=float,
+        default=0.02,
+        help="probability that what was seen of a rock says nothing: moved, misjudged (default 0.02)",
+    )
+    parser.add_argument(
+        "--prior",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("PARAMETER", "MEDIAN", "SD"),
+        help="what is known beforehand of amplitude, duration or shape, with the standard deviation of its logarithm "
+        "(of the shape itself): the estimate is the most probable motion then; once for each",
+    )
+    parser.add_argument(
         "--starts", type=int, default=64, help="points from which the maximum is looked for (default 64)"
     )
     parser.add_argument("--points", type=int, default=48, help="points along each axis of the map (default 48)")
@@ -55,16 +70,21 @@ def invert(arguments: argparse.Namespace, model: Model) -> tuple[str, list[Path]
     if arguments.points < 2:
         raise ValueError(f"Argument `--points` must be at least 2, but is {arguments.points}.")
     pulse, extent = _PULSES[arguments.pulse]
-    unknowns = {"amplitude": Unknown(*arguments.amplitude), extent: Unknown(*arguments.duration)}
+    priors = _priors(arguments.prior, arguments.pulse)
+    unknowns = {
+        "amplitude": Unknown(*arguments.amplitude, prior=priors.get("amplitude")),
+        extent: Unknown(*arguments.duration, prior=priors.get("duration")),
+    }
     if arguments.pulse == "exponential":
-        unknowns["shape"] = Unknown(*arguments.shape, log=False)
-    found = estimate_motion(observations, pulse, unknowns, arguments.scatter, starts=arguments.starts, model=model)
+        unknowns["shape"] = Unknown(*arguments.shape, log=False, prior=priors.get("shape"))
+    scatter, lapse = arguments.scatter, arguments.lapse
+    found = estimate_motion(observations, pulse, unknowns, scatter, lapse=lapse, starts=arguments.starts, model=model)
     fixed = {name: found[name] for name in found.names[2:]}
     axes = {
         "amplitude": np.geomspace(*arguments.amplitude, arguments.points),
         extent: np.geomspace(*arguments.duration, arguments.points),
     }
-    region = feasible_region(Likelihood(observations, pulse, arguments.scatter, model), axes, fixed)
+    region = feasible_region(Likelihood(observations, pulse, scatter, model, lapse=lapse), axes, fixed)
     wall = None
     if bool(jnp.any(observations.seen != TOPPLED)):
         wall = unexceeded_motion(observations, lambda a, t: pulse(a, t, *fixed.values()), axes[extent], model=model)
@@ -72,7 +92,23 @@ def invert(arguments: argparse.Namespace, model: Model) -> tuple[str, list[Path]
     unusable = bool((found.status == EstimateStatus.contradictory) | (found.status == EstimateStatus.not_converged))
     said = EstimateStatus[found.status]
     good = found.status == EstimateStatus.successful
-    return "\n".join([_text(observations, found), *([] if good else [said])]), files, said if unusable else None
+    text = _text(observations, found, ", with the priors" if priors else "")
+    return "\n".join([text, *([] if good else [said])]), files, said if unusable else None
+
+
+def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]]:
+    """Median and standard deviation by name."""
+    known = ("amplitude", "duration", "shape") if pulse == "exponential" else ("amplitude", "duration")
+    priors = {}
+    for name, *numbers in given:
+        if name not in known or name in priors:
+            raise ValueError(f"Argument `--prior` must name each of {', '.join(known)} at most once, but names {name}.")
+        try:
+            priors[name] = float(numbers[0]), float(numbers[1])
+        except ValueError:
+            said = f"{name} {' '.join(numbers)}"
+            raise ValueError(f"Argument `--prior` must end with two numbers, but is {said}.") from None
+    return priors
 
 
 def _write(
@@ -162,7 +198,7 @@ def draw(region: FeasibleRegion, found: Estimate | None = None, wall: Unexceeded
     return axis
 
 
-def _text(observations: Observations, found: Estimate) -> str:
+def _text(observations: Observations, found: Estimate, more: str) -> str:
     seen = np.asarray(observations.seen)
     lines = [f"{seen.size} rocks: " + ", ".join(f"{int(np.sum(seen == k))} {word}" for k, word in enumerate(SEEN))]
     unknown = int(np.sum(observations.ways[0] != observations.ways[-1]))
@@ -172,5 +208,5 @@ def _text(observations: Observations, found: Estimate) -> str:
         ends = f"{'<' if below else ''}{float(low):.4g} to {'>' if above else ''}{float(high):.4g}"
         ends = ends if np.isfinite(float(low)) else "no interval"
         lines.append(f"  {name:<10} {float(value):10.4g} {_UNITS[name]:<2}  95 %: {ends}")
-    lines.append(f"  log-likelihood {float(found.log_likelihood):.3f}, scatter {float(found.scatter):g}")
+    lines.append(f"  log-likelihood {float(found.log_likelihood):.3f}{more}, scatter {float(found.scatter):g}")
     return "\n".join([*lines, *found.remarks])

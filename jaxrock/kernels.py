@@ -24,8 +24,11 @@ def is_long(shape: tuple[int, ...]) -> bool:
 
 
 class _Frame:
-    """A function `void name(void **outputs, void **inputs, int64 *next)`; the first input tells for how many lanes there
-    is room in the arrays, and how many are wanted (int32 both), `next` the first that nobody has taken."""
+    """A function `void name(void **outputs, void **inputs, int64 *next)`.
+
+    The first input tells for how many lanes there is room in the arrays, and how many are wanted (int32 both); `next`
+    is the first that nobody has taken.
+    """
 
     def __init__(self, jaxpr, lanes: int, name: str):
         self.module = ir.Module(name)

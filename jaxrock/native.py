@@ -65,11 +65,12 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
 
 
 def _threads() -> int:
-    """How many threads run a program: all cores of this process that are no devices of their own."""
+    """How many threads run a program: all cores of this process, dealt to the devices that run it at the same time."""
     if not _HAS_THREADS:
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // len(jax.local_devices(backend="cpu")))
+    together = min(jax.sharding.get_abstract_mesh().size, len(jax.local_devices(backend="cpu")))
+    return max(1, cores // max(1, together))  # none outside of a `shard_map`
 
 
 class _Machine:

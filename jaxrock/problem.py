@@ -92,7 +92,7 @@ class Problem(eqx.Module):
 
 
 @eqx.filter_jit
-def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
+def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
     def density(places):
         terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
         return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts

@@ -1,5 +1,6 @@
 """What rocks say about a motion: probabilities against counted verdicts, maxima against grids, honest refusals."""
 
+import re
 import sys
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.__main__ import main
 from jaxrock.climb import climb
-from jaxrock.likelihood import rocks_at
+from jaxrock.possible import rocks_at
 from jaxrock.problem import Evaluator, Problem
 
 # All tests have twelve rocks and a sine pulse, so that they share one compiled program.
@@ -250,6 +251,37 @@ def test_the_command_from_a_table_to_figures(tmp_path, capsys):
     assert wall[0] == "duration_s,amplitude_g,rock,complete" and len(wall) == 7
     assert (tmp_path / "region.png").stat().st_size > 1000
     assert len(path.read_text().splitlines()) == 13  # what was read is left alone
+
+
+def test_rocks_that_say_nothing_leave_what_was_known_before(tmp_path, capsys):
+    """They cannot be moved in the range: the most probable motion and its intervals are those of the priors."""
+    path = tmp_path / "rocks.csv"
+    path.write_text("name,alpha_rad,p_rad_per_s,observed\na,0.6,2,survived\nb,0.7,3,survived\n")
+    ranges = ("--amplitude", "0.04", "0.25", "--duration", "0.2", "5", "--starts", "4", "--points", "2")
+    priors = ("--prior", "amplitude", "0.1", "0.2", "--prior", "duration", "1.2", "0.4")
+    status = main(["invert", str(path), *ranges, *priors, "--lapse", "0.05", "--out", str(tmp_path)])
+    printed, errors = capsys.readouterr()
+    assert status == 0 and errors == ""
+    assert f"log-likelihood {2 * np.log(1 - 0.05 / 2):.3f}, with the priors, scatter 0.3" in printed
+    for line, (median, sd) in zip((tmp_path / "estimate.csv").read_text().splitlines()[1:], [(0.1, 0.2), (1.2, 0.4)]):
+        expected = median * np.exp(np.sqrt(2 * 1.9207) * sd * np.array([0, -1, 1]))
+        np.testing.assert_allclose([float(x) for x in line.split(",")[2:5]], expected, rtol=2e-4)
+        assert line.endswith(",0,0")
+
+
+@pytest.mark.parametrize(
+    "prior, message",
+    [
+        (("shape", "1", "1"), "must name each of amplitude, duration at most once, but names shape"),
+        (("duration", "1", "wide"), "must end with two numbers, but is duration 1 wide"),
+        (("duration", "1", "-1"), r"`prior\[1\]` must be positive"),
+    ],
+)
+def test_impossible_priors_of_the_command(tmp_path, capsys, prior, message):
+    path = tmp_path / "rocks.csv"
+    path.write_text("name,alpha_rad,p_rad_per_s,observed\na,0.6,2,survived\n")
+    assert main(["invert", str(path), "--prior", *prior, "--out", str(tmp_path)]) == 2
+    assert re.search(message, capsys.readouterr().err)
 
 
 HEADER = (
