@@ -28,6 +28,8 @@ Real = Inexact[Array, "..."]
 _SCREENED = 4  # points for each start, of which the best are taken
 _LEAST_SCREENED = 64
 _AROUND = 0.15  # of the ranges
+_ROUNDS_BESIDE, _SCREENED_BESIDE, _BESIDE = 3, 64, 0.08  # rounds, points in each, and their extent in ranges
+_GAIN = 1e-6  # of a round that calls for another
 _RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
@@ -138,6 +140,11 @@ def estimate_motion(
     bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
     found = climb(evaluate, _starts(starts, evaluate))
+    for _ in range(_ROUNDS_BESIDE):
+        more, before = climb(evaluate, _beside(evaluate, found)), found.values.max()
+        found = _joined(more, found)
+        if found.values.max() < before + _GAIN:
+            break
     for _ in range(3):
         best = int(np.argmax(found.values))
         shape = shape_at(evaluate, found.points[best])
@@ -145,8 +152,7 @@ def estimate_motion(
         if profiled.better is None:
             break
         # A profile went over a pass to a higher summit.
-        more = climb(evaluate, profiled.better[None])
-        found = Summits(*(np.concatenate(pair) for pair in zip(more, found)))
+        found = _joined(climb(evaluate, profiled.better[None]), found)
     result = _conclude(evaluate, found, shape, profiled)
     bar.add(bar.total - bar.done)
     return result
@@ -161,6 +167,21 @@ def _starts(count: int, evaluate: Evaluator) -> np.ndarray:
     near = np.max(np.abs(share[:, None] - share[None]), axis=2) < _AROUND
     beside = np.tril(near, -1).any(axis=1)
     return evaluate.points(places[np.concatenate([order[~beside], order[beside]])[:count]])
+
+
+def _beside(evaluate: Evaluator, found: Summits) -> np.ndarray:
+    """The best of some points around the highest summit: gaps that are narrower than the scatter make small summits
+    beside it."""
+    low, high = evaluate.ends
+    best = evaluate.places(found.points[np.argmax(found.values)])
+    places = best + _BESIDE * (_spread(_SCREENED_BESIDE, evaluate) - (low + high) / 2)
+    places = np.clip(places, low, high)
+    order = np.argsort(-evaluate.at(places)[0], kind="stable")
+    return evaluate.points(places[order[: _SCREENED_BESIDE // _SCREENED]])
+
+
+def _joined(more: Summits, found: Summits) -> Summits:
+    return Summits(*(np.concatenate(pair) for pair in zip(more, found)))
 
 
 def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
