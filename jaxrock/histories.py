@@ -167,6 +167,8 @@ def fit_history(
     """
     if starts < 1:
         raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
+    if np.size(rotation) == 0:
+        raise ValueError("Argument `rotation` must hold measurements, but is empty.")
     spread = float(positive("spread", spread))
     scene = _Scene.of(block, motion, model, parameters, initial, rotation, engine)
     time, rotation, weight = _data(time, rotation, scatter, 2 * len(scene.names))

@@ -33,6 +33,7 @@ _GAIN = 1e-6  # of a round that calls for another
 _RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
+_COMPUTED = 0.5  # of the possible scenes at the maximum
 _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
 
 
@@ -51,6 +52,10 @@ class EstimateStatus(eqx.Enumeration):
     contradictory = (
         "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
         "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
+    )
+    not_computed = (
+        "Under the best motion the responses of rocks were mostly too close to call, or could not be computed: nothing "
+        "can be said. Look at the motion, or set the engine."
     )
     not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
 
@@ -140,6 +145,8 @@ def estimate_motion(
     bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
     found = climb(evaluate, _starts(starts, evaluate))
+    if not np.isfinite(evaluate.lowest):
+        raise ValueError("Argument `unknowns` must have ranges in which there are motions, but all its values are bad.")
     for _ in range(_ROUNDS_BESIDE):
         more, before = climb(evaluate, _beside(evaluate, found)), found.values.max()
         found = _joined(more, found)
@@ -200,17 +207,21 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
     places = jnp.asarray(evaluate.places(found.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     values = {name: x[best] for name, x in problem.values(places).items()}
-    stands, _, *facts = evaluate.facts(evaluate.places(found.points[best]))
+    stands, computed, *facts = evaluate.facts(evaluate.places(found.points[best]))
     surprise = _surprise(facts)
     probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
     remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
     status = EstimateStatus.successful
     if profiled.open.any():
         status = EstimateStatus.open_interval
-    if found.values[best] - profiled.lowest < _RATIO:
+    if found.values[best] - evaluate.lowest < _RATIO:
         status = EstimateStatus.no_information
+    elif profiled.open.all():
+        remarks += ("They allow some combinations of these and not others: `feasible_region` maps them.",)
     if not found.arrived[best] and not profiled.open.any():
         status = EstimateStatus.not_converged
+    if np.mean(computed) < _COMPUTED:
+        status = EstimateStatus.not_computed
     interval, covariance = np.where(logs[:, None], np.exp(profiled.ends), profiled.ends), shape.covariance
     if surprise > _SURPRISED:
         status = EstimateStatus.contradictory
@@ -219,7 +230,7 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
         names = problem.likelihood.observations.names
         worst = np.argsort(np.asarray(probability))[:3]
         worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
-        remarks = (f"Least probable under the best motion: {', '.join(worst)}.",)
+        remarks = (f"Least probable under the best motion: {', '.join(worst)}.",) if worst else ()
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
     per_point = problem.likelihood.observations.ways.size * NODES
@@ -259,7 +270,7 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         starts = np.concatenate([point[None], _starts(_RETRIES, again)])
         found = climb(again, starts)
         evaluate.count += again.count
-        if _surprise(again.facts(again.places(found.points[np.argmax(found.values)]))[1:]) <= _SURPRISED:
+        if _surprise(again.facts(again.places(found.points[np.argmax(found.values)]))[2:]) <= _SURPRISED:
             return float(scatter)
     return np.inf
 

@@ -89,7 +89,8 @@ def invert(arguments: argparse.Namespace, model: Model) -> tuple[str, list[Path]
     if bool(jnp.any(observations.seen != TOPPLED)):
         wall = unexceeded_motion(observations, lambda a, t: pulse(a, t, *fixed.values()), axes[extent], model=model)
     files = _write(arguments.out, observations, found, region, wall)
-    unusable = bool((found.status == EstimateStatus.contradictory) | (found.status == EstimateStatus.not_converged))
+    bad = (EstimateStatus.contradictory, EstimateStatus.not_converged, EstimateStatus.not_computed)
+    unusable = any(bool(found.status == each) for each in bad)
     said = EstimateStatus[found.status]
     good = found.status == EstimateStatus.successful
     text = _text(observations, found, ", with the priors" if priors else "")

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 _MOST_STEPS, _FEW_STEPS = 60, 8  # of the last window, and of one on the way
 _TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain in a step, below which it is the last one there
+_UNTOLD = 1e10  # variance of what the data do not tell, in squares of its natural size
 _TO_THE_BOUND = 0.9  # share of the way to a bound that one step may go
 
 
@@ -159,7 +160,11 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
         unknown = np.diag(np.full(count, np.inf))
         return Covariance(unknown, unknown, np.inf, 0.0)
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
-    values = np.maximum(values, 1e-14 * max(values.max(), 1e-280))
+    floor = 1e-14 * max(values.max(), 1e-280)
+    untold = vectors[:, values <= floor]
+    # However small the residuals are: they say nothing about what does not show in them.
+    unknown = _UNTOLD * np.outer(scale, scale) * (untold @ untold.T)
+    values = np.maximum(values, floor)
     inverse = (vectors / values) @ vectors.T
     scatter = float(np.sqrt(np.sum(residuals**2) / (size - count)))
     middle = slopes.T @ slopes
@@ -169,7 +174,8 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
     both = np.outer(scale, scale)
     robust = inverse @ middle @ inverse * scatter**2
     neighbours = float(np.sum(residuals[1:] * residuals[:-1]) / max(np.sum(residuals**2), 1e-300))
-    return Covariance(both * inverse * (1.0 if scatter_is_known else scatter**2), both * robust, scatter, neighbours)
+    independent = both * inverse * (1.0 if scatter_is_known else scatter**2)
+    return Covariance(independent + unknown, both * robust + unknown, scatter, neighbours)
 
 
 def _correlations(residuals: np.ndarray) -> np.ndarray:

@@ -75,6 +75,8 @@ class Likelihood(eqx.Module):
         engine: AbstractEngine | None = None,
         lapse: ArrayLike = 0.02,
     ):
+        if isinstance(motion, AbstractMotion):
+            raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
         self.observations, self.motion, self.model, self.engine = observations, motion, model, engine
         self.scatter = positive("scatter", scatter)
         self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
@@ -184,10 +186,9 @@ class Likelihood(eqx.Module):
         if slopes:
             real = _sloping(real, jnp.where(jnp.isfinite(rows), rows, 0.0), parameters)
         margin, rotation, lost, known = (x.reshape(shape) for x in (*real.T, lost, known))
-        # On the verge of overturning a rock is at the angle of its weaker side.
         verge = jnp.broadcast_to((levels.alpha * seen.weaker_alpha / seen.alpha)[..., None, :], shape)
-        rotation = jnp.where(lost, verge, jnp.where(known, rotation, verge / 2))
-        return Possible.of(where[..., None, :], margin, rotation, known), impossible
+        rotation = jnp.where(known, rotation, 0.0)
+        return Possible.of(where[..., None, :], margin, rotation, known, lost, verge), impossible
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
         """Logarithm of the strength of a motion, and whether there is no such motion."""

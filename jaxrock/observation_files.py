@@ -65,6 +65,8 @@ def read_observations(path: str | Path) -> Observations:
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
+    if rows:
+        _check_comments(path.name, lines, *rows[0])
     if len(rows) < 2:
         raise file_error(path.name, "holds no rocks: it must have a line of column names, and one for each rock.")
     header = rows[0][1]
@@ -94,7 +96,17 @@ def _observations(rocks: list[dict], names: list[str] | None = None) -> Observat
     return Observations.asymmetric(AsymmetricBlock(*shape), *rest[0], facing=column("facing"), **rest[1])
 
 
+def _check_comments(file: str, lines: list[str], first: int, header: list[str]) -> None:
+    """That none after the header, in line `first`, is a rock."""
+    for number, line in enumerate(lines[first:], first + 1):
+        if line.lstrip().startswith("#") and len(next(csv.reader([line]))) == len(header):
+            said = "looks like a rock, but a line that begins with # is a comment; put its name in another way."
+            raise file_error(file, f"line {number}: {said}")
+
+
 def _check_header(file: str, header: list[str]) -> None:
+    if len(header) == 1 and ";" in header[0]:
+        raise file_error(file, "must separate its fields by commas, not by semicolons.")
     unknown = [name for name in header if name not in _COLUMNS]
     if unknown:
         raise file_error(file, f"has a column `{unknown[0]}`, but known are {', '.join(sorted(_COLUMNS))}.")
@@ -103,14 +115,28 @@ def _check_header(file: str, header: list[str]) -> None:
         raise file_error(file, f"has the column `{twice[0]}` twice.")
     if "observed" not in header:
         raise file_error(file, f"has no column `observed` ({', '.join(SEEN)}).")
+    for name in header:
+        if name.endswith("_sd") and name.removesuffix("_sd") not in header:
+            raise file_error(file, f"has a column `{name}`, but no column `{name.removesuffix('_sd')}`.")
+    _check_shapes(file, set(header))
+
+
+def _check_shapes(file: str, header: set[str]) -> None:
+    """Each measure in one way, and of two sides both."""
     for way in _WAYS:
-        if sum(name in header for name in way) != 1:
+        if len(header.intersection(way)) != 1:
             raise file_error(file, f"must have one of the columns {', '.join(way)}.")
+    if header.issuperset(("rotation_rad", "rotation_deg")):
+        raise file_error(file, "must have one of the columns rotation_rad, rotation_deg, and not both.")
     for pair in _PAIRS:
-        if (pair[0] in header) != (pair[1] in header):
+        if len(header.intersection(pair)) == 1:
             raise file_error(file, f"must have both columns {pair[0]} and {pair[1]}, or none of them.")
-    if any(name in header for name in _WAYS[0][3:]) != any(name in header for name in _WAYS[1][3:]):
+    two_sides = [bool(header.intersection(way[3:])) for way in _WAYS]
+    if two_sides[0] != two_sides[1]:
         raise file_error(file, "must have columns of both sides (1 and 2) for angles and sizes alike.")
+    for name in header.intersection(("facing", "inertia_ratio")):
+        if not two_sides[0]:
+            raise file_error(file, f"has a column `{name}`, which is for rocks whose sides differ (alpha1, alpha2).")
 
 
 def _rock(fields: dict[str, str]) -> dict:
@@ -126,6 +152,7 @@ def _rock(fields: dict[str, str]) -> dict:
                 return empty if value is None else value * factor, (sd or 0.0) * factor
         return empty, 0.0
 
+    fields = fields | {"observed": fields["observed"].lower()}
     if fields["observed"] not in SEEN:
         raise ValueError(f"`observed` must be {', '.join(SEEN)}, but is {fields['observed']!r}.")
     rock = {"name": fields.get("name", ""), "observed": fields["observed"]}

@@ -109,8 +109,17 @@ class Possible(NamedTuple):
     rotation_width: Real
 
     @classmethod
-    def of(cls, where, margin, rotation, known) -> "Possible":
-        """From the results at nodes, (nodes, ..., ways, rocks), which are so many standard deviations away."""
+    def of(cls, where, margin, rotation, known, lost, verge) -> "Possible":
+        """From the results at nodes, (nodes, ..., ways, rocks), which are so many standard deviations away; `verge` is
+        the rotation from which a rock at rest overturns.
+
+        On the way to overturning the rotation grows without bounds with the amplitude; what is left of the energy to
+        overturn, about (1 - rotation/verge)^2, does not, and passes zero with y, of which it is twice as much there.
+        """
+        left = 1 - rotation / verge
+        left = jnp.where(lost, 2 * _straightened(jnp.minimum(margin, 0.0)), left * jnp.abs(left))
+        left = jnp.where(known, left, 0.25)
+        ends_of_parts = jnp.concatenate([verge[:1], _halves(verge)]), jnp.concatenate([left[:1], _halves(left)])
         y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known)
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
         few = _SLOPE_OVER - 1
@@ -120,8 +129,8 @@ class Possible(NamedTuple):
         half = jnp.concatenate([where[:1], _halves(where)])
         weight = jnp.diff(ndtr(half), axis=0)
         return cls(
-            weight, _between(y), _twice(width), _twice(known[1:] & known[:-1]), ends, _between(rotation),
-            _twice(_SMEAR * jnp.diff(rotation, axis=0)),
+            weight, _between(y), _twice(width), _twice(known[1:] & known[:-1]), ends,
+            _rotation(_between(verge), _between(left)), jnp.abs(jnp.diff(_rotation(*ends_of_parts), axis=0)),
         )  # fmt: skip
 
     def log_probability(self, stands: bool, density: Real | float = 0.0) -> Real:
@@ -149,6 +158,10 @@ class Possible(NamedTuple):
         return jnp.mean(
             jnp.sum(jnp.where(self.known, self.weight, 0.0), axis=0) / jnp.sum(self.weight, axis=0), axis=-2
         )
+
+
+def _rotation(verge: Real, left: Real) -> Real:
+    return verge * (1 - left / (left**2 + 1e-6) ** 0.25)
 
 
 def _between(values: Real) -> Real:

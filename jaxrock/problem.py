@@ -42,6 +42,8 @@ class Unknown(eqx.Module):
         if not self.low < self.high:
             raise ValueError(f"Argument `high` must be above `low`, but is {high} with {low}.")
         self.log = log
+        if prior is not None and np.shape(prior) != (2,):
+            raise ValueError(f"Argument `prior` must be a median and a standard deviation, but is {prior!r}.")
         self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
 
     @property
@@ -63,6 +65,11 @@ class Problem(eqx.Module):
 
     likelihood: Likelihood
     unknowns: dict[str, Unknown]
+
+    def __check_init__(self):
+        for name, unknown in self.unknowns.items():
+            if isinstance(unknown, (int, float, tuple, list)):
+                raise ValueError(f"Argument `unknowns` must hold an `Unknown` for `{name}`, but holds {unknown!r}.")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,8 +139,13 @@ class Evaluator:
         self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
         return values, slopes
 
+    @property
+    def lowest(self) -> float:
+        """The lowest value that was met."""
+        return float(np.min(self.known[1], initial=np.inf, where=np.isfinite(self.known[1])))
+
     def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
-        """`survival` and `surprise` of the likelihood at a place, (rocks,) each."""
+        """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
         return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(place, (_LANES, 1)))[2])
 

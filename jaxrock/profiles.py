@@ -50,7 +50,6 @@ class Profile(NamedTuple):
     ends: np.ndarray  # (parameters, 2), places
     open: np.ndarray  # whether an end is only that of the range
     better: np.ndarray | None  # a point above the maximum
-    lowest: float  # log-likelihood that was met
 
 
 class _Row(NamedTuple):
@@ -86,7 +85,7 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
         if pair is not None:
             ends[j, (s + 1) // 2], open_[j, (s + 1) // 2] = _secant(*pair, 0.0), False
     better = sides.highest[1] if sides.highest[0] > sides.best + 1e-6 else None
-    return Profile(ends, open_, better, min(sides.lowest, found.values.min()))
+    return Profile(ends, open_, better)
 
 
 def _secant(inner: _Row, outer: _Row, margin: float) -> float:
@@ -101,7 +100,7 @@ class _Sides:
     def __init__(self, evaluate: Evaluator, best: float, place: np.ndarray):
         self.evaluate, self.best = evaluate, best
         self.rows = {(j, s): [_Row(place[j], 0.0, place)] for j in range(place.size) for s in (-1, 1)}
-        self.highest, self.lowest = (-np.inf, None), np.inf
+        self.highest = (-np.inf, None)
 
     def follow(self, wanted: dict[tuple[int, int], float]) -> None:
         """Climb with one parameter held at a value, for each of some sides: from the nearest place on the profile, and
@@ -125,7 +124,6 @@ class _Sides:
             self.rows[side].append(_Row(value, np.sqrt(2 * max(self.best - values[best], 0.0)), places[best]))
         top = int(np.argmax(values))
         self.highest = max(self.highest, (values[top], reached.points[top]), key=lambda pair: pair[0])
-        self.lowest = min(self.lowest, values.min())
 
     def recall(self) -> None:
         """Add to each side the outermost of all known places that are within 95 %: it may lie beyond a valley."""

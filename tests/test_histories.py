@@ -144,6 +144,23 @@ def test_a_parameter_that_does_not_show_stays_and_has_no_interval():
     assert np.sqrt(covariance(found, scale, True).independent[1, 1]) > 1e5
 
 
+@pytest.mark.parametrize(
+    "rotation, untold",
+    [
+        (0 * TIME, ("alpha", "p", "restitution")),
+        (free_rocking(TIME / 20), ("restitution",)),  # no impact yet
+    ],
+    ids=["never moved", "no impact"],
+)
+def test_what_a_history_does_not_show_has_no_interval(rotation, untold):
+    """However well the rest fits, errors of measurement are none and their scatter is not known."""
+    time = TIME if not rotation.any() else TIME / 20
+    found = fit(rotation, time, rk.Block(ALPHA, P, RESTITUTION), starts=1)
+    assert bool(found.status == rk.HistoryStatus.not_identified)
+    wide = dict(zip(found.names, np.diff(found.intervals())[:, 0]))
+    assert all(wide[name] > 100 for name in untold)
+
+
 def test_a_start_without_a_result_is_given_up():
     def at(points, samples):
         """A line through the origin, that cannot be drawn with a slope below 1.9 (one of the starts)."""
@@ -198,6 +215,7 @@ DATA = free_rocking(TIME)
         (dict(motion=rk.Record(np.zeros(9), 0.1)), "`motion` must move the ground"),
         (dict(block=rk.Block(np.array([0.1, 0.2]), np.array([2.0, 2.0]))), "`block` must hold one scene"),
         (dict(block=rk.Block(0.2, 2.5, 1.0)), "`restitution` can be fitted only from within its range"),
+        (dict(time=np.zeros(0), rotation=np.zeros(0)), "`rotation` must hold measurements"),
         (dict(starts=0), "`starts` must be at least 1"),
         (dict(spread=-0.1), "`spread` must be positive"),
     ],

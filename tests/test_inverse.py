@@ -83,6 +83,69 @@ def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
     np.testing.assert_allclose(evaluate(points)[1], differences, rtol=1e-4, atol=1e-4)
 
 
+def test_a_likelihood_is_smooth_in_the_amplitude():
+    """However rough the margin is: nodes do not move along."""
+    amplitude = TRUTH["amplitude"] * np.exp(np.linspace(-0.5, 0.5, 1001))
+    terms = log_terms(rocks(["survived", "toppled"] * 6), amplitude=amplitude, period=1.7)
+    bends = np.abs(np.diff(terms, 2, axis=0))
+    # A normal probability bends by 1/scatter^2 at most; the rest is where nodes come and go, far outside.
+    assert bends.max() < 1e-2 and np.quantile(bends, 0.98) < 5e-5
+
+
+def log_terms(seen, scatter=SCATTER, **values):
+    """Of rocks at motions (motions, rocks)."""
+    return np.asarray(rk.Likelihood(seen, rk.SinePulse, scatter).log_terms(values, slopes=False))
+
+
+def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
+    """However little the rotation is uncertain: from node to node it goes from none to overturning."""
+    alpha = np.array([0.2, 0.17, 0.23] * 4)
+    p, peak, sd = np.array([3.0, 3.5, 2.5] * 4), np.repeat([0.1, 0.08, 0.12, 0.05], 3), np.repeat([0.01, 0.02], 6)
+    seen = rk.Observations(alpha, p, ["rotation"] * 12, rotation=peak, rotation_sd=sd)
+    amplitude = np.geomspace(0.12, 0.6, 80)
+    found = log_terms(seen, 0.3, amplitude=amplitude, period=1.2)
+    e = np.linspace(-4.5, 4.5, 3001)
+    factors = np.exp(0.3 * e)
+    exact = np.empty_like(found)
+    for i in range(12):
+        grid = np.geomspace(amplitude[0] * factors[0], amplitude[-1] * factors[-1], 12_000)
+        scene = rk.sweep(rotation_of, outer=False, progress=False, amplitude=grid, alpha=0 * grid + alpha[i],
+                         p=0 * grid + p[i]).values  # fmt: skip
+        density = np.exp(-(((peak[i] - scene["peak"]) / sd[i]) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd[i])
+        density = np.where(scene["lost"], 0.0, density)
+        weight = np.exp(-((np.log(grid / amplitude[:, None]) / 0.3) ** 2) / 2) / (np.sqrt(2 * np.pi) * 0.3)
+        exact[:, i] = (density * weight).sum(axis=1) * np.log(grid[1] / grid[0])
+    exact = np.log(0.98 * exact + 0.01 * 2 / np.pi)
+    # Such rotations are met within one or two hundredths of the amplitude, a tenth of the way from node to node.
+    assert np.sqrt(np.mean((found - exact) ** 2)) < 0.45 and np.max(np.abs(found - exact)) < 1.0
+    total = found.sum(axis=1)
+    assert np.sum(np.diff(np.sign(np.diff(total))) < 0) == 1  # one maximum
+    assert abs(np.log(amplitude[total.argmax()] / amplitude[exact.sum(axis=1).argmax()])) < 0.05
+
+
+def rotation_of(amplitude, alpha, p):
+    found = rk.outcome(rk.Block(alpha, p), rk.SinePulse(amplitude, 1.2))
+    return {"lost": found.overturned, "peak": jnp.where(found.overturned, 0.0, found.max_rotation)}
+
+
+def test_motions_that_there_are_not_are_impossible():
+    terms = log_terms(rocks(["survived"] * 12), amplitude=np.array([0.2, 0.2, np.nan]), period=np.array([1, -1, 1]))
+    assert np.isfinite(terms[0]).all() and (terms[1:] == -np.inf).all()
+    never = {"amplitude": UNKNOWNS["amplitude"], "period": rk.Unknown(-2.0, -1.0, log=False)}
+    with pytest.raises(ValueError, match="`unknowns` must have ranges in which there are motions"):
+        rk.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, never, SCATTER, starts=1)
+
+
+@pytest.mark.parametrize("what", ["survival", "log_terms"])
+def test_slopes_that_were_not_computed_are_refused(what):
+    likelihood = rk.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
+    options = {} if what == "survival" else {"slopes": False}
+    with pytest.raises(NotImplementedError, match="without derivatives"):
+        jax.eval_shape(
+            jax.grad(lambda a: getattr(likelihood, what)(dict(amplitude=a, period=1.0), **options).sum()), 0.3
+        )
+
+
 def test_second_derivatives_are_refused():
     likelihood = rk.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
     with pytest.raises(NotImplementedError, match="first derivatives only"):
@@ -313,11 +376,33 @@ def test_a_file_of_rocks(tmp_path):
         ("a,ten,0.5,1,0,,toppled,,", "line 2: `alpha_deg` must be a number"),
         ("a,10,0.5,1,0,,toppled,", "line 2: has 8 fields, but there are 9 columns"),
         ("a,,0.5,1,0,,toppled,,", "line 2: `alpha` is empty"),
+        ("#1,10,0.5,1,0,,toppled,,", "line 2: looks like a rock, but a line that begins with # is a comment"),
     ],
 )
 def test_impossible_rocks_are_named_by_their_line(tmp_path, line, message):
     path = tmp_path / "rocks.csv"
     path.write_text(f"{HEADER}\n{line}\n")
+    with pytest.raises(ValueError, match=message):
+        rk.read_observations(path)
+
+
+@pytest.mark.parametrize(
+    "header, message",
+    [
+        ("alpha_deg;p_rad_per_s;observed", "must separate its fields by commas"),
+        ("alpha_deg,alpha_rad_sd,p_rad_per_s,observed", "has a column `alpha_rad_sd`, but no column `alpha_rad`"),
+        ("alpha_deg,half_diagonal_m,p_rad_per_s_sd,observed", "`p_rad_per_s_sd`, but no column `p_rad_per_s`"),
+        ("alpha_deg,p_rad_per_s,restitution_sd,observed", "`restitution_sd`, but no column `restitution`"),
+        ("alpha_deg,p_rad_per_s,observed,rotation_rad,rotation_deg", "rotation_rad, rotation_deg, and not both"),
+        ("alpha_deg,p_rad_per_s,observed,facing", "`facing`, which is for rocks whose sides differ"),
+        ("alpha_deg,p_rad_per_s,observed,inertia_ratio", "`inertia_ratio`, which is for rocks whose sides differ"),
+        ("alpha_deg,alpha_rad,p_rad_per_s,observed", "must have one of the columns alpha_rad, alpha_deg"),
+        ("alpha_deg,observed", "must have one of the columns p_rad_per_s"),
+    ],
+)
+def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, message):
+    path = tmp_path / "rocks.csv"
+    path.write_text(f"{header}\n{','.join('1' * (header.count(',') + 1))}\n")
     with pytest.raises(ValueError, match=message):
         rk.read_observations(path)
 
