@@ -12,7 +12,9 @@ margin:
 A probit of the margin over its slope (the delta method) would give that where the margin is straight; but overturning
 sets are unions of intervals, narrower than the scatter or wider, and a probit with one slope would be certain where the
 slope vanishes, in the middle of one. So the margin is computed at many amplitudes (see `possible`). No derivatives are
-needed for the likelihood, and only first ones for its slope.
+needed for the likelihood, and only first ones for its slope. Beside counted verdicts probabilities are off by 0.01 to
+0.04 (root of the mean square), and by up to 0.13 where shape and size are known to a tenth or two only
+(`benchmarks/inverse.md`).
 
 Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
 both ways.
