@@ -5,6 +5,7 @@
     python benchmarks/inverse.py grid
     python benchmarks/inverse.py posterior --rocks 20
     python benchmarks/inverse.py probabilities
+    python benchmarks/inverse.py optimizers
 
 Each adds what it measured to inverse.json and writes inverse.md from all of it; what is done of a coverage is kept,
 and goes on from there. Synthetic rocks are drawn anew in every repetition: sizes and shapes, then their true alpha, p
@@ -195,6 +196,33 @@ def grid(kept: dict, rocks: int, points: int) -> None:
     write(kept)
 
 
+def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
+    """Points that climbers need from the same starts, beside Adam of optax at several rates, all starts at once."""
+    import optax
+
+    from jaxrock.climb import climb
+    from jaxrock.inverse import _starts
+    from jaxrock.problem import Evaluator
+
+    seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
+    evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))
+    begin = _starts(starts, evaluate)
+    before = evaluate.count
+    found = climb(evaluate, begin)
+    rows = {"climbers": [float(found.values.max()), evaluate.count - before]}
+    for rate in (0.03, 0.1, 0.3):
+        method, points, best, before = optax.adam(rate), begin, -np.inf, evaluate.count
+        state = method.init(points)
+        for step in range(1, 301):
+            values, slopes = evaluate(points)
+            moves, state = method.update(-slopes, state)
+            points, best = np.asarray(optax.apply_updates(points, moves)), max(best, float(values.max()))
+            if step in (30, 100, 300):
+                rows[f"Adam, rate {rate:g}, {step} steps"] = [best, evaluate.count - before]
+    kept["optimizers"] = rows
+    write(kept)
+
+
 def write(kept: dict) -> None:
     """Keep what was measured, and say it."""
     KEPT.write_text(json.dumps(kept) + "\n")
@@ -228,6 +256,17 @@ def write(kept: dict) -> None:
             f"| {row['scatter']:g} | {row['alpha']:g} | {row['p']:g} | {row['rms']:.3f} | {row['worst']:.3f} | "
             f"{row['mean']:+.4f} |"
             for row in kept["probabilities"]
+        ]
+    if "optimizers" in kept:
+        highest = max(value for value, _ in kept["optimizers"].values())
+        lines += [
+            "",
+            "## Climbers of this package beside optax, from the same 16 starts (20 rocks, two parameters)",
+            "",
+        ]
+        lines += ["| method | below the highest | points |", "| --- | ---: | ---: |"]
+        lines += [
+            f"| {name} | {highest - value:.1e} | {points:,} |" for name, (value, points) in kept["optimizers"].items()
         ]
     if "grid" in kept:
         lines += ["", "## Beside a grid", "", *_grid_text(kept["grid"])]
@@ -291,7 +330,7 @@ def _coverage_text(rows: list[dict]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("coverage", "times", "grid", "posterior", "probabilities"))
+    parser.add_argument("what", choices=("coverage", "times", "grid", "posterior", "probabilities", "optimizers"))
     parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
     parser.add_argument("--repetitions", type=int, default=400)
     parser.add_argument("--scatter", type=float, default=0.1)
@@ -307,6 +346,8 @@ def main() -> None:
         times(kept, given.rocks or 100, given.starts or 64)
     elif given.what == "posterior":
         posterior(kept, given.rocks or 20)
+    elif given.what == "optimizers":
+        optimizers(kept)
     elif given.what == "probabilities":
         probabilities(kept)
     else:
