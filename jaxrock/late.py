@@ -4,7 +4,11 @@ from collections.abc import Callable
 
 import jax
 from jax.extend.core import ClosedJaxpr, Primitive
-from jax.interpreters import mlir
+
+try:
+    from jax.interpreters.mlir import lower_fun, register_lowering
+except ImportError:  # a release of JAX without them
+    lower_fun = None
 
 _late_p = Primitive("late")
 _late_p.multiple_results = True
@@ -27,6 +31,9 @@ def late(function: Callable, made_of: ClosedJaxpr, told: str, results) -> Callab
     stand for it in the text of programs, so they have to tell it from others.
     """
 
+    if lower_fun is None:
+        return function
+
     def run(tree):
         leaves, structure = jax.tree.flatten(tree)
         shapes, structure_of_results = jax.tree.flatten(results)
@@ -42,7 +49,8 @@ def _run(*leaves, function, made_of):
 
 
 _late_p.def_impl(_run)
-mlir.register_lowering(_late_p, mlir.lower_fun(_run, multiple_results=True))
+if lower_fun is not None:
+    register_lowering(_late_p, lower_fun(_run, multiple_results=True))
 
 
 @_late_p.def_abstract_eval
