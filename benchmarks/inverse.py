@@ -236,7 +236,10 @@ def write(kept: dict) -> None:
             f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['responses']:,} |"
             for key, row in kept["times"].items()
         ]
-        lines += ["", "The first fit compiles. Where processor time is less than time, other work took the machine."]
+        lines += [
+            "",
+            "The first fit compiles. Both cores work in parts of it: processor time may be up to twice the time.",
+        ]
     if "posterior" in kept:
         lines += ["", "## Exponential pulses, three parameters: samples of the posterior", ""]
         lines += ["| rocks | time [s] | processor time [s] | samples kept | smallest effective size | largest R-hat |"]

@@ -12,7 +12,7 @@ node: a probit that smears each interval so far that the sum is smooth.
 Nodes are fixed levels of the strength of the motion over the rock's tan(alpha): a motion that grows moves the weights
 along, and not the nodes. So the probability is as smooth in the amplitude as the normal distribution is, however rough
 the margin: overturning sets are unions of intervals, some of them narrower than what is between two nodes, and nodes
-that move with the amplitude would flicker through these. What is narrower than about a third of the scatter is either
+that move with the amplitude would flicker through these. What is narrower than two fifths of the scatter is either
 met by a node or not, and counts for an interval or for nothing.
 
 From node to node alpha, p and restitution change, too, in patterns that have no mean and no correlation: whatever the

@@ -380,8 +380,12 @@ def test_a_file_of_rocks(tmp_path):
     ],
 )
 def test_impossible_rocks_are_named_by_their_line(tmp_path, line, message):
-    path = tmp_path / "rocks.csv"
-    path.write_text(f"{HEADER}\n{line}\n")
+    refused(tmp_path, HEADER, line, message)
+
+
+def refused(folder, header, line, message):
+    path = folder / "rocks.csv"
+    path.write_text(f"{header}\n{line}\n")
     with pytest.raises(ValueError, match=message):
         rk.read_observations(path)
 
@@ -401,10 +405,7 @@ def test_impossible_rocks_are_named_by_their_line(tmp_path, line, message):
     ],
 )
 def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, message):
-    path = tmp_path / "rocks.csv"
-    path.write_text(f"{header}\n{','.join('1' * (header.count(',') + 1))}\n")
-    with pytest.raises(ValueError, match=message):
-        rk.read_observations(path)
+    refused(tmp_path, header, ",".join("1" * (header.count(",") + 1)), message)
 
 
 @pytest.mark.parametrize(
