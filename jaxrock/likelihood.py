@@ -35,6 +35,7 @@ from jaxrock.models import Housner, Model
 from jaxrock.motion import AbstractMotion
 from jaxrock.observations import ROTATION, TOPPLED, Observations
 from jaxrock.possible import Possible, levels_around
+from jaxrock.pulses import AbstractPulse
 from jaxrock.response import outcome
 from jaxrock.status import Status
 
@@ -164,7 +165,7 @@ class Likelihood(eqx.Module):
             def results(parameters):
                 with put_down():  # those of the motion are looked at before, and the rocks are known to be good
                     motion = self.motion(**dict(zip(names, parameters)))
-                    motion = motion * (way * jnp.exp(level - _log_strength(motion)))
+                    motion = _of_strength(motion, level, way)
                     found = outcome(block, motion, self.model, engine=self.engine)
                 rotation = jnp.where(found.overturned, 0.0, found.max_rotation)
                 real = jnp.stack([found.margin, rotation])
@@ -203,6 +204,16 @@ class Likelihood(eqx.Module):
 def _log_strength(motion: AbstractMotion) -> Real:
     """Logarithm of a measure of the acceleration: any that grows with it will do."""
     return jnp.log(jnp.maximum(jnp.max(motion.bounds), _NO_STRENGTH))
+
+
+def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> AbstractMotion:
+    """The motion made so strong, one way or (-1) the other.
+
+    The amplitude of a pulse, which would cancel, is left out, so that nothing is differentiated by it.
+    """
+    if isinstance(motion, AbstractPulse):
+        motion = eqx.tree_at(lambda pulse: pulse.amplitude, motion, jnp.sign(motion.amplitude))
+    return motion * (way * jnp.exp(logarithm - _log_strength(motion)))
 
 
 @jax.custom_jvp

@@ -1,14 +1,14 @@
-"""Samples of the posterior distribution of a motion's parameters (NumPyro, an extra).
+"""Samples of the posterior distribution of a motion's parameters (with NumPyro's diagnostics, an extra).
 
-The posterior has several maxima and ridges, and many motions at once are cheap: so ensembles of walkers, which need
-log-densities only and learn from each other how far and where to step. Several ensembles know nothing of each other:
-whether they agree tells whether they have arrived.
+The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
+where it is first (see `proposals`). Several chains know nothing of each other: whether they agree tells whether they
+have arrived. (Ensembles of walkers, by NumPyro's AIES, take ten times as many responses or more:
+benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
@@ -19,16 +19,17 @@ from jaxrock.inverse import Estimate, EstimateStatus, estimate_motion
 from jaxrock.likelihood import Likelihood
 from jaxrock.models import Housner, Model
 from jaxrock.observations import Observations
+from jaxrock.possible import NODES
 from jaxrock.problem import Problem, Unknown
+from jaxrock.proposals import ROUNDS, around, begin, learn
 
 Real = Inexact[Array, "..."]
 
-_ENSEMBLES, _WALKERS = 4, 24
-_STEPS = 50  # in one call of the compiled program
-_THINNED = 5  # one in so many is kept
-_BURNT = 3  # of what is kept one in so many, the first, is not used
-_DEPTH = 6.0  # log-density below the best maximum down to which walkers begin at maxima
-_APART = 0.05  # of the ranges: how far from them
+_CHAINS = 8
+_ROUND = 512  # points of a round: those of all chains together
+_LANES = 64  # points in one call of the compiled program
+_DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
+_AROUND, _EVENLY = 0.05, 0.85  # how far from them, in ranges; share of the first points that is spread over everything
 _ALIKE = 1.01  # R-hat
 _END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
 
@@ -36,12 +37,12 @@ _END = 0.02  # of a range, where samples are counted: an end is open if there ar
 class PosteriorStatus(eqx.Enumeration):
     """Whether samples can be trusted; `PosteriorStatus[posterior.status]` is the message."""
 
-    successful = "The ensembles agree, and hold enough independent samples."
+    successful = "The chains agree, and hold enough independent samples."
     open_interval = (
-        "The ensembles agree. The observations leave a parameter open: its distribution reaches the end of the range, "
+        "The chains agree. The observations leave a parameter open: its distribution reaches the end of the range, "
         "which bounds it as a prior does."
     )
-    not_converged = "The ensembles do not agree, or there are too few independent samples. Raise `steps`."
+    not_converged = "The chains do not agree, or there are too few independent samples. Raise `steps`."
     contradictory = (
         "The observations contradict each other (see the estimate): samples say what would hold if they did not."
     )
@@ -50,12 +51,13 @@ class PosteriorStatus(eqx.Enumeration):
 class Posterior(eqx.Module):
     """Samples of a posterior distribution.
 
-    - `names`: the parameters; `samples`: (ensembles, steps, walkers, parameters), in their units; every fifth step.
-    - `log_density`: (ensembles, steps, walkers) log-likelihood and log-prior.
+    - `names`: the parameters; `samples`: (chains, steps, parameters), in their units.
+    - `log_density`: (chains, steps) log-likelihood and log-prior.
     - `effective_size`: (parameters,) number of independent samples that would know the mean as well.
-    - `r_hat`: (parameters,) between halves of all ensembles, 1 if they agree.
+    - `r_hat`: (parameters,) between halves of all chains, 1 if they agree.
     - `open`: (parameters, 2) whether the distribution reaches the end of its range.
-    - `estimate`: the `Estimate` from whose maxima walkers began.
+    - `responses`: how many scenes were computed, without those of the estimate.
+    - `estimate`: the `Estimate`, by whose maxima the distribution was looked for.
     - `status`: a `PosteriorStatus`.
     """
 
@@ -65,6 +67,7 @@ class Posterior(eqx.Module):
     effective_size: Real
     r_hat: Real
     open: Bool[Array, "parameters 2"]
+    responses: int = eqx.field(static=True)
     estimate: Estimate
     status: PosteriorStatus
 
@@ -97,7 +100,7 @@ def sample_motion(
     lapse: ArrayLike = 0.02,
     estimate: Estimate | None = None,
     effective_size: int = 1000,
-    steps: int = 3000,
+    steps: int = 4000,
     seed: int = 0,
     model: Model = Housner(),
     engine: AbstractEngine | None = None,
@@ -111,9 +114,9 @@ def sample_motion(
     **Arguments:**
 
     - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `model`, `engine`: as in `estimate_motion`.
-    - `estimate`: what `estimate_motion` found: walkers begin at its best maxima. None makes one.
-    - `effective_size`: of every parameter at which it ends, once the ensembles agree (R-hat below 1.01); at least 1.
-    - `steps`: of all walkers, at most; at least 1. The first third is not used.
+    - `estimate`: what `estimate_motion` found: where to look first. None makes one.
+    - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
+    - `steps`: of each of eight chains, at most; at least 1.
     - `seed`: of the random numbers.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -122,11 +125,11 @@ def sample_motion(
     **Raises:** ValueError for arguments outside their ranges; ImportError without NumPyro (`pip install
     "jaxrock[posterior]"`).
 
-    **Source:** Ter Braak (2006), differential evolution; Goodman & Weare (2010), stretches and the effective size of an
-    ensemble; Vehtari et al. (2021), R-hat.
+    **Source:** Hastings (1970), independent proposals; Cappe et al. (2004), populations of them that learn; Vehtari et
+    al. (2021), R-hat and effective size, by NumPyro.
     """
     try:
-        import numpyro.infer  # noqa: F401
+        import numpyro.diagnostics  # noqa: F401
     except ImportError as error:
         raise ImportError('Sampling needs NumPyro: pip install "jaxrock[posterior]".') from error
     for name, value in (("effective_size", effective_size), ("steps", steps)):
@@ -137,91 +140,61 @@ def sample_motion(
             observations, motion, unknowns, scatter, lapse=lapse, model=model, engine=engine, progress=progress
         )
     problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
-    bar, rounds = Progress(steps, "posterior", progress), -(-steps // _STEPS)
-    key, walkers = jax.random.key(seed), _beginnings(problem, estimate, seed)
-    found = []
-    for number in range(rounds):
-        walkers, kept = _advance(problem, jax.random.fold_in(key, number), walkers)
-        found.append([np.asarray(x) for x in kept])
-        places, density = (np.concatenate(x)[len(found) * (_STEPS // _THINNED) // _BURNT :] for x in zip(*found))
-        sizes, r_hat = diagnostics(places)
-        bar.add(min(_STEPS, steps - bar.done))
+    random, density = np.random.default_rng(seed), _Density(problem)
+    bar = Progress(ROUNDS + -(-steps * _CHAINS // _ROUND), "posterior", progress)
+    low, high = np.asarray(problem.ends).T
+    first = around(_summits(problem, estimate), _AROUND, _EVENLY, low, high)
+    drawn = learn(density, first, _ROUND, random, lambda: bar.add(1))
+    chains = begin(drawn, _CHAINS, random)
+    while chains.steps < steps:
+        chains = chains.follow(density, min(_ROUND // _CHAINS, steps - chains.steps), random)
+        sizes, r_hat = diagnostics(chains.places[1:])
+        bar.add(1)
         if sizes.min() >= effective_size and r_hat.max() < _ALIKE:
             break
     bar.add(bar.total - bar.done)
-    return _conclude(problem, estimate, places, density, sizes, r_hat, effective_size)
-
-
-@eqx.filter_jit  # so that it is traced once, however often loops around it are
-def _log_density(problem: Problem, places: Real) -> Real:
-    low, high = problem.ends.T
-    inside = ((places >= low) & (places <= high)).all(axis=-1)
-    return jnp.where(inside, problem.log_density(jnp.clip(places, low, high), slopes=False), -jnp.inf)
+    places, values = chains.places[1:], chains.log_density[1:]
+    return _conclude(problem, estimate, places, values, sizes, r_hat, effective_size, density.count)
 
 
 @eqx.filter_jit
-def _advance(problem: Problem, key: Array, walkers: Real) -> tuple[Real, tuple[Real, Real]]:
-    """Walkers, (ensembles, walkers, parameters), after some steps; places and log-densities of those that are kept."""
-    from numpyro.infer import AIES
+def _log_density(problem: Problem, places: Real) -> Real:
+    return problem.log_density(places, slopes=False)
 
-    arrays, rest = eqx.partition(problem, eqx.is_array)
 
-    @jax.custom_batching.custom_vmap
-    def log_density(arrays, places):
-        return _log_density(eqx.combine(arrays, rest), places)
+class _Density:
+    """Log-densities at any number of places, in batches of one compiled program; it counts."""
 
-    @log_density.def_vmap
-    def _(size, batched, arrays, places):
-        return log_density(arrays, places), True  # more of them, in one batch
+    def __init__(self, problem: Problem):
+        self.problem, self.count = problem, 0
 
-    # Steps of length one between two walkers lead from one maximum to another.
-    moves = {AIES.DEMove(): 0.6, AIES.StretchMove(): 0.3, AIES.DEMove(g0=1.0): 0.1}
-    with jax.ensure_compile_time_eval():  # it checks them
-        kernel = AIES(potential_fn=lambda place: -log_density(arrays, place), randomize_split=True, moves=moves)
+    def __call__(self, places: np.ndarray) -> np.ndarray:
+        found = []
+        for number in range(0, len(places), _LANES):
+            part = places[number : number + _LANES]
+            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
+            found.append(np.asarray(_log_density(self.problem, padded))[: len(part)])
+        self.count += len(places)
+        found = np.concatenate(found)
+        return np.where(np.isnan(found), -np.inf, found)
 
-    def begin(key, walkers):
-        return kernel.init(jax.random.split(key, walkers.shape[0]), 0, walkers)
 
-    def step(_, state):
-        return jax.vmap(lambda state: kernel.sample(state, (), {}))(state)
-
-    def keep(state, _):
-        state = jax.lax.fori_loop(0, _THINNED, step, state)
-        return state, (state.z, log_density(arrays, state.z))
-
-    state = jax.vmap(begin)(jax.random.split(key, walkers.shape[0]), walkers)
-    state, kept = jax.lax.scan(keep, state, length=_STEPS // _THINNED)
-    return state.z, kept
+def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
+    """Places of the best maxima of the estimate, (maxima, parameters)."""
+    values = np.asarray(estimate.summit_values)
+    summits = np.asarray(estimate.summits)[values > values.max() - _DEPTH]
+    logs = np.array([unknown.log for unknown in problem.unknowns.values()])
+    return np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
 
 
 def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sizes and R-hat, (parameters,) each, of places (steps, ensembles, walkers, parameters).
-
-    Walkers of an ensemble are not independent: the effective size comes from the series of their means, whose variance
-    tells how many independent walkers there are, and whose autocorrelation how many independent steps.
-    """
+    """Effective sizes and R-hat, (parameters,) each, of places (steps, chains, parameters); few steps tell nothing."""
     from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 
-    by_ensemble = places.swapaxes(0, 1)
-    means = by_ensemble.mean(axis=2)
-    variance = by_ensemble.var(axis=(0, 1, 2)), np.maximum(means.var(axis=(0, 1)), 1e-300)
-    sizes = np.asarray(effective_sample_size(means)) * variance[0] / variance[1]
-    flat = by_ensemble.reshape(by_ensemble.shape[0], -1, places.shape[-1])
-    return sizes, np.asarray(split_gelman_rubin(flat))
-
-
-def _beginnings(problem: Problem, estimate: Estimate, seed: int) -> Real:
-    """Places at which walkers begin, (ensembles, walkers, parameters), none like another: around the best maxima."""
-    random = np.random.default_rng(seed)
-    low, high = np.asarray(problem.ends).T
-    logs = np.array([unknown.log for unknown in problem.unknowns.values()])
-    values = np.asarray(estimate.summit_values)
-    summits = np.asarray(estimate.summits)[values > values.max() - _DEPTH]
-    places = np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
-    places = places[random.integers(len(places), size=(_ENSEMBLES, _WALKERS))]
-    share = (places - low) / (high - low) + _APART * random.normal(size=places.shape)
-    share = 1 - np.abs(1 - np.abs(share) % 2)  # what lies beyond an end is reflected
-    return jnp.asarray(low + (high - low) * share)
+    if len(places) < 4:
+        return np.zeros(places.shape[-1]), np.full(places.shape[-1], np.inf)
+    by_chain = places.swapaxes(0, 1)
+    return np.asarray(effective_sample_size(by_chain)), np.asarray(split_gelman_rubin(by_chain))
 
 
 def _conclude(
@@ -232,6 +205,7 @@ def _conclude(
     sizes: np.ndarray,
     r_hat: np.ndarray,
     wanted: int,
+    points: int,
 ) -> Posterior:
     low, high = np.asarray(problem.ends).T
     share = ((places - low) / (high - low)).reshape(-1, low.size)
@@ -249,6 +223,7 @@ def _conclude(
         effective_size=jnp.asarray(sizes),
         r_hat=jnp.asarray(r_hat),
         open=jnp.asarray(open_),
+        responses=points * problem.likelihood.observations.ways.size * NODES,
         estimate=estimate,
         status=status,
     )

@@ -117,7 +117,8 @@ class _Sides:
         low, high = self.evaluate.ends
         inner = np.clip(begin, low + _AWAY * (high - low), high - _AWAY * (high - low))
         points = self.evaluate.points(np.where(free, inner, begin))
-        reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-4, together=False)
+        group = np.repeat(np.arange(len(wanted)), 2)
+        reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-3, group=group)
         places, values = self.evaluate.places(reached.points), reached.values
         for number, (side, value) in enumerate(wanted.items()):
             best = 2 * number + int(values[2 * number + 1] > values[2 * number])

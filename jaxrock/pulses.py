@@ -34,7 +34,13 @@ def _harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
     return terms[: order + 1]
 
 
-class RectangularPulse(AbstractMotion):
+class AbstractPulse(AbstractMotion):
+    """A motion that is proportional to its `amplitude` [g]."""
+
+    amplitude: eqx.AbstractVar[Real]
+
+
+class RectangularPulse(AbstractPulse):
     """Constant `amplitude` [g] for `duration` [s] (positive): the limit shape -> -inf of `ExponentialPulse`."""
 
     amplitude: Real
@@ -60,7 +66,7 @@ class RectangularPulse(AbstractMotion):
         return [self.amplitude + 0.0 * local]
 
 
-class TriangularPulse(AbstractMotion):
+class TriangularPulse(AbstractPulse):
     """Straight up to `amplitude` [g] at mid `duration` [s] and straight down: shape 0 of `ExponentialPulse`."""
 
     amplitude: Real
@@ -97,7 +103,7 @@ def _growth_ratio(x: Real) -> Real:
     return jnp.where(small, near, jnp.expm1(far) / far)
 
 
-class ExponentialPulse(AbstractMotion):
+class ExponentialPulse(AbstractPulse):
     """The single-lobe pulse family that runs from rectangle through triangle to spike.
 
     With x = time/duration, u = amplitude (1 - e^(2 shape x))/(1 - e^shape) up to x = 1/2, then mirrored.
@@ -183,7 +189,7 @@ class ExponentialPulse(AbstractMotion):
         return terms
 
 
-class HalfSinePulse(AbstractMotion):
+class HalfSinePulse(AbstractPulse):
     """amplitude sin(pi t/duration) [g] for `duration` [s] (positive)."""
 
     amplitude: Real
@@ -210,7 +216,7 @@ class HalfSinePulse(AbstractMotion):
         return _sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
-class SinePulse(AbstractMotion):
+class SinePulse(AbstractPulse):
     """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
     amplitude: Real
@@ -237,7 +243,7 @@ class SinePulse(AbstractMotion):
         return _sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
-class CosinePulse(AbstractMotion):
+class CosinePulse(AbstractPulse):
     """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
 
     amplitude: Real
@@ -270,7 +276,7 @@ class CosinePulse(AbstractMotion):
 _ANTISYMMETRIC_PEAK = math.sqrt(3 - math.sqrt(6)) * math.sqrt(6) * math.exp(-(3 - math.sqrt(6)) / 2)
 
 
-class RickerPulse(AbstractMotion):
+class RickerPulse(AbstractPulse):
     """A Ricker wavelet, the second or third derivative of a Gaussian.
 
     symmetric: u = amplitude (1 - 2 y^2) e^(-y^2), y = pi (t - center)/period;
@@ -342,7 +348,7 @@ class RickerPulse(AbstractMotion):
         ]
 
 
-class MavroeidisPapageorgiouPulse(AbstractMotion):
+class MavroeidisPapageorgiouPulse(AbstractPulse):
     """The near-fault pulse of Mavroeidis & Papageorgiou: a cosine velocity under a cosine bell.
 
     velocity = V/2 [1 + cos(2 pi x/(oscillations period))] cos(2 pi x/period + phase), x = t - center,

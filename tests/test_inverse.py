@@ -250,7 +250,7 @@ def test_climbers_find_summits_and_hold_what_is_held():
 
     starts = np.array([[0.0, 0.0], [3.0, -2.0]])
     np.testing.assert_allclose(climb(hills, starts).points[0], 1.0, atol=1e-4)
-    held = climb(hills, starts, np.array([True, False]), together=False)
+    held = climb(hills, starts, np.array([True, False]), group=np.arange(len(starts)))
     np.testing.assert_allclose(held.points, [[1.0, 0.0], [1.0, -2.0]], atol=1e-4)
 
 
