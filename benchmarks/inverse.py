@@ -3,7 +3,8 @@
     python benchmarks/inverse.py coverage --repetitions 400 [--spanning]
     python benchmarks/inverse.py times
     python benchmarks/inverse.py grid
-    python benchmarks/inverse.py posterior --rocks 20
+    python benchmarks/inverse.py posterior --rocks 100
+    python benchmarks/inverse.py samplers
     python benchmarks/inverse.py probabilities
     python benchmarks/inverse.py optimizers
 
@@ -21,6 +22,7 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxrock as rk
@@ -29,6 +31,7 @@ from jaxrock.problem import Problem
 
 TRUTH = {"amplitude": 0.35, "period": 0.8}
 KEPT = Path(__file__).with_suffix(".json")
+WHAT = ("coverage", "times", "grid", "posterior", "samplers", "probabilities", "optimizers")
 
 
 def unknowns() -> dict[str, rk.Unknown]:
@@ -125,9 +128,51 @@ def posterior(kept: dict, rocks: int) -> None:
     kept.setdefault("posterior", {})[f"{rocks} rocks"] = {
         "wall": time.monotonic() - begun,
         "cpu": time.process_time() - used,
-        "samples": int(np.prod(drawn.samples.shape[:3])),
+        "samples": int(np.prod(drawn.samples.shape[:2])),
+        "responses": drawn.responses,
         "size": float(drawn.effective_size.min()),
         "r_hat": float(drawn.r_hat.max()),
+    }
+    write(kept)
+
+
+def samplers(kept: dict, rocks: int = 20, walkers: int = 24, steps: int = 2000) -> None:
+    """Points that `sample_motion` computes, beside those of an ensemble of walkers by NumPyro that begins at its
+    samples; effective sizes, of walkers as of chains, by the same function."""
+    import equinox as eqx
+    from numpyro.infer import AIES, MCMC
+
+    from jaxrock.posterior import diagnostics
+
+    seen = synthetic(rocks, np.random.default_rng(0), 0.2)
+    found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
+    drawn = rk.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
+    rows = {"chains with proposals that learn": (drawn.effective_size, drawn.r_hat, drawn.responses // (NODES * rocks))}
+    problem = Problem(rk.Likelihood(seen, rk.ExponentialPulse, 0.2), three())
+    low, high = problem.ends.T
+    arrays, rest = eqx.partition(problem, eqx.is_array)
+
+    @jax.custom_batching.custom_vmap
+    def log_density(arrays, places):
+        inside = ((places >= low) & (places <= high)).all(axis=-1)
+        density = eqx.combine(arrays, rest).log_density(jnp.clip(places, low, high), slopes=False)
+        return jnp.where(inside, density, -jnp.inf)
+
+    log_density.def_vmap(lambda size, batched, arrays, places: (log_density(arrays, places), True))
+    moves = {AIES.DEMove(): 0.6, AIES.StretchMove(): 0.3, AIES.DEMove(g0=1.0): 0.1}
+    kernel = AIES(potential_fn=lambda place: -log_density(arrays, place), moves=moves)  # walkers keep their numbers
+    chains = MCMC(kernel, num_warmup=0, num_samples=steps, num_chains=walkers, chain_method="vectorized",
+                  progress_bar=False)  # fmt: skip
+    values = {name: np.asarray(drawn[name]) for name in drawn.names}
+    places = np.stack([np.log(values["amplitude"]), np.log(values["duration"]), values["shape"]], axis=1)
+    start = places[np.random.default_rng(0).choice(len(places), walkers, replace=False)]
+    chains.run(jax.random.key(0), init_params=jnp.asarray(start))
+    walked = np.asarray(chains.get_samples(group_by_chain=True)).swapaxes(0, 1)
+    # It computes each proposal, and in every step anew where the walker is.
+    rows[f"ensemble of {walkers} walkers (AIES), {steps:,} steps"] = (*diagnostics(walked), 2 * steps * walkers)
+    kept["samplers"] = {
+        name: {"size": float(np.min(size)), "r_hat": float(np.max(r_hat)), "points": points}
+        for name, (size, r_hat, points) in rows.items()
     }
     write(kept)
 
@@ -242,14 +287,26 @@ def write(kept: dict) -> None:
         ]
     if "posterior" in kept:
         lines += ["", "## Exponential pulses, three parameters: samples of the posterior", ""]
-        lines += ["| rocks | time [s] | processor time [s] | samples kept | smallest effective size | largest R-hat |"]
-        lines += ["| --- | ---: | ---: | ---: | ---: | ---: |"]
         lines += [
-            f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['samples']:,} | {row['size']:.0f} | "
-            f"{row['r_hat']:.4f} |"
+            "| rocks | time [s] | processor time [s] | responses | samples | smallest effective size | largest R-hat |",
+            "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+        ]
+        lines += [
+            f"| {key} | {row['wall']:.0f} | {row['cpu']:.0f} | {row['responses']:,} | {row['samples']:,} | "
+            f"{row['size']:.0f} | {row['r_hat']:.4f} |"
             for key, row in kept["posterior"].items()
         ]
         lines += ["", "Compilation is in it, the fit in whose maxima it begins is not."]
+    if "samplers" in kept:
+        lines += ["", "## Samples beside those of NumPyro's ensembles (20 rocks, three parameters)", ""]
+        lines += ["| method | points | smallest effective size | points for each of these | largest R-hat |"]
+        lines += ["| --- | ---: | ---: | ---: | ---: |"]
+        lines += [
+            f"| {name} | {row['points']:,} | {row['size']:.0f} | {row['points'] / row['size']:.0f} | "
+            f"{row['r_hat']:.3f} |"
+            for name, row in kept["samplers"].items()
+        ]
+        lines += ["", "Walkers began at samples of the other; the points with which the other learned are counted."]
     if "probabilities" in kept:
         lines += ["", "## Probabilities that rocks stand, beside 10,000 drawn scenes", ""]
         lines += ["60 rocks and sine pulses; the drawing itself is uncertain by up to 0.005.", ""]
@@ -333,7 +390,7 @@ def _coverage_text(rows: list[dict]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("coverage", "times", "grid", "posterior", "probabilities", "optimizers"))
+    parser.add_argument("what", choices=WHAT)
     parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
     parser.add_argument("--repetitions", type=int, default=400)
     parser.add_argument("--scatter", type=float, default=0.1)
@@ -349,6 +406,8 @@ def main() -> None:
         times(kept, given.rocks or 100, given.starts or 64)
     elif given.what == "posterior":
         posterior(kept, given.rocks or 20)
+    elif given.what == "samplers":
+        samplers(kept)
     elif given.what == "optimizers":
         optimizers(kept)
     elif given.what == "probabilities":
