@@ -306,7 +306,12 @@ def write(kept: dict) -> None:
             f"{row['r_hat']:.3f} |"
             for name, row in kept["samplers"].items()
         ]
-        lines += ["", "Walkers began at samples of the other; the points with which the other learned are counted."]
+        lines += [
+            "",
+            "The points with which the chains learned are counted. Walkers began at samples of the chains; half of "
+            "their points are where a walker already is, which NumPyro computes again. Walkers depend on each other, "
+            "so that their effective size is rather too large.",
+        ]
     if "probabilities" in kept:
         lines += ["", "## Probabilities that rocks stand, beside 10,000 drawn scenes", ""]
         lines += ["60 rocks and sine pulses; the drawing itself is uncertain by up to 0.005.", ""]

@@ -4,7 +4,7 @@ Each climber has a BFGS matrix of its own; there are few dimensions. It tries on
 good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's
 line search, and a round is one call of one compiled program, whatever the climbers are at. (`optax.lbfgs` under
 `jax.vmap` would wait for the longest line search; its search also fails where the function has a batching rule of its
-own, as outcomes have. `optax.adam` takes seven times as many points or more: benchmarks/inverse.md.)
+own, as outcomes have. `optax.adam` takes many times as many points: benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable
@@ -16,9 +16,10 @@ _FARTHEST = 1.0  # a step, in the units of the points
 _ENOUGH = 1e-4  # of the gain that the slope promises
 _SHORTEST = 1e-9  # step below which there is a jump
 # Rounds after which climbers so far below the best are given up. (Of 11 fits, 416 climbers that were all followed to
-# their ends, none would have lost its highest summit so; sameness cost one of them 8e-4.)
+# their ends, none would have lost its highest summit so.)
 _HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1))
-_SAME = 0.03  # distance from a higher climber, in the units of the points, at which one is given up
+_SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
+_NOWHERE = -1e300  # the value where there is none
 
 
 class Summits(NamedTuple):
@@ -64,8 +65,9 @@ def climb(
         found *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(found), axis=1), 1e-300))[:, None]
         ahead[fresh], step[fresh] = found[fresh], 1.0
         promised = np.sum(ahead * slopes, axis=1)
-        arrived |= fresh & ~done & (promised < promise)
-        done |= arrived | (step < _SHORTEST)
+        level = fresh & ~done & (promised < promise)
+        arrived |= level & (values > _NOWHERE)
+        done |= level | (step < _SHORTEST)
         done |= _given_up(number, points, values, group)
         if done.all():
             break
@@ -114,4 +116,4 @@ def _finite(values, slopes) -> tuple[np.ndarray, np.ndarray]:
     """What is not a number is no place to climb to."""
     values, slopes = np.array(values), np.array(slopes)
     bad = ~np.isfinite(values) | ~np.isfinite(slopes).all(axis=1)
-    return np.where(bad, -1e300, values), np.where(bad[:, None], 0.0, slopes)
+    return np.where(bad, _NOWHERE, values), np.where(bad[:, None], 0.0, slopes)

@@ -1,9 +1,9 @@
 """Samples of the posterior distribution of a motion's parameters (with NumPyro's diagnostics, an extra).
 
 The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
-where it is first (see `proposals`). Several chains know nothing of each other: whether they agree tells whether they
-have arrived. (Ensembles of walkers, by NumPyro's AIES, take ten times as many responses or more:
-benchmarks/inverse.md.)
+where it is first (see `proposals`), from the maxima of an estimate and from everywhere. Whether chains agree tells
+whether they have arrived; not whether there is a maximum that neither the estimate nor any proposal has met. (Ensembles
+of walkers, by NumPyro's AIES, take ten times as many points: benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable
@@ -28,6 +28,7 @@ Real = Inexact[Array, "..."]
 _CHAINS = 8
 _ROUND = 512  # points of a round: those of all chains together
 _LANES = 64  # points in one call of the compiled program
+_PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
 _DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
 _AROUND, _EVENLY = 0.05, 0.85  # how far from them, in ranges; share of the first points that is spread over everything
 _ALIKE = 1.01  # R-hat
@@ -116,7 +117,7 @@ def sample_motion(
     - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `model`, `engine`: as in `estimate_motion`.
     - `estimate`: what `estimate_motion` found: where to look first. None makes one.
     - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
-    - `steps`: of each of eight chains, at most; at least 1.
+    - `steps`: of each of eight chains, at most; at least 1. Those before chains began anew are counted, but not used.
     - `seed`: of the random numbers.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -125,8 +126,8 @@ def sample_motion(
     **Raises:** ValueError for arguments outside their ranges; ImportError without NumPyro (`pip install
     "jaxrock[posterior]"`).
 
-    **Source:** Hastings (1970), independent proposals; Cappe et al. (2004), populations of them that learn; Vehtari et
-    al. (2021), R-hat and effective size, by NumPyro.
+    **Source:** Hastings (1970), independent proposals; Cappe et al. (2004), populations of them that learn; Gelman et
+    al. (2013, 11.4), R-hat between halves of chains, and effective size, by NumPyro.
     """
     try:
         import numpyro.diagnostics  # noqa: F401
@@ -146,8 +147,10 @@ def sample_motion(
     first = around(_summits(problem, estimate), _AROUND, _EVENLY, low, high)
     drawn = learn(density, first, _ROUND, random, lambda: bar.add(1))
     chains = begin(drawn, _CHAINS, random)
-    while chains.steps < steps:
-        chains = chains.follow(density, min(_ROUND // _CHAINS, steps - chains.steps), random)
+    for done in range(0, steps, _ROUND // _CHAINS):
+        if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
+            chains = begin(chains.drawn, _CHAINS, random)  # they have met something, from which there is more to learn
+        chains = chains.follow(density, min(_ROUND // _CHAINS, steps - done), random)
         sizes, r_hat = diagnostics(chains.places[1:])
         bar.add(1)
         if sizes.min() >= effective_size and r_hat.max() < _ALIKE:
@@ -184,7 +187,12 @@ def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
     values = np.asarray(estimate.summit_values)
     summits = np.asarray(estimate.summits)[values > values.max() - _DEPTH]
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
-    return np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
+    places = np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
+    low, high = np.asarray(problem.ends).T
+    slack = 1e-9 * (high - low)
+    if estimate.names != problem.names or not ((places > low - slack) & (places < high + slack)).all():
+        raise ValueError("Argument `estimate` must be of these unknowns in these ranges, but is of others.")
+    return np.clip(places, low, high)
 
 
 def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

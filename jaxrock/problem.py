@@ -14,6 +14,7 @@ from jaxrock.likelihood import Likelihood
 Real = Inexact[Array, "..."]
 
 _LANES = 4  # points in one call of the compiled program
+_FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
 
 
 class Unknown(eqx.Module):
@@ -26,7 +27,8 @@ class Unknown(eqx.Module):
     - `prior`: median and standard deviation of a normal prior on the logarithm (or on itself); None: a uniform one,
       with which the fit is that of maximum likelihood.
 
-    **Raises:** ValueError for values outside their ranges.
+    **Raises:** ValueError for values outside their ranges, and for a prior more than five standard deviations away from
+    the range.
     """
 
     low: Real
@@ -45,6 +47,9 @@ class Unknown(eqx.Module):
         if prior is not None and np.shape(prior) != (2,):
             raise ValueError(f"Argument `prior` must be a median and a standard deviation, but is {prior!r}.")
         self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
+        if prior is not None and not _FARTHEST >= self._away:
+            found = f"{prior} with a range of {low} to {high}"
+            raise ValueError(f"Argument `prior` must be within five standard deviations of the range, but is {found}.")
 
     @property
     def ends(self) -> Float[Array, "2"]:
@@ -52,12 +57,22 @@ class Unknown(eqx.Module):
         ends = jnp.stack([self.low, self.high])
         return jnp.log(ends) if self.log else ends
 
+    @property
+    def _middle(self) -> Real:
+        """The place of the prior's median."""
+        return jnp.log(self.prior[0]) if self.log else self.prior[0]
+
+    @property
+    def _away(self) -> Real:
+        """How far the range is from the prior's median, in its standard deviations."""
+        low, high = self.ends
+        return jnp.maximum(low - self._middle, self._middle - high) / self.prior[1]
+
     def log_prior(self, place: Real) -> Real:
         """Logarithm of the prior's density at a place in the range, but for a constant."""
         if self.prior is None:
             return jnp.zeros_like(place)
-        middle = jnp.log(self.prior[0]) if self.log else self.prior[0]
-        return -(((place - middle) / self.prior[1]) ** 2) / 2
+        return -(((place - self._middle) / self.prior[1]) ** 2) / 2
 
 
 class Problem(eqx.Module):

@@ -48,7 +48,9 @@ def test_single_budget():
     "engine, tolerance",
     [
         pytest.param(rk.Diffrax(solver=diffrax.Dopri8(), rtol=1e-9), 1e-8, id="Dopri8", marks=pytest.mark.slow),
-        pytest.param(rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)"),
+        pytest.param(
+            rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)", marks=pytest.mark.slow
+        ),
         pytest.param(rk.Diffrax(controller=diffrax.ConstantStepSize()), 1e-6, id="constant steps"),
     ],
 )
@@ -61,6 +63,7 @@ def test_any_solver(engine, tolerance):
     assert abs(float(found.margin - exact.margin)) < 3 * tolerance
 
 
+@pytest.mark.slow
 def test_history_to_rest():
     """More than a hundred impacts, one by one: times, velocities and the dense history agree with the series engine."""
     exact, found = (rk.simulate(BLOCK, PULSE, engine=e, samples=401) for e in (rk.Series(), rk.Diffrax()))

@@ -296,6 +296,7 @@ def test_extreme_blocks(ratio, alpha):
     assert np.all((found.margin < 0) == found.overturned)
 
 
+@pytest.mark.slow
 def test_single_precision():
     """Five digits in float32, with a warning that says how to get more."""
     block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.5, 1.1)
@@ -323,8 +324,7 @@ slow = pytest.mark.slow
 def tables():
     """Engine, model, kind: the slow ones are those that only compile more of the same."""
     quick = {("series", "nonlinear", kind) for kind in KINDS} | {("series", "linear", "sum")}
-    quick |= {("diffrax", "nonlinear", kind) for kind in ("sine", "sum", "record")}
-    quick |= {("tight", "nonlinear", "sine"), ("single", "nonlinear", "sine")}
+    quick |= {("diffrax", "nonlinear", "sine"), ("single", "nonlinear", "sine")}
     every = itertools.product(BOUNDS, NAMES, KINDS)
     return [pytest.param(*parts, id="-".join(parts), marks=() if parts in quick else slow) for parts in every]
 

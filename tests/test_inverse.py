@@ -413,6 +413,8 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
     [
         (lambda: rk.Unknown(2.0, 1.0), "`high` must be above `low`"),
         (lambda: rk.Unknown(0.0, 1.0), "`low` must be positive"),
+        (lambda: rk.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),
+        (lambda: rk.Unknown(-1.0, 1.0, log=False, prior=(-2.0, 0.1)), "`prior` must be within five"),
         (lambda: rk.Observations([0.1], [2.0], ["fell"]), "`seen` must hold only"),
         (lambda: rk.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
         (lambda: rk.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),

@@ -31,8 +31,15 @@ RARE = {"ricker, antisymmetric", "near-fault", "exponential"}  # other motions, 
 scene = pytest.mark.parametrize(
     "scene", [pytest.param(name, marks=pytest.mark.slow) if name in RARE else name for name in SCENES]
 )
-model = pytest.mark.parametrize(
-    "model", ["nonlinear", "linear", pytest.param("plastic spring", marks=pytest.mark.slow)]
+# The linear model shares the engine's path: one scene of it, unless all are asked for.
+scene_and_model = pytest.mark.parametrize(
+    "scene, model",
+    [
+        pytest.param(scene, model, id=f"{model}-{scene}", marks=() if quick else pytest.mark.slow)
+        for model in MODELS
+        for scene in SCENES
+        for quick in [scene not in RARE and model == "nonlinear" or (scene, model) == ("sine, one impact", "linear")]
+    ],
 )
 
 
@@ -60,8 +67,7 @@ def same(a, b, tolerance, rotation=1.0, time=1.0, delay=0.0):
         np.testing.assert_allclose(b.time_of_max, a.time_of_max * time + delay, rtol=10 * tolerance)
 
 
-@scene
-@model
+@scene_and_model
 def test_mirror(scene, model):
     initial = (0.03, -0.05)
     mirrored = (-0.03, 0.05)
@@ -85,8 +91,7 @@ def slower(motion, factor):
     )
 
 
-@scene
-@model
+@scene_and_model
 def test_size(scene, model):
     """Geometric similarity: p halved and the motion twice as long, for slender and non-slender blocks."""
     block, motion = SCENES[scene]
@@ -108,28 +113,25 @@ def test_slenderness_of_linear_block(scene):
     same(first, again, 1e-15, rotation=0.25)
 
 
-@scene
-@model
+@scene_and_model
 def test_delay(scene, model):
     """A delay that is no multiple of anything: times round differently."""
     same(run(scene, model), run(scene, model, delay=0.377), 3e-12, delay=0.377)
 
 
-@scene
-@model
+@scene_and_model
 def test_wrapping_changes_nothing(scene, model):
     same(outcome(*SCENES[scene], MODELS[model]), run(scene, model), 1e-12)
 
 
-@pytest.mark.parametrize("scene", ["sine, one impact", "record"])
+@pytest.mark.parametrize("scene", ["sine, one impact", pytest.param("record", marks=pytest.mark.slow)])
 def test_superposition(scene):
     """A motion is the sum of its parts."""
     block, motion = SCENES[scene]
     same(outcome(block, motion), outcome(block, 0.3 * motion + 0.7 * motion), 1e-11)
 
 
-@scene
-@model
+@scene_and_model
 def test_free_stage_is_what_integration_gives(scene, model):
     """The energy argument against the integrated motion, which a silent tail forces upon the engine."""
     first, again = run(scene, model), run(scene, model, silence=12.0)
@@ -169,6 +171,7 @@ def test_order_of_the_series(scene, order):
     same(outcome(block, motion), again, 3e-12)
 
 
+@pytest.mark.slow
 def test_limits_of_the_exponential_pulse():
     for shape, pulse in ((-np.inf, rk.RectangularPulse), (0.0, rk.TriangularPulse), (1e-13, rk.TriangularPulse)):
         a = outcome(BLOCK, rk.ExponentialPulse(0.7, 0.5, shape), MODELS["nonlinear"])
@@ -178,6 +181,7 @@ def test_limits_of_the_exponential_pulse():
     assert spike.max_rotation == 0 and spike.margin >= 1 and spike.impact_count == 0
 
 
+@pytest.mark.slow
 def test_triangle_as_a_record():
     record = rk.Record([0.0, 0.4, 0.8, 0.4, 0.0], 0.1)
     a, b = outcome(BLOCK, record), outcome(BLOCK, rk.TriangularPulse(0.8, 0.4))
