@@ -123,8 +123,8 @@ def sample_motion(
 
     **Returns:** a `Posterior`.
 
-    **Raises:** ValueError for arguments outside their ranges; ImportError without NumPyro (`pip install
-    "jaxrock[posterior]"`).
+    **Raises:** ValueError for arguments outside their ranges, and for an estimate of other unknowns; ImportError
+    without NumPyro (`pip install "jaxrock[posterior]"`).
 
     **Source:** Hastings (1970), independent proposals; Cappe et al. (2004), populations of them that learn; Gelman et
     al. (2013, 11.4), R-hat between halves of chains, and effective size, by NumPyro.
@@ -202,7 +202,9 @@ def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(places) < 4:
         return np.zeros(places.shape[-1]), np.full(places.shape[-1], np.inf)
     by_chain = places.swapaxes(0, 1)
-    return np.asarray(effective_sample_size(by_chain)), np.asarray(split_gelman_rubin(by_chain))
+    sizes, r_hat = np.asarray(effective_sample_size(by_chain)), np.asarray(split_gelman_rubin(by_chain))
+    # Chains that never moved.
+    return np.where(np.isnan(sizes), 0.0, sizes), np.where(np.isnan(r_hat), np.inf, r_hat)
 
 
 def _conclude(

@@ -207,6 +207,9 @@ def test_a_posterior_is_that_of_a_grid():
             within = float(np.mean(found[name] < level))
             expected = 4 * np.sqrt(probability * (1 - probability) / float(found.effective_size[i]))
             assert abs(within - probability) < expected + 0.002
+    with pytest.raises(ValueError, match="`estimate` must be of these unknowns"):
+        others = UNKNOWNS | {"amplitude": rk.Unknown(10.0, 20.0)}
+        rk.sample_motion(seen, rk.SinePulse, others, SCATTER, estimate=found.estimate)
     top = values.max()
     assert top - 0.1 < float(found.log_density.max()) <= float(found.estimate.log_likelihood) + 1e-6
 
