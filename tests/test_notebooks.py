@@ -8,8 +8,8 @@ nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient 
 nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-# Minutes of compilation, of what `test_arcs`, `test_closed_forms`, `test_derivatives`, `test_critical`, `test_inverse`, `test_springs`,
-# `test_asymmetric_rocks` and `test_flexible` judge.
+# Minutes of compilation, of what `test_arcs`, `test_closed_forms`, `test_derivatives`, `test_critical`, `test_inverse`,
+# `test_springs`, `test_asymmetric_rocks` and `test_flexible` judge.
 SLOW = {
     "03_a_block_of_your_own",
     "05_one_sine_pulse",
