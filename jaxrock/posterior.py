@@ -3,7 +3,7 @@
 The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
 where it is first (see `proposals`), from the maxima of an estimate and from everywhere. Whether chains agree tells
 whether they have arrived; not whether there is a maximum that neither the estimate nor any proposal has met. (Ensembles
-of walkers, by NumPyro's AIES, take ten times as many points: benchmarks/inverse.md.)
+of walkers, by NumPyro's AIES, take many times as many points: benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from jaxrock.likelihood import Likelihood
 from jaxrock.models import Housner, Model
 from jaxrock.observations import Observations
 from jaxrock.possible import NODES
-from jaxrock.problem import Problem, Unknown
+from jaxrock.problem import Problem, Unknown, in_batches
 from jaxrock.proposals import ROUNDS, around, begin, learn
 
 Real = Inexact[Array, "..."]
@@ -172,13 +172,8 @@ class _Density:
         self.problem, self.count = problem, 0
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
-        found = []
-        for number in range(0, len(places), _LANES):
-            part = places[number : number + _LANES]
-            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append(np.asarray(_log_density(self.problem, padded))[: len(part)])
         self.count += len(places)
-        found = np.concatenate(found)
+        (found,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
         return np.where(np.isnan(found), -np.inf, found)
 
 

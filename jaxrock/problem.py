@@ -124,6 +124,20 @@ def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real
     return value, back(jnp.ones_like(value))[0], facts
 
 
+def in_batches(
+    function: Callable, places: np.ndarray, lanes: int, progress: Callable[[int], None] = lambda more: None
+) -> list[np.ndarray]:
+    """Results of `function`, each (n, ...), at any number of places, (n, parameters): so many of them at a time that
+    one compiled program serves for all."""
+    found = []
+    for begin in range(0, len(places), lanes):
+        part = places[begin : begin + lanes]
+        padded = np.pad(part, ((0, lanes - len(part)), (0, 0)), mode="edge")
+        found.append([np.asarray(x)[: len(part)] for x in function(padded)])
+        progress(len(part))
+    return [np.concatenate(x) for x in zip(*found)]
+
+
 class Evaluator:
     """Values and slopes at any number of points, in batches of one compiled program; it counts.
 
@@ -143,14 +157,8 @@ class Evaluator:
 
     def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and slopes at places, and by them."""
-        found = []
-        for begin in range(0, len(places), _LANES):
-            part = places[begin : begin + _LANES]
-            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append([np.asarray(x)[: len(part)] for x in _batch(self.problem, padded)[:2]])
-            self.progress(len(part))
+        values, slopes = in_batches(lambda part: _batch(self.problem, part)[:2], places, _LANES, self.progress)
         self.count += len(places)
-        values, slopes = (np.concatenate(x) for x in zip(*found))
         self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
         return values, slopes
 

@@ -71,7 +71,9 @@ def _student(random: np.random.Generator, count: int, size: int) -> np.ndarray:
     return random.normal(size=(count, size)) / np.sqrt(random.chisquare(_FREEDOM, count) / _FREEDOM)[:, None]
 
 
-def _kernels(centres, roots, weights, evenly: float, low: np.ndarray, high: np.ndarray) -> Kernels:
+def _kernels(
+    centres: np.ndarray, roots: np.ndarray, weights: np.ndarray, evenly: float, low: np.ndarray, high: np.ndarray
+) -> Kernels:
     """Kernels with such weights of what is drawn in the box: those at its ends, where much is drawn again, have more.
 
     How much is counted, not known. That changes the proposals a little, and not how well their density is known.
@@ -124,9 +126,8 @@ class Drawn(NamedTuple):
         white = np.linalg.solve(root, centres.T).T
         order = np.argsort(np.sum((white[:, None] - white) ** 2, axis=2), axis=1)
         near = order[:, 1 : 1 + max(_NEIGHBOURS, 6 * size)]  # the first is the kernel itself
-        away = (white[near] - white[:, None]) * np.sqrt(weights[near] / weights[near].sum(axis=1, keepdims=True))[
-            ..., None
-        ]
+        nearness = weights[near] / weights[near].sum(axis=1, keepdims=True)
+        away = np.sqrt(nearness)[..., None] * (white[near] - white[:, None])
         local = np.einsum("kni,knj->kij", away, away) + _WIDER**2 * np.eye(size)
         roots = root @ np.linalg.cholesky(local)
         return _kernels(centres, roots, weights, _EVENLY, last.low, last.high), plain

@@ -214,11 +214,18 @@ def test_a_posterior_is_that_of_a_grid():
     assert top - 0.1 < float(found.log_density.max()) <= float(found.estimate.log_likelihood) + 1e-6
 
 
-def test_samples_need_numpyro_and_good_arguments(monkeypatch):
+def test_samples_need_numpyro(monkeypatch):
     seen = rocks(["survived"] * 12)
-    monkeypatch.setitem(sys.modules, "numpyro.infer", None)
+    monkeypatch.setitem(sys.modules, "numpyro.diagnostics", None)
     with pytest.raises(ImportError, match=r"jaxrock\[posterior\]"):
         rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER)
+
+
+@pytest.mark.parametrize("name", ["effective_size", "steps"])
+def test_samples_need_good_arguments(name):
+    pytest.importorskip("numpyro", reason="samples need NumPyro")
+    with pytest.raises(ValueError, match=f"`{name}` must be at least 1"):
+        rk.sample_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, **{name: 0})
 
 
 def test_survivors_bound_from_above_only():

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.likelihood import _of_strength
+from jaxrock.pulses import AbstractPulse
 
 EPS = np.finfo(float).eps
 ORDER = 12
@@ -162,6 +164,16 @@ JUMPS = {
     ),
     "difference that starts together": (rk.CosinePulse(0.8, 1.3) - rk.RectangularPulse(0.3, 0.2), [(0.0, 0.5)]),
 }
+
+
+@pytest.mark.parametrize("name", [name for name, motion in MOTIONS.items() if isinstance(motion, AbstractPulse)])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_pulse_is_proportional_to_its_amplitude(name, way):
+    """So likelihoods may leave it out where they set the strength of a motion."""
+    motion, t = MOTIONS[name], np.linspace(0, 1.2 * float(MOTIONS[name].end), 50)
+    found = _of_strength(motion, np.log(0.37), way).acceleration(t)
+    expected = way * 0.37 / np.max(motion.bounds) * motion.acceleration(t)
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("motion, values", JUMPS.values(), ids=JUMPS)
