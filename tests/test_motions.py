@@ -171,7 +171,7 @@ JUMPS = {
 def test_a_pulse_is_proportional_to_its_amplitude(name, way):
     """So likelihoods may leave it out where they set the strength of a motion."""
     motion, t = MOTIONS[name], np.linspace(0, 1.2 * float(MOTIONS[name].end), 50)
-    found = _of_strength(motion, np.log(0.37), way).acceleration(t)
+    found = _of_strength(motion, jnp.log(0.37), jnp.asarray(way)).acceleration(t)
     expected = way * 0.37 / np.max(motion.bounds) * motion.acceleration(t)
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
