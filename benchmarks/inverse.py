@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxrock as rk
-from jaxrock.possible import NODES, rocks_at
-from jaxrock.problem import Problem
+from jaxrock.inverse.scatter import NODES, rocks_at
+from jaxrock.inverse.unknowns import Problem
 
 TRUTH = {"amplitude": 0.35, "period": 0.8}
 KEPT = Path(__file__).with_suffix(".json")
@@ -142,7 +142,7 @@ def samplers(kept: dict, rocks: int = 20, walkers: int = 24, steps: int = 2000) 
     import equinox as eqx
     from numpyro.infer import AIES, MCMC
 
-    from jaxrock.posterior import diagnostics
+    from jaxrock.inverse.posterior import diagnostics
 
     seen = synthetic(rocks, np.random.default_rng(0), 0.2)
     found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
@@ -245,9 +245,9 @@ def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
     """Points that climbers need from the same starts, beside Adam of optax at several rates, all starts at once."""
     import optax
 
-    from jaxrock.climb import climb
-    from jaxrock.inverse import _starts
-    from jaxrock.problem import Evaluator
+    from jaxrock.inverse.estimate import _starts
+    from jaxrock.inverse.unknowns import Evaluator
+    from jaxrock.numerics.climb import climb
 
     seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
     evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))

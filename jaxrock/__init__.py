@@ -8,32 +8,27 @@ velocity after an impact over that before it.
 import importlib
 from typing import TYPE_CHECKING
 
-from jaxrock import closed_form as closed_form, similarity as similarity
-from jaxrock.arcs import Diffrax as Diffrax
-from jaxrock.asymmetric import AsymmetricBlock as AsymmetricBlock
-from jaxrock.block import Block as Block
-from jaxrock.contact import Contact as Contact, contact_forces as contact_forces
-from jaxrock.critical import (
-    Critical as Critical,
-    critical_amplitudes as critical_amplitudes,
-    critical_durations as critical_durations,
-)
-from jaxrock.devices import use_cpu_devices as use_cpu_devices
-from jaxrock.dispatch import outcome as outcome, simulate as simulate
-from jaxrock.feasible import (
-    FeasibleRegion as FeasibleRegion,
-    Unexceeded as Unexceeded,
-    feasible_region as feasible_region,
-    unexceeded_motion as unexceeded_motion,
-)
-from jaxrock.flexible import (
+from jaxrock import closed_form as closed_form
+from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
+from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
+from jaxrock.blocks.random import draw_blocks as draw_blocks
+from jaxrock.blocks.rigid import Block as Block
+from jaxrock.engines.diffrax.arcs import Diffrax as Diffrax
+from jaxrock.engines.taylor.careful import Series as Series
+from jaxrock.flexible.response import (
     FlexibleResponse as FlexibleResponse,
     outcome_flexible as outcome_flexible,
     simulate_flexible as simulate_flexible,
 )
-from jaxrock.flexible_block import FlexibleBlock as FlexibleBlock
-from jaxrock.flexible_scene import FlexibleOutcome as FlexibleOutcome
-from jaxrock.fragility import (
+from jaxrock.flexible.stepper import FlexibleOutcome as FlexibleOutcome
+from jaxrock.hazard.curves import (
+    HazardCurve as HazardCurve,
+    allowed_scale as allowed_scale,
+    branch_weights as branch_weights,
+    survival_probability as survival_probability,
+    toppling_rate as toppling_rate,
+)
+from jaxrock.hazard.fragility import (
     AbstractFragility as AbstractFragility,
     FitStatus as FitStatus,
     FragilityFit as FragilityFit,
@@ -41,63 +36,12 @@ from jaxrock.fragility import (
     TabulatedFragility as TabulatedFragility,
     fit_fragility as fit_fragility,
 )
-from jaxrock.grid import Grid as Grid
-from jaxrock.hazard import (
-    HazardCurve as HazardCurve,
-    allowed_scale as allowed_scale,
-    branch_weights as branch_weights,
-    survival_probability as survival_probability,
-    toppling_rate as toppling_rate,
-)
-from jaxrock.hazard_files import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
-from jaxrock.histories import HistoryFit as HistoryFit, HistoryStatus as HistoryStatus, fit_history as fit_history
-from jaxrock.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
-from jaxrock.inverse import (
-    Estimate as Estimate,
-    EstimateStatus as EstimateStatus,
-    estimate_motion as estimate_motion,
-)
-from jaxrock.likelihood import Likelihood as Likelihood
-from jaxrock.models import Equation as Equation, Housner as Housner, Linear as Linear, Spring as Spring
-from jaxrock.motion import AbstractMotion as AbstractMotion, Record as Record, WithVertical as WithVertical
-from jaxrock.observation_files import read_observations as read_observations
-from jaxrock.observations import Observations as Observations
-from jaxrock.posterior import Posterior as Posterior, PosteriorStatus as PosteriorStatus, sample_motion as sample_motion
-from jaxrock.problem import Unknown as Unknown
-from jaxrock.pulses import (
-    CosinePulse as CosinePulse,
-    ExponentialPulse as ExponentialPulse,
-    HalfSinePulse as HalfSinePulse,
-    MavroeidisPapageorgiouPulse as MavroeidisPapageorgiouPulse,
-    RectangularPulse as RectangularPulse,
-    RickerPulse as RickerPulse,
-    SinePulse as SinePulse,
-    TriangularPulse as TriangularPulse,
-)
-from jaxrock.records import example_record as example_record, read_record as read_record
-from jaxrock.response import Outcome as Outcome, Response as Response
-from jaxrock.sensitivity import (
-    Sensitivity as Sensitivity,
-    SensitivityMap as SensitivityMap,
-    sensitivity as sensitivity,
-    sensitivity_map as sensitivity_map,
-)
-from jaxrock.series import Series as Series
-from jaxrock.spectra import (
-    OverturningMap as OverturningMap,
-    Spectrum as Spectrum,
-    overturning_map as overturning_map,
-    rocking_spectrum as rocking_spectrum,
-    self_similar_spectrum as self_similar_spectrum,
-)
-from jaxrock.status import Status as Status
-from jaxrock.suites import (
+from jaxrock.hazard.openquake import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.hazard.simulated_fragility import (
     SimulatedFragility as SimulatedFragility,
-    Suite as Suite,
-    draw_blocks as draw_blocks,
     simulated_fragility as simulated_fragility,
 )
-from jaxrock.surfaces import (
+from jaxrock.hazard.surfaces import (
     SimulatedSurface as SimulatedSurface,
     SurfaceFit as SurfaceFit,
     SurfaceFragility as SurfaceFragility,
@@ -105,7 +49,78 @@ from jaxrock.surfaces import (
     simulated_surface as simulated_surface,
     surface_of as surface_of,
 )
-from jaxrock.sweeps import sweep as sweep
+from jaxrock.inverse.estimate import (
+    Estimate as Estimate,
+    EstimateStatus as EstimateStatus,
+    estimate_motion as estimate_motion,
+)
+from jaxrock.inverse.feasible import (
+    FeasibleRegion as FeasibleRegion,
+    Unexceeded as Unexceeded,
+    feasible_region as feasible_region,
+    unexceeded_motion as unexceeded_motion,
+)
+from jaxrock.inverse.history_fit import (
+    HistoryFit as HistoryFit,
+    HistoryStatus as HistoryStatus,
+    fit_history as fit_history,
+)
+from jaxrock.inverse.likelihood import Likelihood as Likelihood
+from jaxrock.inverse.observation_files import read_observations as read_observations
+from jaxrock.inverse.observations import Observations as Observations
+from jaxrock.inverse.posterior import (
+    Posterior as Posterior,
+    PosteriorStatus as PosteriorStatus,
+    sample_motion as sample_motion,
+)
+from jaxrock.inverse.unknowns import Unknown as Unknown
+from jaxrock.models.rigid import Housner as Housner, Linear as Linear
+from jaxrock.models.spring import Spring as Spring
+from jaxrock.models.user_equation import Equation as Equation
+from jaxrock.motions.files.reading import example_record as example_record, read_record as read_record
+from jaxrock.motions.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
+from jaxrock.motions.motion import AbstractMotion as AbstractMotion, WithVertical as WithVertical
+from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)
+from jaxrock.motions.pulses.exponential import (
+    ExponentialPulse as ExponentialPulse,
+    RectangularPulse as RectangularPulse,
+    TriangularPulse as TriangularPulse,
+)
+from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgiouPulse as MavroeidisPapageorgiouPulse
+from jaxrock.motions.pulses.ricker import RickerPulse as RickerPulse
+from jaxrock.motions.pulses.sinusoidal import (
+    CosinePulse as CosinePulse,
+    HalfSinePulse as HalfSinePulse,
+    SinePulse as SinePulse,
+)
+from jaxrock.motions.record import Record as Record
+from jaxrock.motions.suite import Suite as Suite
+from jaxrock.responses.contact import Contact as Contact, contact_forces as contact_forces
+from jaxrock.responses.dispatch import outcome as outcome, simulate as simulate
+from jaxrock.responses.rigid import Outcome as Outcome, Response as Response
+from jaxrock.status import Status as Status
+from jaxrock.studies import similarity as similarity
+from jaxrock.studies.critical import (
+    Critical as Critical,
+    critical_amplitudes as critical_amplitudes,
+    critical_durations as critical_durations,
+)
+from jaxrock.studies.sensitivities import (
+    Sensitivity as Sensitivity,
+    SensitivityMap as SensitivityMap,
+    sensitivity as sensitivity,
+    sensitivity_map as sensitivity_map,
+)
+from jaxrock.studies.spectra import (
+    OverturningMap as OverturningMap,
+    Spectrum as Spectrum,
+    overturning_map as overturning_map,
+    rocking_spectrum as rocking_spectrum,
+    self_similar_spectrum as self_similar_spectrum,
+)
+from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.sweeps.grid import Grid as Grid
+from jaxrock.sweeps.sweep import sweep as sweep
 
 if TYPE_CHECKING:
     from jaxrock import plot as plot

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.__main__ import main
-from jaxrock.possible import rocks_at
+from jaxrock.command_line.main import main
+from jaxrock.inverse.scatter import rocks_at
 
 # All tests have twelve rocks, of one of which at least it is not known how it stood: they share one compiled program.
 ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])

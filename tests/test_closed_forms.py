@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._exponential import exponential_difference, logarithm_ratio
-from jaxrock._roots import bracketed_root
 from jaxrock.closed_form import pushover, restitution, sine_pulse, single_lobe
+from jaxrock.numerics.divided_differences import exponential_difference, logarithm_ratio
+from jaxrock.numerics.roots import bracketed_root
 
 ALPHA = 0.1  # plays no part in the linear model, whose results are over alpha
 

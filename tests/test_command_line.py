@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.__main__ import main
+from jaxrock.command_line.main import main
 
 STEPS = np.arange(60)
 SAMPLES = np.round(0.5 * np.sin(0.3 * STEPS) * np.exp(-0.04 * STEPS), 5)  # g

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.motion import Shaking
-from jaxrock.polynomial import jet
-from jaxrock.taylor import End, Start, arrive, expand
+from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.motions.motion import Shaking
+from jaxrock.numerics.polynomial import jet
 
 MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
 PULSES = {

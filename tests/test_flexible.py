@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.flexible_block import unit_column
-from jaxrock.flexible_phases import Numbers, locked_phase, rocking_phase
+from jaxrock.blocks.cantilever import unit_column
+from jaxrock.flexible.phases import Numbers, locked_phase, rocking_phase
 
 TALL = dict(width=5.0, height=50.0, youngs_modulus=30e9, density=2500.0)  # Diamantopoulos & Fragiadakis, figure 22
 SHORT = dict(width=5.0, height=25.0, youngs_modulus=30e9, density=2500.0)  # figure 23

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
 
 ALPHA, P, RESTITUTION, TILT = 0.2, 2.5, 0.9, 0.12
 TIME = np.linspace(0.02, 6.0, 240)

@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxrock.lanes
-from jaxrock.derivatives import differentiable
-from jaxrock.lanes import Passes, in_lanes
+from jaxrock.transforms import batching
+from jaxrock.transforms.batching import Passes, in_lanes
+from jaxrock.transforms.differentiation import differentiable
 
 
 @pytest.fixture(autouse=True, params=["machine code", "XLA"])
 def compiler(request, monkeypatch):
     if request.param == "XLA":
-        monkeypatch.setattr(jaxrock.lanes, "native", None)
-    elif jaxrock.lanes.native is None:
+        monkeypatch.setattr(batching, "native", None)
+    elif batching.native is None:
         pytest.skip("needs llvmlite")
 
 

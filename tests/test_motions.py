@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.likelihood import _of_strength
-from jaxrock.pulses import AbstractPulse
+from jaxrock.inverse.likelihood import _of_strength
+from jaxrock.motions.pulses.pulse import AbstractPulse
 
 EPS = np.finfo(float).eps
 ORDER = 12

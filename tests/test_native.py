@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-native = pytest.importorskip("jaxrock.native", reason="needs llvmlite")
+native = pytest.importorskip("jaxrock.native.call", reason="needs llvmlite")
 
 import jaxrock as rk  # noqa: E402
-from jaxrock import lanes  # noqa: E402
-from jaxrock.operations import Unsupported  # noqa: E402
+from jaxrock.native.operations import Unsupported  # noqa: E402
+from jaxrock.transforms import batching as lanes  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
 OTHERS = np.roll(NUMBERS, 5)

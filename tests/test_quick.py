@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._pick import pick
-from jaxrock._trigonometry import logarithm
-from jaxrock.polynomial import root_of
-from jaxrock.response import _passes, _start
+from jaxrock.numerics.elementary import logarithm
+from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.polynomial import root_of
+from jaxrock.responses.rigid import _passes, _start
 
 PULSES = {
     "sine": rk.SinePulse,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxrock.records import STANDARD_GRAVITY, example_record, read_record
+from jaxrock.motions.files.reading import STANDARD_GRAVITY, example_record, read_record
 
 SAMPLES = np.array([0.01, -0.2556093, 0.3, -0.04, 0.05, 1.06e-3, -7e-5])  # g
 

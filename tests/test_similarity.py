@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock import similarity
+from jaxrock.studies import similarity
 
 TAU = np.linspace(0, 12, 400)
 

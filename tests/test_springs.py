@@ -12,8 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
-from jaxrock.free import Visit, free_stage
-from jaxrock.models import Angle
+from jaxrock.engines.free_stage import Visit, free_stage
+from jaxrock.models.coefficients import Angle
 
 SCENES = json.loads((Path(__file__).parent / "springs.json").read_text())["scenes"]
 MOTIONS = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "ricker symmetric": rk.RickerPulse}

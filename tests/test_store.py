@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.store import Store
+from jaxrock.sweeps.store import Store
 
 xarray, zarr = pytest.importorskip("xarray"), pytest.importorskip("zarr")
 pytest.importorskip("h5netcdf")

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.sweeps import Plan, Runner, layout, surface
-from jaxrock.traced import Traced
+from jaxrock.sweeps.plan import Plan, layout
+from jaxrock.sweeps.runner import Runner
+from jaxrock.sweeps.sweep import surface
+from jaxrock.transforms.fingerprint import Traced
 
 COMPILED = []
 jax.monitoring.register_event_duration_secs_listener(
@@ -120,7 +122,7 @@ def test_a_runner_takes_any_number_of_points():
 def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
     shape = layout(points, 2, "gpu")
     assert shape == (4 if points == 10**6 else 1, 2, lanes)
-    monkeypatch.setattr("jaxrock.sweeps.layout", lambda *_: shape)
+    monkeypatch.setattr("jaxrock.sweeps.runner.layout", lambda *_: shape)
     x = np.arange(float(points))
     np.testing.assert_array_equal(Runner(lambda x, _: x**2, (x,), (), points)([x])[0], x**2)
 

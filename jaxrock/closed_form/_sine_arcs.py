@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrock._roots import search_root
+from jaxrock.numerics.roots import search_root
 
 Real = Float[Array, "..."]
 

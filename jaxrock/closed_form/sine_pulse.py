@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int
 
 from jaxrock._checks import checked, elementwise, positive, share
-from jaxrock._roots import bracketed_root
 from jaxrock.closed_form import _sine_arcs as arcs
+from jaxrock.numerics.roots import bracketed_root
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]

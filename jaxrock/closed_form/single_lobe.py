@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int
 
 from jaxrock._checks import elementwise, not_nan, positive
-from jaxrock._exponential import exponential_difference, growth_ratio, logarithm_ratio
-from jaxrock._roots import bracketed_root
+from jaxrock.numerics.divided_differences import exponential_difference, growth_ratio, logarithm_ratio
+from jaxrock.numerics.roots import bracketed_root
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]

@@ -1,0 +1,251 @@
+"""Asymmetric blocks: two corners, each with a slenderness, a frequency parameter and a restitution of its own."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import Values, acute, checked, finite, positive
+from jaxrock.blocks.outline import Outline
+from jaxrock.blocks.rigid import GRAVITY, Side
+from jaxrock.numerics.elementary import sine_cosine
+
+Real = Inexact[Array, "..."]
+
+
+class AsymmetricBlock(eqx.Module):
+    """A free-standing rigid block whose two sides differ: a rock, a statue, a loaded cabinet.
+
+    Side 1 is that of positive rotations, on which it stands on corner 1, the right one; side 2 that of negative
+    rotations. Positive ground acceleration drives negative rotation, as everywhere.
+
+    **Arguments:**
+
+    - `alpha1`, `alpha2`: slenderness angles, between the vertical at rest and the line from each corner to the centre
+      of mass [rad], in (0, pi/2).
+    - `p1`: frequency parameter about corner 1, sqrt(m g R1/I1) [rad/s], positive.
+    - `inertia_ratio`: m R1^2/I1, with I1 the moment of inertia about corner 1 [-], in (0, 1]; 3/4 for a rectangle.
+    - `radius_ratio`: R2/R1, distances from the corners to the centre of mass [-], positive. None: that of a flat base,
+      cos(alpha1)/cos(alpha2), which follows the angles under differentiation.
+    - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2. None: by angular
+      momentum about the new corner, zero at least.
+
+    All may be arrays of one shape, for use under `jax.vmap`.
+
+    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the
+    energy that two impacts keep, exceeds 1. (One of them may: about corners of unequal height it often does.)
+
+    **Source:** Housner (1963) for each side; the impact by angular momentum, e_st = 1 - kappa_t [1 - (R_s/R_t)
+    cos(alpha1 + alpha2)] with kappa_t = m R_t^2/I_t, which is Housner's for a rectangle.
+    """
+
+    alpha1: Real
+    alpha2: Real
+    p1: Real
+    inertia_ratio: Real
+    given_radius_ratio: Real | None
+    given_restitution1: Real | None
+    given_restitution2: Real | None
+
+    def __init__(
+        self,
+        alpha1: ArrayLike,
+        alpha2: ArrayLike,
+        p1: ArrayLike,
+        inertia_ratio: ArrayLike = 0.75,
+        radius_ratio: ArrayLike | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+    ):
+        self.alpha1, self.alpha2, self.p1 = acute("alpha1", alpha1), acute("alpha2", alpha2), positive("p1", p1)
+        self.inertia_ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
+        self.given_radius_ratio = None if radius_ratio is None else positive("radius_ratio", radius_ratio)
+        self.given_restitution1 = self.given_restitution2 = None
+        if restitution is not None:
+            first, second = (
+                checked(f"restitution[{i}]", e, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+                for i, e in enumerate(restitution)
+            )
+            keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
+            checked("restitution", first * second, keeps, lambda x: x <= 1 + 1e-12)
+            self.given_restitution1, self.given_restitution2 = first, second
+
+    @classmethod
+    def from_radii(
+        cls,
+        alpha1: ArrayLike,
+        alpha2: ArrayLike,
+        R1: ArrayLike,
+        R2: ArrayLike,
+        gyration_radius: ArrayLike,
+        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "AsymmetricBlock":
+        """Build a block from the distances of its corners to the centre of mass, and its inertia.
+
+        **Arguments:**
+
+        - `alpha1`, `alpha2`, `restitution`: as in `AsymmetricBlock`.
+        - `R1`, `R2`: distances from the corners to the centre of mass [m], positive.
+        - `gyration_radius`: sqrt(I/m), I the moment of inertia about the centre of mass [m], 0 or more.
+        - `gravity`: acceleration of gravity [m/s^2], positive.
+
+        **Returns:** an `AsymmetricBlock`.
+
+        **Raises:** ValueError for a value outside its range.
+        """
+        first, second, gravity = positive("R1", R1), positive("R2", R2), positive("gravity", gravity)
+        gyration = checked(
+            "gyration_radius", gyration_radius, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf)
+        )
+        ratio = first**2 / (first**2 + gyration**2)
+        return cls(alpha1, alpha2, jnp.sqrt(gravity * ratio / first), ratio, second / first, restitution)
+
+    @classmethod
+    def from_frequencies(
+        cls,
+        alpha1: ArrayLike,
+        alpha2: ArrayLike,
+        p1: ArrayLike,
+        p2: ArrayLike,
+        inertia_ratio: ArrayLike = 0.75,
+        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> "AsymmetricBlock":
+        """Build a block from the frequency parameters about both corners.
+
+        **Arguments:**
+
+        - `alpha1`, `alpha2`, `p1`, `inertia_ratio`, `restitution`: as in `AsymmetricBlock`; the inertia ratio at
+          least 1/2, so that the farther corner has the smaller frequency parameter.
+        - `p2`: frequency parameter about corner 2 [rad/s], positive.
+
+        **Returns:** an `AsymmetricBlock` with R2/R1 from (p2/p1)^2 = R2/R1/(kappa1 [(R2/R1)^2 + 1/kappa1 - 1]).
+
+        **Raises:** ValueError for a value outside its range, or a p2 that no distance of the second corner gives.
+        """
+        kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
+        rate = (positive("p2", p2) / positive("p1", p1)) ** 2
+        inner = 1 - 4 * rate**2 * kappa * (1 - kappa)
+        largest = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
+        checked("p2", p2, largest, lambda _: inner >= 0)
+        return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * rate * kappa), restitution)
+
+    @classmethod
+    def from_corners(
+        cls,
+        corner1: Values,
+        corner2: Values,
+        centre: Values,
+        gyration_radius: ArrayLike,
+        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "AsymmetricBlock":
+        """Build a block from the places of its corners and of its centre of mass, at rest.
+
+        **Arguments:**
+
+        - `corner1`, `corner2`, `centre`: (2,) horizontal and vertical place of the right corner, the left corner and
+          the centre of mass [m]; the centre above both corners, and between them.
+        - `gyration_radius`, `restitution`, `gravity`: as in `from_radii`.
+
+        **Returns:** an `AsymmetricBlock`.
+
+        **Raises:** ValueError where the block would not stand.
+        """
+        places = {"corner1": corner1, "corner2": corner2, "centre": centre}
+        right, left, centre = (finite(name, place) for name, place in places.items())
+        for name, place in zip(places, (right, left, centre)):
+            if place.shape != (2,):
+                raise ValueError(f"Argument `{name}` must have shape (2,), but has {place.shape}.")
+        width1 = positive("corner1[0] - centre[0]", right[0] - centre[0])
+        width2 = positive("centre[0] - corner2[0]", centre[0] - left[0])
+        height1 = positive("centre[1] - corner1[1]", centre[1] - right[1])
+        height2 = positive("centre[1] - corner2[1]", centre[1] - left[1])
+        alphas = jnp.arctan2(width1, height1), jnp.arctan2(width2, height2)
+        radii = jnp.hypot(width1, height1), jnp.hypot(width2, height2)
+        return cls.from_radii(*alphas, *radii, gyration_radius, restitution, gravity)
+
+    @classmethod
+    def from_outline(
+        cls,
+        outline: Values,
+        *,
+        supports: tuple[int, int] | None = None,
+        centre: Values | None = None,
+        gyration_radius: ArrayLike | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "AsymmetricBlock":
+        """Build a homogeneous block from the polygon of its outline, in the plane of rocking.
+
+        **Arguments:**
+
+        - `outline`: (n, 2) vertices in order, horizontal and vertical [m], n at least 3; no two edges cross.
+        - `supports`: positions in `outline` of the right and the left corner on which it stands; None takes the
+          outermost of the lowest vertices (a flat base).
+        - `centre`: (2,) centre of mass [m]; None: that of the area.
+        - `gyration_radius`: sqrt(I/m) about the centre of mass [m]; None: that of the area.
+        - `restitution`, `gravity`: as in `from_radii`.
+
+        **Returns:** an `AsymmetricBlock`; about corners of unequal height where `supports` say so.
+
+        **Raises:** ValueError for an outline that crosses itself or has no area; where the block would not stand; where
+        another vertex reaches the level of the ground before the block is in balance on a corner: it would roll onto
+        that face, and not rock about the corner.
+        """
+        shape = Outline.of(outline)
+        right, left = shape.flat_base() if supports is None else (shape.at(position) for position in supports)
+        centre = shape.centre if centre is None else centre
+        gyration = shape.gyration_radius if gyration_radius is None else gyration_radius
+        block = cls.from_corners(right, left, centre, gyration, restitution, gravity)
+        shape.check_rolling(right, 1, float(block.alpha1))
+        shape.check_rolling(left, -1, float(block.alpha2))
+        return block
+
+    @property
+    def radius_ratio(self) -> Real:
+        """R2/R1: given, or that of a flat base."""
+        if self.given_radius_ratio is None:
+            return sine_cosine(self.alpha1)[1] / sine_cosine(self.alpha2)[1]
+        return self.given_radius_ratio
+
+    @property
+    def inertia_ratio2(self) -> Real:
+        """m R2^2/I2."""
+        square = self.radius_ratio**2
+        return square / (square + 1 / self.inertia_ratio - 1)
+
+    @property
+    def p2(self) -> Real:
+        """Frequency parameter about corner 2 [rad/s]."""
+        return self.p1 * jnp.sqrt(self.inertia_ratio2 / (self.inertia_ratio * self.radius_ratio))
+
+    @property
+    def restitution1(self) -> Real:
+        """Angular velocity after an impact that ends the stay on side 1 over that before it."""
+        if self.given_restitution1 is None:
+            return self._by_momentum(self.inertia_ratio2, 1 / self.radius_ratio)
+        return self.given_restitution1
+
+    @property
+    def restitution2(self) -> Real:
+        """The same for an impact that ends the stay on side 2."""
+        if self.given_restitution2 is None:
+            return self._by_momentum(self.inertia_ratio, self.radius_ratio)
+        return self.given_restitution2
+
+    def _by_momentum(self, inertia_ratio: Real, radii: Real) -> Real:
+        """Angular momentum about the new corner is kept; radii: that before over that after."""
+        cosine = sine_cosine(self.alpha1)[1] * sine_cosine(self.alpha2)[1]
+        sine = sine_cosine(self.alpha1)[0] * sine_cosine(self.alpha2)[0]
+        return jnp.maximum(1 - inertia_ratio * (1 - radii * (cosine - sine)), 0)
+
+    @property
+    def sides(self) -> tuple[Side, Side]:
+        """What a model sees of side 1 and of side 2."""
+        return Side(self.alpha1, self.p1, self.restitution1), Side(self.alpha2, self.p2, self.restitution2)
+
+    @property
+    def mirrored(self) -> "AsymmetricBlock":
+        """The block seen from behind: its sides exchanged."""
+        pair = None if self.given_restitution1 is None else (self.given_restitution2, self.given_restitution1)
+        radii = None if self.given_radius_ratio is None else 1 / self.given_radius_ratio
+        return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, pair)

@@ -1,0 +1,165 @@
+"""The flexible block: a rigid base on a spring of negative stiffness that carries an elastic column of masses."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import checked, one_of, positive, share
+from jaxrock.blocks.cantilever import unit_column
+from jaxrock.blocks.rigid import GRAVITY
+
+Real = Inexact[Array, "..."]
+
+
+class FlexibleBlock(eqx.Module):
+    """A rectangular elastic block that rocks: lumped masses on a cantilever whose base is a rocking spring (mmSM).
+
+    Small rotations: the column of length 2R carries the ground's acceleration times cos(alpha), and its base turns
+    against the moment M0 (1 - |theta|/alpha), M0 = m g R sin(alpha); below M0 it is locked. When the rotation
+    returns to zero the velocities of all masses are multiplied by the restitution.
+
+    **Arguments:**
+
+    - `width`, `height`: full sizes [m], positive. (The depth does not matter.)
+    - `youngs_modulus`: [Pa], positive; so large that the column does not give way before its base, and at most such
+      that it is 10^12 times as stiff (some 10^18 Pa of 1 m by 5 m: a rigid block to 12 digits). From 10^9 times on, an
+      undamped column may vibrate too long for its greatest bending to be searched: a `Status` then says so.
+    - `density`: [kg/m^3], positive.
+    - `damping_ratio`: of the column, in [0, 1) [-]; 0 for none.
+    - `masses`: number of lumped masses, the one at the base included; 2 to 60. Six are within a few per cent of many.
+    - `restitution`: velocities after an impact over those before it, in [0, 1]; None: Housner's, 1 - 1.5 sin^2(alpha).
+    - `damping`: "stiffness": in proportion to the column's stiffness, with `damping_ratio` in its first clamped mode;
+      "modal": `damping_ratio` in every clamped mode; "rayleigh": in proportion to stiffness and masses, with
+      `damping_ratio` in the first two clamped modes. The masses' part brakes rigid rocking, too.
+    - `impacts`: which returns of the base to zero count as impacts: "alternate": the first from either side, and later
+      ones from that side that end a longer stay, so that a column that bounces on one edge is not braked twice, and
+      one that trembles as it uplifts is braked when it comes down; "every": all of them.
+    - `gravity`: [m/s^2], positive.
+
+    All but `masses`, `damping` and `impacts` may be arrays of one shape, for use under `jax.vmap`.
+
+    **Raises:** ValueError for a value outside its range.
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), sections 3.4 and 6, with the constant negative stiffness of
+    figure 3b; Vassiliou, Mackie & Stojadinovic (2016).
+    """
+
+    width: Real
+    height: Real
+    youngs_modulus: Real
+    density: Real
+    damping_ratio: Real
+    given_restitution: Real | None
+    gravity: Real
+    masses: int = eqx.field(static=True)
+    damping: str = eqx.field(static=True)
+    impacts: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        width: ArrayLike,
+        height: ArrayLike,
+        youngs_modulus: ArrayLike,
+        density: ArrayLike,
+        damping_ratio: ArrayLike,
+        masses: int = 6,
+        *,
+        restitution: ArrayLike | None = None,
+        damping: str = "stiffness",
+        impacts: str = "alternate",
+        gravity: ArrayLike = GRAVITY,
+    ):
+        self.damping = one_of("damping", damping, ("stiffness", "modal", "rayleigh"))
+        self.impacts = one_of("impacts", impacts, ("alternate", "every"))
+        least = 3 if damping == "rayleigh" else 2
+        if not isinstance(masses, int) or not least <= masses <= 60:
+            raise ValueError(f"Argument `masses` must be a whole number from {least} to 60, but is {masses!r}.")
+        self.masses = masses
+        self.width, self.height = positive("width", width), positive("height", height)
+        self.density, self.gravity = positive("density", density), positive("gravity", gravity)
+        self.damping_ratio = checked("damping_ratio", damping_ratio, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+        self.youngs_modulus = positive("youngs_modulus", youngs_modulus)
+        self.given_restitution = None
+        if restitution is not None:
+            self.given_restitution = share("restitution", restitution)
+        else:
+            flat = "be at most 1.41 times the height when `restitution` is None: Housner's value is negative above"
+            self.width = checked("width", self.width, flat, lambda x: x <= math.sqrt(2) * self.height * (1 + 1e-6))
+        self.youngs_modulus = checked(
+            "youngs_modulus",
+            self.youngs_modulus,
+            "make the column stiffer than its base is unstable",
+            lambda x: jnp.sum(self._column_stiffness, -1) > self.spring_rate,
+        )
+        self.youngs_modulus = checked(
+            "youngs_modulus",
+            self.youngs_modulus,
+            "make the column at most 1e12 times as stiff as its base is unstable: rounding shows above (a rigid block)",
+            lambda x: jnp.sum(self._column_stiffness, -1) < 1e12 * self.spring_rate,
+        )
+
+    @property
+    def alpha(self) -> Real:
+        """Slenderness angle [rad]."""
+        return jnp.arctan2(self.width, self.height)
+
+    @property
+    def length(self) -> Real:
+        """Length of the column, 2R, from pivot to opposite corner [m]."""
+        return jnp.hypot(self.width, self.height)
+
+    @property
+    def restitution(self) -> Real:
+        """Velocities after an impact over those before it (given, or Housner's)."""
+        if self.given_restitution is None:
+            return jnp.maximum(1 - 1.5 * jnp.sin(self.alpha) ** 2, 0)  # Diamantopoulos & Fragiadakis 2017, 21
+        return self.given_restitution
+
+    @property
+    def first_period(self) -> Real:
+        """First period of the clamped continuous column [s].
+
+        **Source:** Diamantopoulos & Fragiadakis (2017), equation 23: 12.38 sqrt(density/modulus) h/tan(alpha), h half
+        the height, with 12.38 = 8 sqrt(3) pi/1.87510^2.
+        """
+        slowness = jnp.sqrt(self.density / self.youngs_modulus)
+        return 8 * math.sqrt(3) * math.pi / 1.8751040687119611**2 * slowness * self.height**2 / (2 * self.width)
+
+    @property
+    def frequencies(self) -> Inexact[Array, "*batch modes"]:
+        """Angular frequencies of the clamped column of masses [rad/s]."""
+        # sqrt(E I/(m L^3)), with section width^3/12 and mass density width height, both per depth.
+        rate = (
+            jnp.sqrt(self.youngs_modulus / (12 * self.density * self.height * self.length)) * self.width / self.length
+        )
+        return rate[..., None] * unit_column(self.masses).frequencies
+
+    @property
+    def _column_stiffness(self) -> Inexact[Array, "*batch modes"]:
+        """Stiffness against a rotation of the base, over m L^2, mode by mode [1/s^2]."""
+        return (self.frequencies * unit_column(self.masses).rotation) ** 2
+
+    @property
+    def strength(self) -> Real:
+        """Moment at which the base unlocks, over m L^2 [1/s^2]."""
+        return self.gravity * jnp.sin(self.alpha) / (2 * self.length)
+
+    @property
+    def spring_rate(self) -> Real:
+        """Negative stiffness of the base, over m L^2 [1/s^2]."""
+        return self.strength / self.alpha
+
+    @property
+    def damping_rates(self) -> tuple[Real, Inexact[Array, "*batch modes"]]:
+        """Decay rate a0 of the masses, and d of each clamped mode of the column: q'' + (a0 + d) q' + ... [1/s]."""
+        frequencies = self.frequencies
+        ratio, first = self.damping_ratio, frequencies[..., 0]
+        if self.damping == "modal":
+            return jnp.zeros_like(first), 2 * ratio[..., None] * frequencies
+        if self.damping == "stiffness":
+            return jnp.zeros_like(first), (2 * ratio / first)[..., None] * frequencies**2
+        second = frequencies[..., 1]
+        part = 2 * ratio / (first + second)
+        return part * first * second, part[..., None] * frequencies**2

@@ -1,0 +1,4 @@
+"""The command `jaxrock`.
+
+Imports everything. Start with `main`.
+"""

@@ -1,0 +1,313 @@
+"""The diffrax engine: one `diffrax.diffeqsolve` for each smooth arc of a rocking block.
+
+An arc runs from one event to the next: impact, turning point, velocity extremum, saddle crossing, certain loss,
+a knot of the motion. All are roots of one function, the smallest of a few guards that are positive at first.
+A guard that starts at zero (the opening angle after an impact, the velocity after a turning point) is divided by
+the power of time with which it leaves zero, so that a hop of any size is seen and its start is not an event. The
+signs of velocity and acceleration are guards too, so that a dip through the ground inside one step cannot hide: it
+needs a turning point. Knots end arcs, so that the right-hand side of every solve is smooth.
+"""
+
+from dataclasses import replace
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.diffrax.guards import (
+    LONGEST,
+    ORDER,
+    Arc,
+    Forcing,
+    Illinois,
+    field,
+    first_guard,
+    first_step,
+    usual_step,
+)
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import State
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either
+from jaxrock.models.coefficients import Angle
+from jaxrock.status import Status
+from jaxrock.transforms.differentiation import differentiable
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
+
+
+_SHARE = 4  # usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace
+
+
+_MOST_STEPS = 4096  # of one solve
+
+
+_GAUSS = tuple(w / 2 for w in (np.polynomial.legendre.leggauss(12)[0] + 1, np.polynomial.legendre.leggauss(12)[1]))
+
+
+_ADJOINTS = {
+    diffrax.RecursiveCheckpointAdjoint: "checkpointed",
+    diffrax.ForwardMode: "lax",
+    diffrax.DirectAdjoint: "bounded",
+}
+
+
+class Diffrax(AbstractEngine):
+    """Settings of the diffrax engine.
+
+    **Arguments:**
+
+    - `solver`: any diffrax solver of ordinary differential equations.
+    - `rtol`: tolerance of a step relative to the state, in (0, 1); 1e-12 is about the tightest in double precision.
+    - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits.
+    - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is
+      only what it is trusted to keep.
+    - `adjoint`: `diffrax.ForwardMode()` (the default: all modes, reverse by way of a small Jacobian),
+      `diffrax.RecursiveCheckpointAdjoint()` for reverse mode by many numbers, or `diffrax.DirectAdjoint()` (slower).
+    - `max_solves`: budget of solves, each of one arc or a part of it; None takes 4,096 and four per piece of
+      the motion.
+
+    **Raises:** ValueError for a value outside its range, or an adjoint that events do not go with.
+    """
+
+    solver: diffrax.AbstractSolver = eqx.field(static=True, default=diffrax.Tsit5())
+    rtol: float = eqx.field(static=True, default=1e-8)
+    atol: float | None = eqx.field(static=True, default=None)
+    controller: diffrax.AbstractStepSizeController | None = eqx.field(static=True, default=None)
+    adjoint: diffrax.AbstractAdjoint = eqx.field(static=True, default=diffrax.ForwardMode())
+    max_solves: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if not 0 < self.rtol < 1:
+            raise ValueError(f"Argument `rtol` must be in (0, 1), but is {self.rtol}.")
+        if self.atol is not None and not 0 < self.atol < 1:
+            raise ValueError(f"Argument `atol` must be in (0, 1), but is {self.atol}.")
+        if self.max_solves is not None and self.max_solves < 1:
+            raise ValueError(f"Argument `max_solves` must be at least 1, but is {self.max_solves}.")
+        if type(self.adjoint) not in _ADJOINTS:
+            names = ", ".join(kind.__name__ for kind in _ADJOINTS)
+            raise ValueError(f"Argument `adjoint` must be one of {names}, but is {type(self.adjoint).__name__}.")
+
+    @property
+    def reverse(self) -> bool:
+        """Whether reverse mode goes through this engine's own loops: as the adjoint tells."""
+        return not isinstance(self.adjoint, diffrax.ForwardMode)
+
+    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "ArcStepper":
+        """This engine at work on a scene."""
+        if taped:
+            raise ValueError(
+                "Derivatives by so many numbers need reverse mode: use Series(), or "
+                "Diffrax(adjoint=diffrax.RecursiveCheckpointAdjoint())."
+            )
+        return ArcStepper(scene=scene, stop=stop, history=history, engine=self)
+
+    def budget(self, scene: Scene, history: bool) -> int:
+        """Largest number of solves."""
+        return self.max_solves or 4096 + 4 * scene.pieces
+
+    def loop(self, unfinished, step, carry, budget: int):
+        """A loop that goes with the adjoint."""
+        return eqxi.while_loop(unfinished, step, carry, max_steps=budget, kind=_ADJOINTS[type(self.adjoint)])
+
+    def limits(self, scene: Scene, piece: Int[ArrayLike, ""]) -> tuple[Scalar, Scalar]:
+        """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
+        atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
+        # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
+        return jax.lax.stop_gradient((atol, jnp.minimum(LONGEST, scene.p * scene.scales[piece])))
+
+    def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None):
+        """The arc, for `length` (p t) at most."""
+        length = jnp.where(arc.side != 0, length, 0.0)
+        # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
+        # do so: of two equal times, derivatives go with each by one half.
+        first = first_step(arc, self.rtol)
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            self.solver,
+            t0=jnp.zeros_like(length),
+            t1=length,
+            dt0=jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0)),
+            y0=jnp.stack([arc.opening, arc.velocity]),
+            args=arc,
+            stepsize_controller=self.controller or diffrax.PIDController(self.rtol, limits[0], dtmax=limits[1]),
+            event=event,
+            adjoint=self.adjoint,
+            max_steps=_MOST_STEPS,
+            throw=False,
+        )
+
+
+class ArcStepper(AbstractStepper):
+    """One scene with the engine's settings, and how far to follow it."""
+
+    scene: Scene
+    stop: Scalar
+    history: bool = eqx.field(static=True)
+    engine: Diffrax
+    doubt: float = eqx.field(static=True, default=1.0)  # the estimate is generous
+
+    def advance(self, state: State) -> State:
+        """One arc of a lane, or a wait at rest."""
+        scene = self.scene
+        forcing = Forcing.of(scene, state)
+        eps = float(jnp.finfo(scene.p.dtype).eps)
+        resting = state.side == 0
+        waited = self.wait(state, forcing.shaking, forcing.unit, ORDER, eps, either)
+        rocked = self.on(state.side)._rock(state, forcing, ~resting)
+        after = self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+        if self.history:
+            return after
+        # After the motion a block that has fallen back and turned below its saddle is safe: it only loses energy.
+        quiet = (state.piece >= scene.pieces) & (after.side != 0)
+        turned = quiet & (state.velocity >= 0) & (after.velocity == 0) & ~after.beyond & (after.opening > 0)
+        turned = turned & (after.impact_time > scene.motion.end)
+        if scene.far is not None:
+            turned = turned & self._outdone(after)
+        return replace(after, done=after.done | turned | (after.status != Status.successful))
+
+    def _outdone(self, state: State) -> Flag:
+        """Whether an asymmetric block that turns back in the free stage will neither fall on the other side, nor come
+        higher or closer to its balance there than before: its energy would not take it to some angle below all that.
+        """
+        scene = self.scene.on(state.side)
+        nodes, weights = (jnp.asarray(values, state.opening.dtype) for values in _GAUSS)
+
+        def energy(table, opening):
+            return opening * jnp.sum(weights * jax.vmap(lambda x: table.restoring(Angle.of(x)))(opening * nodes))
+
+        left = scene.restitution**2 * energy(scene.table, state.opening)
+        outdone = jnp.zeros_like(state.done)
+        for share in (0.999, 0.7, 0.4, 0.1):
+            opening = share * jnp.minimum(state.peak, scene.far.saddle)
+            least = (scene.far.restoring(Angle.of(opening)) / scene.far.restoring_at_rest) ** 2
+            outdone = outdone | ((left < energy(scene.far, opening)) & (least >= state.closeness))
+        return outdone
+
+    def finish(self, state: State) -> State:
+        """Follow the free stage by the same arcs."""
+        if not self.history:
+            return state
+        stepper = ArcStepper(self.scene, jnp.full_like(self.stop, jnp.inf), False, self.engine)
+        moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
+        state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
+        budget = self.engine.budget(self.scene, False)
+        return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+
+    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+        """Solve again from the node."""
+        scene = self.scene.on(node.side)
+        arc = Arc.of(scene, node, Forcing.of(scene, node), self.history)
+
+        def run(scene):
+            return self.engine.solve(*scene, event=None).ys[-1]
+
+        run = run if self.engine.reverse else differentiable(run)
+        opening, velocity = run((arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
+        return opening, velocity * self.scene.p
+
+    def _is_hop(self, state: State, bend: Scalar, forcing: Forcing) -> Flag:
+        """Whether the block comes back to the ground at once, without a peak or a speed that matters.
+
+        From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
+        than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
+        faster than 2 v.
+        """
+        table, v = self.scene.table, state.velocity
+        back = jnp.where(bend < 0, -bend, 1.0)
+        flight, height = 4 * v / (back * self.scene.p), v * v / back
+        weight = forcing.shaking.now[1]
+        pull = table.stiffness * (1.0 if weight is None else weight) + table.restoring_at_rest + back
+        change = table.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
+        certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
+        least = (table.restoring(Angle.of(jnp.minimum(height, table.saddle))) / table.restoring_at_rest) ** 2
+        small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
+        starts = (state.opening == 0) & (v > 0) & (bend < 0)
+        return starts & certain & small & (not self.history)
+
+    def _rock(self, state: State, forcing: Forcing, rocking: Flag) -> State:
+        """Rocking: an arc up to its event, the knot, or the stop."""
+        scene, engine = self.scene, self.engine
+        lost = self.escaped(state, Angle.of(state.opening)) & (not self.history)
+        room = jnp.where(rocking & ~lost, self.room(state), 0.0)
+        share = _SHARE * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
+        whole = room <= share
+        length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
+        arc = Arc.of(scene, state, forcing, self.history)
+        arc = replace(arc, hop=self._is_hop(state, arc.bend, forcing))
+        eps = float(jnp.finfo(scene.p.dtype).eps)
+        event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
+        solution = engine.solve(arc, engine.limits(scene, state.piece), length, event)
+        time, y = solution.ts[-1], solution.ys[-1]
+        void = rocking & arc.is_void(time, y, solution.event_mask)
+        time = jnp.where(void, jnp.maximum(time, jnp.minimum(arc.horizon, length)), time)
+        y = jnp.where(void, 0.0, y)
+        happened = rocking & solution.event_mask & (time > 0) | void
+        guards = arc.guards(time, y)
+        fired = happened & (jnp.arange(guards.size) == jnp.argmin(guards))
+        ground, turning, _, crossing, _, flat = fired
+        ground = ground | (happened & (y[0] <= 0) & ~void)
+        # The saddle is where a free block has its slowest passage: two events in one.
+        crossing = crossing | (happened & (arc.gap(y[0]) == 0) & (arc.gap(state.opening) != 0))
+        turning, crossing = turning & ~ground, crossing & ~ground
+
+        elapsed = time / scene.p
+        full = ~happened & whole
+        piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
+        steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
+        off = 2.5 * engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
+        spread = self.spread_after(state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
+        moved = time > 0
+        after = replace(
+            state,
+            piece=piece,
+            local=local,
+            opening=jnp.where(flat, jnp.pi / 2, jnp.where(crossing, scene.table.saddle, y[0])),
+            velocity=jnp.where(turning, 0.0, y[1]),
+            uplifting=state.uplifting & ~moved,
+            beyond=state.beyond ^ crossing,
+            fastest=jnp.maximum(state.fastest, jnp.abs(y[1])),
+            spread=spread,
+            done=over & self.history,  # an outcome goes on through the free stage
+        )
+        after = replace(after, side=jnp.where(void, 0.0, after.side))
+        return self._happen(state, after, arc, (ground & ~void, turning, crossing), y, lost, solution.result)
+
+    def _happen(self, before: State, after: State, arc: Arc, events, y: Pair, lost: Flag, result) -> State:
+        """Let the event of an arc happen: peaks, margin, impact, verdict."""
+        ground, turning, crossing = events
+        scene = self.scene
+        outward = (before.velocity > 0) | ((before.velocity == 0) & (arc.bend >= 0))
+        bend = arc.acceleration((after.local - before.local) * scene.p, y)
+        after = self.note(after, outward, turning, crossing, y[0], y[1], bend)
+        quiet = before.piece >= scene.pieces
+        forcing = Forcing.of(scene, after)
+        reach = jnp.minimum(self.room(after), forcing.reach)
+        after = self.impact(after, ground, y[1], forcing.shaking.now, forcing.steepest, reach)
+        down = after.opening >= jnp.pi / 2
+        escaped = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
+        overturned = escaped | down if scene.falls_flat else escaped
+        if not self.history:
+            # The impact after the motion counts if the block is lost after it.
+            decisive = (after.impact_time > scene.motion.end) & overturned
+            after = replace(after, impacts=jnp.where(quiet, before.impacts + decisive, after.impacts))
+        exhausted = result == diffrax.RESULTS.max_steps_reached
+        failed = ~exhausted & ~diffrax.is_okay(result)
+        balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.bend) <= arc.noise) & (before.side != 0)
+        # Fallen flat at next to no speed: it may have turned back just before.
+        barely = scene.falls_flat & down & ~escaped
+        barely = barely & (y[1] ** 2 <= 2 * self.doubt * jnp.abs(bend) * after.spread.angle)
+        status = Status.where(balanced | barely, Status.undecided, after.status)
+        status = Status.where(exhausted, Status.step_budget_exhausted, status)
+        status = Status.where(failed, Status.solver_failed, status)
+        ends = overturned & down if self.history else overturned
+        return replace(after, overturned=overturned, status=status, done=after.done | ends | exhausted | failed)

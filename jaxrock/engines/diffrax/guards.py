@@ -1,0 +1,245 @@
+"""One smooth arc of a rocking block as a problem for diffrax: its forcing, its right-hand side, its guards."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import State
+from jaxrock.models.coefficients import Angle, Table
+from jaxrock.models.user_equation import EquationTable
+from jaxrock.motions.motion import AbstractMotion, Shaking
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
+
+
+LONGEST = 0.5  # step of the default controller, in 1/p
+
+
+ORDER = 12  # of the motion's series: for waiting, for coming to rest, and of pieces that are polynomials
+
+
+class Forcing(eqx.Module):
+    """The ground's acceleration [g] along an arc. A piece that is a polynomial (of a record) is taken as that, so that
+    a right-hand side does not look into the record."""
+
+    motion: AbstractMotion | None  # None: the terms are all
+    shaking: Shaking  # Taylor coefficients in time/unit
+    unit: Scalar  # [s]
+    piece: Int[Array, ""]
+    local: Scalar
+    during: Flag
+    p: Scalar
+
+    @classmethod
+    def of(cls, scene: Scene, state: State) -> "Forcing":
+        """The forcing from a state on."""
+        shaking, unit = scene.shaking(state.piece, state.local, ORDER)
+        piece = jnp.minimum(state.piece, scene.pieces - 1)
+        polynomial = all(terms is None or len(terms) <= ORDER for terms in shaking)
+        motion = None if polynomial else scene.motion
+        return cls(motion, shaking, unit, piece, state.local, state.piece < scene.pieces, scene.p)
+
+    def __call__(self, time: Scalar) -> tuple[Scalar, Scalar | None]:
+        """Acceleration [g] and weight (`Shaking.at`) at p t since the state."""
+        if self.motion is None:
+            return self.shaking.at(time / (self.p * self.unit))
+        here = self.piece, self.local + time / self.p, 1 / self.p, 0
+        values = Shaking(self.motion.series(*here), self.motion.vertical_series(*here))
+        return values.each(lambda terms: [jnp.where(self.during, u, 0.0) for u in terms]).now
+
+    @property
+    def reach(self) -> Scalar:
+        """For how long `steepest` holds [s], within the piece."""
+        return 0.25 * self.unit
+
+    @property
+    def steepest(self) -> tuple[Scalar, Scalar | None]:
+        """Bounds of how fast the acceleration changes within `reach`, horizontal and vertical [g/s]."""
+        return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
+
+
+class Arc(eqx.Module):
+    """The smooth problem of one arc, and its guards; time is p t since its start."""
+
+    table: Table | EquationTable
+    forcing: Forcing
+    side: Scalar
+    opening: Scalar
+    velocity: Scalar
+    bend: Scalar  # acceleration at the start
+    jerk: Scalar  # its derivative
+    noise: Scalar  # what rounding may make of an acceleration that is zero
+    helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
+    hop: Flag  # too small for its turning point to matter, and certain to come back
+    flat: Flag  # whether a rotation of pi/2 ends it
+
+    @classmethod
+    def of(cls, scene: Scene, start: State, forcing: Forcing, history: bool) -> "Arc":
+        """The arc from a state on."""
+        zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
+        flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
+        state = start.side, start.opening, start.velocity
+        arc = cls(scene.table, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
+        y = jnp.stack([start.opening, start.velocity])
+        bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
+        # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
+        pull = scene.table.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.table.arm_at_rest
+        noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
+        leaving = (start.opening == 0) & (start.velocity == 0)
+        bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
+        noise = jax.lax.stop_gradient(noise)
+        return eqx.tree_at(lambda a: (a.bend, a.jerk, a.noise), arc, (bend, jerk, noise))
+
+    def acceleration(self, time: Scalar, y: Pair) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2."""
+        acceleration, weight = self.forcing(time)
+        return self.table.acceleration(Angle.of(y[0]), y[1], self.side * acceleration, weight)
+
+    def flow(self, time: Scalar, y: Pair) -> Pair:
+        """The right-hand side."""
+        return jnp.stack([y[1], self.acceleration(time, y)])
+
+    def gap(self, opening: Scalar) -> Scalar:
+        """Opening angle beyond the saddle; zero where that is only rounding."""
+        gap = opening - self.table.saddle
+        return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.table.saddle, 0.0, gap)
+
+    @property
+    def leaving(self) -> Flag:
+        """Whether the block leaves rest."""
+        return (self.opening == 0) & (self.velocity == 0)
+
+    @property
+    def horizon(self) -> Scalar:
+        """Time (p t) for which the acceleration of a block that leaves rest is only noise."""
+        return self.noise / jnp.maximum(self.jerk, self.noise)
+
+    def is_void(self, time: Scalar, y: Pair, event: Flag) -> Flag:
+        """Whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
+        nothing = event & (jnp.abs(y[1]) <= self.noise * time)
+        return self.leaving & (self.bend == 0) & ((self.jerk <= 0) | nothing)
+
+    def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
+        """Ground, turning point, velocity extremum, saddle, certain loss, fallen flat: the first to reach zero ends
+        the arc. All start above zero."""
+        ground = _guard(time, y[0], [self.opening, self.velocity, self.bend / 2, self.jerk / 6], True)
+        turn = _guard(time, y[1], [self.velocity, self.bend, self.jerk / 2], ~self.hop)
+        # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
+        rises = jnp.where(self.bend == 0, self.jerk >= 0, self.bend > 0)
+        along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
+        extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
+        saddle = _guard(time, y[0] - self.table.saddle, [self.gap(self.opening), self.velocity], True)
+        held = self._hold(self.opening)
+        forced = self.helpful[0] > 0
+        if self.helpful[1] is not None:
+            forced = forced | (self.helpful[1] != 1)
+        escape = _guard(time, self._hold(y[0]), [held], forced & (held > 0))
+        flat = _guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat)
+        return jnp.stack([ground, turn, extremum, saddle, escape, flat])
+
+    def _hold(self, opening: Scalar) -> Scalar:
+        """What the restoring moment and the most helpful forcing do against overturning."""
+        return -self.table.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
+
+
+def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag) -> Scalar:
+    """`value` over its leading term c t^m at the start, `jet` = its Taylor coefficients there; one at time 0."""
+    lead, power = jnp.ones_like(time), jnp.ones_like(time)
+    found = jnp.zeros_like(time, bool)
+    for m, c in enumerate(jet):
+        here = ~found & (c != 0)
+        lead = jnp.where(here, c, lead)
+        power = jnp.where(here, time**m, power)
+        found = found | here
+    later = found & (time > 0) & active
+    return jnp.where(later, value / jnp.where(later, lead * power, 1.0), 1.0)
+
+
+def field(t, y, args: Arc):
+    """The right-hand side, as diffrax calls it."""
+    return args.flow(t, y)
+
+
+def first_guard(t, y, args: Arc, **kwargs):
+    """The smallest guard, as diffrax calls it."""
+    # Diffrax sets this beside a zero of the default type, also where the scene is in single precision.
+    return jnp.min(args.guards(t, y)).astype(jnp.result_type(float))
+
+
+def usual_step(rtol: float) -> float:
+    """Step (p t) that methods of order five take at this tolerance."""
+    return min(0.1 * (rtol / 1e-8) ** 0.2, LONGEST)
+
+
+def first_step(arc: Arc, rtol: float) -> Scalar:
+    """A step (p t) that does not jump over a small hop: half the way back to the ground; a certain hop at once."""
+    x, v, bend = arc.opening, arc.velocity, arc.bend
+    tiny = jnp.finfo(x.dtype).tiny
+    back = jnp.maximum(-bend, tiny)
+    root = jnp.sqrt(v * v + 2 * back * x)
+    to_ground = jnp.where(v > 0, (v + root) / back, 2 * x / jnp.maximum(root - v, tiny))
+    # Where the deceleration is only just beginning, it is its growth that turns the block back.
+    to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.jerk, tiny))
+    usual = jnp.minimum(usual_step(rtol), jnp.where(to_turn > 0, 4 * to_turn, jnp.inf))
+    return jnp.where(to_ground > 0, jnp.minimum(jnp.where(arc.hop, 1.1, 0.5) * to_ground, usual), usual)
+
+
+class _Bracket(eqx.Module):
+    lower: Scalar
+    upper: Scalar
+    at_lower: Scalar
+    at_upper: Scalar
+    count: Int[Array, ""]
+
+
+class Illinois(optx.AbstractRootFinder):
+    """Root of a function that is positive at `lower` and not at `upper`: false position with Illinois's weights,
+    and bisection whenever that has not at least quartered the bracket in three steps."""
+
+    rtol: float
+    atol: float
+    norm: Any = eqx.field(static=True, default=jnp.abs)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The bracket of the last step."""
+        lower, upper = (jnp.asarray(options[name], y.dtype) for name in ("lower", "upper"))
+        return _Bracket(lower, upper, fn(lower, args)[0], fn(upper, args)[0], jnp.array(0))
+
+    def step(self, fn, y, args, options, state, tags):
+        """One evaluation."""
+        bisect = state.count % 3 == 2
+        share = state.at_lower / (state.at_lower - state.at_upper)
+        share = jnp.where(bisect | ~(share > 0) | ~(share < 1), 0.5, share)
+        x = state.lower + share.astype(y.dtype) * (state.upper - state.lower)
+        value, aux = fn(x, args)
+        above = value > 0
+        # The end that stays is weighted down, so that it moves next time.
+        state = _Bracket(
+            lower=jnp.where(above, x, state.lower),
+            upper=jnp.where(above, state.upper, x),
+            at_lower=jnp.where(above, value, jnp.where(bisect, 1.0, 0.5) * state.at_lower),
+            at_upper=jnp.where(above, jnp.where(bisect, 1.0, 0.5) * state.at_upper, value),
+            count=state.count + 1,
+        )
+        return x, state, aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Whether the bracket is as small as rounding allows, or the root is met."""
+        small = state.upper - state.lower <= self.atol + self.rtol * jnp.abs(state.upper)
+        # A quantity that is only noise may have no root but the start.
+        return small | (state.at_upper == 0) | (state.at_lower <= 0) | (state.count >= 200), optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """The last point."""
+        return y, aux, {}

@@ -1,0 +1,299 @@
+"""The free stage: what a rocking block does after the ground has come to rest, by energy alone.
+
+Velocities are per dimensionless time p t. With x half the angle that is missing to the saddle, the free
+equation is dx/dtau = sqrt(sin^2 x - k^2): its times are elliptic integrals of the first kind (logarithms
+in the linear model; quadrature in `skewed` where a constant adds to the sinusoid), its peaks and verdicts follow
+from the energy.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.state import surpasses
+from jaxrock.models import free_swing as skewed
+from jaxrock.models.coefficients import Angle, Table
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+class FreeStage(eqx.Module):
+    """Result of a free stage; times and velocities per p t, angles in rad."""
+
+    overturned: Bool[Array, ""]
+    impacts: Int[Array, ""]  # before overturning; a safe block's infinitely many are not counted
+    peak: Scalar  # largest opening angle still to come
+    peak_time: Scalar
+    peak_steepness: Scalar  # -2 (change of the energy with the peak)
+    peak_share: Scalar  # of an error of the present energy that is left in that of the peak
+    fastest: Scalar  # largest speed still to come
+    closeness: Scalar  # smallest squared distance from standing still in balance still to come
+    deficit: Scalar  # 2 (energy of the saddle - energy) of the excursion that decides [rad^2]
+    share: Scalar  # of an error of the present energy that is left in it
+
+    @classmethod
+    def none(cls, like: Scalar) -> "FreeStage":
+        """Of a block that does not move."""
+        zero, one, no = jnp.zeros_like(like), jnp.ones_like(like), jnp.zeros_like(like, bool)
+        return cls(
+            overturned=no,
+            impacts=jnp.zeros_like(like, jnp.int32),
+            peak=zero,
+            peak_time=zero,
+            peak_steepness=one,
+            peak_share=one,
+            fastest=zero,
+            closeness=jnp.full_like(like, jnp.inf),
+            deficit=jnp.full_like(like, jnp.inf),
+            share=one,
+        )
+
+
+def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+    """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""
+    for _ in range(14):
+        roots = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        shift = roots[0] * roots[1] + roots[1] * roots[2] + roots[2] * roots[0]
+        x, y, z = (x + shift) / 4, (y + shift) / 4, (z + shift) / 4
+    mean = (x + y + z) / 3
+    dx, dy = 1 - x / mean, 1 - y / mean
+    dz = -(dx + dy)
+    e2, e3 = dx * dy - dz * dz, dx * dy * dz
+    return (1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)
+
+
+def _time_to_peak(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
+    """Time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
+    if not table.sinusoidal:
+        return jnp.arctanh(speed / manifold)
+    if table.skew is not None:
+        turn = skewed.turning_gap((manifold - speed) * (manifold + speed), table.skew, table.saddle)
+        return skewed.time_to_turning(gap, speed, turn, table.skew)
+    k = jnp.sqrt(jnp.maximum((manifold - speed) * (manifold + speed), 1e-280)) / 2
+    tangent = speed / (2 * jnp.cos(gap / 2))
+    ratio = tangent / k
+    return ratio * carlson_rf(jnp.ones_like(k), 1 + tangent**2, 1 + ratio**2)
+
+
+def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, base: Scalar, arrival: Scalar):
+    """Time from opening angle saddle - gap, moving inward, to the impact at speed `arrival`."""
+    if not table.sinusoidal:
+        return jnp.log((base + arrival) / (manifold + speed))
+
+    def below():
+        return _time_to_peak(table, table.saddle, base, arrival) - _time_to_peak(table, gap, manifold, speed)
+
+    def above():
+        kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
+
+        def from_saddle(angle):
+            if table.skew is not None:
+                return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
+            tangent = jnp.tan(angle / 2)
+            ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
+            return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
+
+        return from_saddle(table.saddle) - from_saddle(gap)
+
+    return jax.lax.cond(speed > jnp.abs(manifold), above, below)
+
+
+class Visit(NamedTuple):
+    """A stay on one side, until the impact that ends it."""
+
+    table: Table
+    restitution: Scalar  # of that impact
+
+
+def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar) -> FreeStage:
+    """Follow an unforced block to its end.
+
+    **Arguments:**
+
+    - `visits`: the sides on which it stands, first the present one, as many as may decide: two for a symmetric block,
+      three for an asymmetric one. Of these the last decides nothing if the block moves outward now: it comes back to
+      the same side with less energy.
+    - `opening`: opening angle [rad], 0 or more.
+    - `velocity`: its derivative with respect to p t [rad], positive outward.
+    - `moving`: whether the block rocks at all; if not, nothing comes.
+    - `known`: the largest opening angle so far [rad]: the time of a peak that is lower is not computed.
+
+    **Returns:** a `FreeStage`.
+
+    **Source:** the energy argument of Housner (1963); D&D (2012), 4.12 corrected.
+    """
+    present = _present(visits[0].table, opening, velocity, moving, comes_back=len(visits) > 2)
+    outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
+    arrival, found = present.arrival, [present]
+    shares = [share]
+    for i, visit in enumerate(visits[1:], 1):
+        happens = moving & ~lost & ~outward if i == len(visits) - 1 else moving & ~lost
+        rebound = visits[i - 1].restitution * arrival
+        share = share * visits[i - 1].restitution ** 2
+        stay = _after_impact(visit.table, rebound, happens)
+        lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
+        arrival = rebound
+        found.append(stay)
+        shares.append(share)
+
+    # Of several peaks the highest, of equal ones the first.
+    zero = jnp.zeros_like(opening)
+    peak, best, steepness, peak_share, highest = zero, known, jnp.ones_like(opening), share, []
+    closeness = deficit = narrowest = jnp.full_like(opening, jnp.inf)
+    decisive, fastest = share, jnp.zeros_like(opening)
+    for stay, share in zip(found, shares):
+        higher = stay.safe & surpasses(stay.peak, peak)
+        highest.append(stay.safe & surpasses(stay.peak, best))
+        best = jnp.where(highest[-1], stay.peak, best)
+        steepness = jnp.where(higher, stay.steepness, steepness)
+        peak_share = jnp.where(higher, share, peak_share)
+        peak = jnp.where(stay.safe & (stay.peak > peak), stay.peak, peak)
+        fastest = jnp.where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
+        closeness = jnp.where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
+        # In terms of the present energy.
+        missing = jnp.abs(stay.deficit) / jnp.where(share > 0, share, 1.0)
+        narrow = stay.decides & (missing < narrowest)
+        deficit, decisive = jnp.where(narrow, stay.deficit, deficit), jnp.where(narrow, share, decisive)
+        narrowest = jnp.where(narrow, missing, narrowest)
+
+    def time():
+        at = since = zero
+        for stay, higher in zip(found, highest):
+            top, since = stay.times(since)
+            at = jnp.where(higher, top, at)
+        return at
+
+    # Elliptic integrals cost more than all the rest: most peaks come before the free stage.
+    peak_time = jax.lax.cond(functools.reduce(jnp.logical_or, highest), time, lambda: zero)
+    return FreeStage(
+        overturned=lost,
+        impacts=impacts.astype(jnp.int32),
+        peak=jnp.where(lost, 0.0, peak),
+        peak_time=peak_time,
+        peak_steepness=steepness,
+        peak_share=peak_share,
+        fastest=jnp.where(lost, 0.0, fastest),
+        closeness=closeness,
+        deficit=deficit,
+        share=decisive,
+    )
+
+
+class _Stay(NamedTuple):
+    """What a block does on one side in the free stage."""
+
+    lost: Flag  # it falls on this side
+    safe: Flag  # it moves there and comes back
+    decides: Flag  # whether it falls here is decided by its energy
+    deficit: Scalar  # 2 (energy of the saddle - energy)
+    peak: Scalar  # highest opening angle; zero if it only comes back
+    steepness: Scalar  # -2 (change of energy with the peak)
+    closeness: Scalar
+    arrival: Scalar  # speed at the impact that ends it
+    times: Callable  # of the time at which it begins: those of its peak, and of the impact that ends it
+
+
+def _peak_of(table: Table, deficit: Scalar) -> Scalar:
+    """Opening angle at which a block turns back; deficit: 4 sin^2(half the angle to the saddle), or its square."""
+    if table.skew is not None:
+        return table.saddle - skewed.turning_gap(deficit, table.skew, table.saddle)
+    missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
+    return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
+
+
+def _weight(table: Table) -> Scalar:
+    """What makes squared velocities and accelerations, in units of the stiffness, a closeness."""
+    return (table.stiffness / table.restoring_at_rest) ** 2
+
+
+def _turning_closeness(table: Table, gap2: Scalar, beyond: bool = False) -> Scalar:
+    """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
+    if table.skew is not None:
+        skew, reach = (-table.skew, jnp.pi / 2 - table.saddle) if beyond else (table.skew, table.saddle)
+        return _weight(table) * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
+    shape = gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2
+    return _weight(table) * shape
+
+
+def _steepness(table: Table, peak: Scalar) -> Scalar:
+    return 2 * jnp.abs(table.restoring(Angle.of(peak)))
+
+
+def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, comes_back: bool) -> _Stay:
+    """The stay on the side where the block is when the motion ends; `comes_back`: whether it matters when it does."""
+    rate = jnp.sqrt(table.stiffness)
+    gap, speed = table.saddle - opening, velocity / rate
+    manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
+    deficit = (manifold - speed) * (manifold + speed)
+    lost, outward = moving & (speed > manifold), speed > 0
+    safe = moving & ~lost
+    arrival = jnp.sqrt(jnp.maximum(base**2 - deficit, 0.0))
+    rises, falls = safe & outward, safe & ~outward
+
+    def times(_):
+        out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
+        back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
+        falling = _time_to_impact(
+            table,
+            jnp.where(falls, gap, table.saddle),
+            jnp.where(falls, manifold, base),
+            jnp.where(falls, -speed, 0.0),
+            base,
+            jnp.where(falls, arrival, 0.0),
+        )
+        return out / rate, jnp.where(outward, out + back, falling) / rate
+
+    # Closeness: crossing the saddle at a speed, or turning at an acceleration.
+    crossing, turning = -deficit * _weight(table), _turning_closeness(table, jnp.abs(deficit))
+    past_inward = (gap < 0) & (speed < 0)
+    beyond = jnp.where(past_inward, _turning_closeness(table, jnp.abs(deficit), beyond=True), jnp.inf)
+    lost_closeness = jnp.where(gap > 0, crossing, beyond)
+    safe_closeness = jnp.where(outward, turning, jnp.where(past_inward, crossing, jnp.inf))
+    peak = _peak_of(table, jnp.where(rises, deficit, base**2))
+    return _Stay(
+        lost=lost,
+        safe=safe,
+        decides=moving & (outward | past_inward),
+        deficit=deficit * table.stiffness,
+        peak=jnp.where(rises, peak, 0.0),
+        steepness=_steepness(table, peak),
+        closeness=jnp.where(lost, lost_closeness, jnp.where(safe, safe_closeness, jnp.inf)),
+        arrival=arrival * rate,
+        times=times,
+    )
+
+
+def _after_impact(table: Table, rebound: Scalar, happens: Flag) -> _Stay:
+    """The stay on a side on which the block comes to stand with a velocity; if it happens at all."""
+    rate = jnp.sqrt(table.stiffness)
+    base, speed = table.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
+    deficit = (base - speed) * (base + speed)
+    lost = happens & (speed > base)
+    safe = happens & ~lost
+
+    def times(since):
+        out = _time_to_peak(table, table.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+        return since + out, since + 2 * out
+
+    peak = _peak_of(table, jnp.where(safe, deficit, base**2))
+    turning = _turning_closeness(table, jnp.abs(deficit))
+    crossing = -deficit * _weight(table)
+    return _Stay(
+        lost=lost,
+        safe=safe,
+        decides=happens,
+        deficit=deficit * table.stiffness,
+        peak=peak,
+        steepness=_steepness(table, peak),
+        closeness=jnp.where(lost, crossing, jnp.where(safe, turning, jnp.inf)),
+        arrival=rebound,
+        times=times,
+    )

@@ -1,0 +1,206 @@
+"""A scene: block, motion and model reduced to the numbers that the engines need."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact, Int
+
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.models.coefficients import Table
+from jaxrock.models.spring import Spring
+from jaxrock.models.user_equation import EquationTable, Model
+from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
+from jaxrock.numerics.lookup import pick
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+_FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
+
+
+def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array, " n"]:
+    """Largest of the `width` values from each position on (width a power of two; zeros beyond the end)."""
+    reach = 1
+    while reach < width:
+        values = jnp.maximum(values, jnp.pad(values[reach:], (0, min(reach, values.size))))
+        reach *= 2
+    return values
+
+
+def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
+    return jax.lax.associative_scan(jnp.maximum, values, reverse=True)
+
+
+def peak_bound(motion: AbstractMotion) -> Scalar:
+    """A bound of the motion's acceleration [g]: its peak, for records and most pulses."""
+    return jnp.max(motion.bounds)
+
+
+def check_single(block: Block | AsymmetricBlock, motion: AbstractMotion) -> None:
+    """Raise ValueError where a parameter is an array outside of `jax.vmap`."""
+    for name, owner in (("block", block), ("motion", motion)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(owner):
+            allowed = 1 if jax.tree_util.keystr(path).endswith(".samples") else 0
+            if jnp.ndim(leaf) > allowed:
+                raise ValueError(
+                    f"Argument `{name}` must hold one scene, but `{jax.tree_util.keystr(path).lstrip('.')}` has "
+                    f"shape {jnp.shape(leaf)}. Use jax.vmap for many."
+                )
+
+
+def _tables(block: Block | AsymmetricBlock, model: Model) -> tuple:
+    """Table of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
+    if isinstance(block, Block):
+        return model.table(block), None
+    return tuple(model.table(side).times((side.p / block.p1) ** 2) for side in block.sides)
+
+
+def _least_threshold(table: Table | EquationTable, far: Table | EquationTable | None) -> Scalar:
+    return table.threshold if far is None else jnp.minimum(table.threshold, far.threshold)
+
+
+def uplift_threshold(block: Block | AsymmetricBlock, model: Model) -> Scalar:
+    """Ground acceleration at which a block uplifts, to its weaker side [g]."""
+    return _least_threshold(*_tables(block, model))
+
+
+class Scene(eqx.Module):
+    """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
+
+    A symmetric block has one `table` for both sides. That of an asymmetric one is for the side on which it stands
+    (rotation > 0 unless `on` tells otherwise), and `far` for the other.
+    """
+
+    table: Table | EquationTable
+    far: Table | EquationTable | None
+    p: Scalar  # unit of time and velocity on either side
+    alpha: Scalar  # size of an angle that matters
+    restitution: Scalar  # of an impact that ends the stay on this side
+    far_restitution: Scalar  # on the other
+    motion: AbstractMotion
+    knots: Inexact[Array, " knots"]
+    lengths: Inexact[Array, " knots"]
+    scales: Inexact[Array, " knots"]
+    ceilings: Inexact[Array, " knots"]  # bound of |acceleration| from each piece to the end [g]
+    vertical_ceilings: Inexact[Array, " knots"] | None  # the same of the vertical acceleration
+    drives: Inexact[Array, " knots"]  # bound of what acts against the threshold, to the end [g]
+    quiet_near: Inexact[Array, " knots"]  # the same over the next pieces
+    quiet_far: Inexact[Array, " knots"]
+    falls_flat: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: Model) -> "Scene":
+        """Build the scene; raise ValueError where a parameter is an array outside of `jax.vmap`."""
+        check_single(block, motion)
+        dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
+        block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
+        knots, bounds, scales = motion.knots, motion.bounds, motion.scales
+        infinity = jnp.full(1, jnp.inf, dtype)
+        bounds, vertical = jnp.pad(bounds, (0, 1)), motion.vertical_bounds
+        if vertical is not None and isinstance(model, Spring):
+            raise ValueError(
+                "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
+            )
+        skips = bounds.size > _NEAR
+        table, far = _tables(block, model)
+        if isinstance(block, Block):
+            near, other, p, alpha = block, block, block.p, block.alpha
+        else:
+            (near, other), p, alpha = block.sides, block.p1, jnp.minimum(block.alpha1, block.alpha2)
+        # At rest while |u| < threshold (1 + v), so at least while |u| + threshold |v| < threshold.
+        threshold = _least_threshold(table, far)
+        drive = bounds if vertical is None else bounds + threshold * jnp.pad(vertical, (0, 1))
+        return cls(
+            table=table,
+            far=far,
+            p=p,
+            alpha=alpha,
+            restitution=near.restitution,
+            far_restitution=other.restitution,
+            motion=motion,
+            knots=knots,
+            lengths=jnp.concatenate([jnp.diff(knots), infinity]),
+            scales=jnp.concatenate([scales, infinity]),
+            ceilings=_running_maximum(bounds),
+            vertical_ceilings=None if vertical is None else _running_maximum(jnp.pad(vertical, (0, 1))),
+            drives=_running_maximum(drive),
+            quiet_near=_sliding_maximum(drive, _NEAR) if skips else drive,
+            quiet_far=_sliding_maximum(drive, _FAR) if skips else drive,
+            falls_flat=model.falls_flat,
+        )
+
+    @property
+    def pieces(self) -> int:
+        """Number of smooth pieces of the motion."""
+        return self.knots.size - 1
+
+    def on(self, side: Scalar) -> "Scene":
+        """The scene as a block on this side sees it; at rest as on side +1."""
+        if self.far is None:
+            return self
+
+        def of(here, there):
+            return jax.tree.map(lambda a, b: jnp.where(side < 0, b, a), here, there)
+
+        return replace(
+            self,
+            table=of(self.table, self.far),
+            far=of(self.far, self.table),
+            restitution=of(self.restitution, self.far_restitution),
+            far_restitution=of(self.far_restitution, self.restitution),
+        )
+
+    @property
+    def tables(self) -> tuple[Table | EquationTable, Table | EquationTable]:
+        """Tables of this side and of the other."""
+        return self.table, self.table if self.far is None else self.far
+
+    @property
+    def own_tables(self) -> tuple[Table | EquationTable, ...]:
+        """The one table, or both."""
+        return (self.table,) if self.far is None else (self.table, self.far)
+
+    @property
+    def threshold(self) -> Scalar:
+        """Ground acceleration below which the block stays at rest, to whichever side it goes [g]."""
+        return _least_threshold(self.table, self.far)
+
+    def drives_of(self, shaking: Shaking) -> list[tuple[list[Scalar], Scalar]]:
+        """What lifts a block at rest to side 1 and to side -1, as a series, and the level above which it does.
+
+        To side s where -s u > threshold (1 + v).
+        """
+        found = []
+        for side, table in zip((1, -1), self.tables):
+            drive = [-side * u for u in shaking.horizontal]
+            if shaking.vertical is not None:
+                drive = sum_of_series(drive, [-table.threshold * v for v in shaking.vertical])
+            found.append((drive, table.threshold))
+        return found
+
+    def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:
+        """The forcing [g] and weight still to come that do most for a block past its saddle."""
+        weight = None if self.vertical_ceilings is None else 1 - pick(self.vertical_ceilings, piece)
+        return pick(self.ceilings, piece), weight
+
+    def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
+        """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
+        if self.pieces < _NEAR:
+            return piece
+        threshold = self.threshold
+        far, near = self.quiet_far[piece] < threshold, self.quiet_near[piece] < threshold
+        return jnp.minimum(piece + jnp.where(far, _FAR, jnp.where(near, _NEAR, 0)), self.pieces)
+
+    def shaking(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[Shaking, Scalar]:
+        """Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
+        unit = jnp.minimum(1 / self.p, pick(self.scales, piece))
+        during = piece < self.pieces
+        inner = jnp.minimum(piece, self.pieces - 1)
+        shaking = Shaking(
+            self.motion.series(inner, local, unit, order), self.motion.vertical_series(inner, local, unit, order)
+        )
+        return shaking.each(lambda terms: [jnp.where(during, u, 0.0) for u in terms]), unit

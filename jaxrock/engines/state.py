@@ -1,0 +1,96 @@
+"""The state of a lane: one block under one motion, on its way."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.uncertainty import Spread
+from jaxrock.models.coefficients import Angle
+from jaxrock.status import Status
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+class State(eqx.Module):
+    """Where a lane is, and what it has seen so far. Velocities are per p t, angles in rad."""
+
+    piece: Int[Array, ""]
+    local: Scalar  # time since the start of the piece [s]
+    side: Scalar  # corner it stands on: +1, -1; 0 at rest
+    opening: Scalar  # side * rotation
+    velocity: Scalar  # of the opening
+    uplifting: Flag  # leaves rest now, with zero acceleration (a continuous motion)
+    beyond: Flag  # past the saddle
+    extremal: Flag  # the velocity has an extremum here: the acceleration is zero, to rounding
+    peak: Scalar
+    peak_time: Scalar
+    error: Scalar  # standard error of the peak
+    fastest: Scalar
+    impacts: Int[Array, ""]
+    impact_time: Scalar  # of the last impact [s]
+    impact_velocity: Scalar  # of the rotation, just before it
+    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
+    closeness_beyond: Scalar  # the same since the saddle was last crossed outward
+    clearance: Scalar  # how far from a graze it has been: the least height at which it turned back before the
+    # ground, or depth to which it would have come without the ground where it was being slowed down
+    peak_clearance: Scalar  # the same up to the peak
+    second: Scalar  # the next highest peak
+    spread: Spread  # of opening and velocity
+    overturned: Flag
+    done: Flag
+    status: Status
+    steps: Int[Array, ""]
+
+
+def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
+    """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
+    velocity = velocity / scene.p
+    side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    opening, outward = jnp.abs(rotation), side * velocity
+    zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
+    count = jnp.zeros_like(opening, jnp.int32)
+    table = scene.on(side).table
+    beyond = opening >= table.saddle
+    # Squared distance from standing still in balance, for a block that starts beyond it.
+    pull = table.restoring(Angle.of(opening))
+    stillness = (table.stiffness * outward**2 + pull**2) / table.restoring_at_rest**2
+    # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
+    unlifted = jnp.maximum(2 - scene.drives[0] / scene.threshold, 1)
+    eps = jnp.finfo(opening.dtype).eps
+    finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
+    return State(
+        piece=count,
+        local=zero,
+        side=side,
+        opening=opening,
+        velocity=outward,
+        uplifting=no,
+        beyond=beyond,
+        extremal=no,
+        peak=opening,
+        peak_time=zero,
+        error=zero,
+        fastest=jnp.abs(outward),
+        impacts=count,
+        impact_time=zero,
+        impact_velocity=zero,
+        closeness=jnp.where(side == 0, unlifted, jnp.where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
+        closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
+        clearance=jnp.full_like(opening, jnp.inf),
+        peak_clearance=jnp.full_like(opening, jnp.inf),
+        second=zero,
+        spread=Spread.none(opening).plus(eps * opening, eps * outward),
+        overturned=no,
+        done=~finite,
+        status=Status.where(finite, Status.successful, Status.not_finite),
+        steps=count,
+    )
+
+
+def surpasses(value: Scalar, best: Scalar) -> Flag:
+    """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
+    return value > best * (1 + 4096 * jnp.finfo(best.dtype).eps)

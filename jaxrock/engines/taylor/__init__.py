@@ -1,0 +1,4 @@
+"""The series engine: Taylor steps that are exact to rounding.
+
+Imports the modules of `engines`. Start with `careful`, one step of one lane; `fast` is the same for many lanes.
+"""

@@ -1,0 +1,379 @@
+"""The series engine: Taylor steps of a rocking block from event to event, exact to rounding.
+
+A lane (one block under one motion) steps through its own time. Within a smooth piece of the motion the
+opening angle is expanded about the present state, the last coefficients give the step, and the step ends
+early at the first event: impact, turning point, saddle crossing, or a new largest velocity. A block at rest
+waits for the threshold. Under `jax.vmap` lanes advance together, each at its own time; a branch that no
+lane needs is not taken.
+"""
+
+import functools
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import State, surpasses
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either, when
+from jaxrock.engines.taylor.checkpointing import on_tape
+from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.models.coefficients import Angle, Table
+from jaxrock.motions.motion import Shaking
+from jaxrock.numerics.polynomial import (
+    Watch,
+    derivative,
+    fall_bound,
+    first_event,
+    jet,
+    keeps_sign,
+    last_size,
+    rescaled,
+    step_length,
+)
+from jaxrock.numerics.xla_cpu import keep, unseen_one
+from jaxrock.status import Status
+from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+_OUTCOME_STEPS = 100_000
+
+
+class Series(AbstractEngine):
+    """Settings of the series engine.
+
+    **Arguments:**
+
+    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16.
+    - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit.
+    - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
+      (`simulate`, which stores every step).
+
+    **Raises:** ValueError for a value outside its range.
+    """
+
+    order: int | None = eqx.field(static=True, default=None)
+    tolerance: float | None = eqx.field(static=True, default=None)
+    max_steps: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.order is not None and self.order < 4:
+            raise ValueError(f"Argument `order` must be at least 4, but is {self.order}.")
+        if self.tolerance is not None and not 0 < self.tolerance < 1:
+            raise ValueError(f"Argument `tolerance` must be in (0, 1), but is {self.tolerance}.")
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"Argument `max_steps` must be at least 1, but is {self.max_steps}.")
+
+    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
+        """This engine at work on a scene; short pieces of a record need few terms."""
+        if not isinstance(scene.table, Table):
+            raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
+        return TaylorStepper(
+            scene=scene,
+            stop=stop,
+            order=self.order or (8 if scene.pieces > 32 else 16),
+            tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
+            history=history,
+            taped=taped,
+        )
+
+    def budget(self, scene: Scene, history: bool) -> int:
+        """Largest number of steps."""
+        return self.max_steps or (4096 + 2 * scene.pieces if history else _OUTCOME_STEPS)
+
+    def loop(self, unfinished, step, carry, budget: int):
+        """A loop that stops at the last lane."""
+        return jax.lax.while_loop(unfinished, step, carry)
+
+
+class TaylorStepper(AbstractStepper):
+    """One scene with the engine's settings, and how far to follow it."""
+
+    scene: Scene
+    stop: Scalar  # time at which to stop [s]; infinite: at the end of the motion
+    order: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+    history: bool = eqx.field(static=True)
+    doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
+    taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through
+
+    def shaking(self, piece: Int[ArrayLike, ""], local: Scalar) -> tuple[Shaking, Scalar]:
+        """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
+        shaking, unit = self.scene.shaking(piece, local, self.order)
+        return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
+
+    def advance(self, state: State) -> State:
+        """One step of a lane."""
+        return self.step(state, *self.shaking(state.piece, state.local))
+
+    def step(self, state: State, shaking: Shaking, unit: Scalar) -> State:
+        """One step of a lane: waiting at rest, or rocking."""
+        resting = state.side == 0
+        waited = self.wait(state, shaking, unit, self.order, self.tolerance, when)
+        rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
+        return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+
+    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
+        """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
+        return on_tape(self.step, self.shaking, state, budget)
+
+    def finish(self, state: State) -> State:
+        """The free stage by energy."""
+        scene = self.scene.on(state.side)
+        table = scene.table
+        moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
+        here, there = Visit(table, scene.restitution), Visit(scene.tables[1], scene.far_restitution)
+        visits = (here, there) if scene.far is None else (here, there, here)
+        start = visits, state.opening, state.velocity, moving, state.peak
+        if self.taped:
+            # In reverse mode what is not taken (roots of zero) would spoil what is.
+            stage = differentiable(lambda start: free_stage(*start))(start)
+        else:
+            none = FreeStage.none(state.opening)
+            stage = jax.lax.cond(moving, lambda: free_stage(*start), lambda: none)
+        # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
+        beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
+        higher = surpasses(stage.peak, state.peak)
+        # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
+        slope = -2 * table.restoring(Angle.of(state.opening))
+        off = state.spread.along(slope, -2 * state.velocity)
+        toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
+        toss_up = toss_up & (state.status == Status.successful)
+        flat = stage.peak_steepness <= 0
+        error = jnp.where(flat, off, off * stage.peak_share / jnp.where(flat, 1.0, stage.peak_steepness))
+        return replace(
+            state,
+            overturned=state.overturned | stage.overturned,
+            closeness=jnp.minimum(state.closeness, stage.closeness),
+            closeness_beyond=beyond,
+            peak=jnp.where(stage.peak > state.peak, stage.peak, state.peak),
+            second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
+            peak_clearance=jnp.where(stage.peak > state.peak, state.clearance, state.peak_clearance),
+            peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
+            error=jax.lax.stop_gradient(jnp.where(higher, error, state.error)),
+            fastest=jnp.maximum(state.fastest, stage.fastest),
+            impacts=state.impacts + stage.impacts,
+            status=Status.where(toss_up, Status.undecided, state.status),
+        )
+
+    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+        """Expand the series again about the node."""
+        shaking, unit = self.shaking(node.piece, node.local)
+        coefficients = expand(self.on(node.side).start(node, shaking, unit), self.order).opening
+        opening, speed = jet(coefficients, elapsed / unit, 1)
+        return opening, speed / unit
+
+    def start(self, state: State, shaking: Shaking, unit: Scalar) -> Start:
+        """Where a step starts, with time in `unit`."""
+        stretch = keep(self.scene.p * unit, state.local)
+        return Start(
+            self.scene.table.bare,
+            stretch,
+            state.side,
+            state.uplifting,
+            state.opening,
+            state.velocity * stretch,
+            shaking,
+            unseen_one(state.local),
+        )
+
+    def _rock(self, state: State, shaking: Shaking, unit: Scalar, rocking: Flag) -> State:
+        """Rocking: a Taylor step, cut at the first event."""
+        # More room than a step can take is as good as endless, and finite.
+        start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
+        # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
+        stepper, before, *rest = jax.lax.stop_gradient((self, state, start, room))
+        step = _Step.of(stepper, before, *rest, rocking)
+        cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
+        impact, turning, extremum, crossing, ground = cut.hits
+        early = cut.length < step.length
+        full = step.full & ~early
+        saddle = self.scene.table.saddle
+        end = End(
+            length=cut.length,
+            opening=cut.opening,
+            speed=cut.speed,
+            level=jnp.where(crossing, saddle, jnp.where(ground, jnp.pi / 2, 0.0)),
+            room=room,
+            meets=impact | crossing | ground,
+            turns=turning,
+            full=full,
+        )
+        length, opening, speed = arrive(self.order, start, end)
+        elapsed, velocity = length * unit, speed / start.stretch
+        piece, local, over = self.move_on(state, elapsed, full)
+        escaped = self.escaped(state, start.angle)
+        moved = (step.length > 0) & rocking
+        time = jnp.where(step.length > 0, step.length * start.stretch, jnp.inf)
+        missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
+        passed = replace(
+            state,
+            spread=self.spread_after(state, start.angle, shaking.now, elapsed, missed),
+            piece=piece,
+            local=local,
+            opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
+            velocity=jnp.where(turning, 0.0, jnp.where(moved, velocity, state.velocity)),
+            beyond=state.beyond ^ crossing,
+            uplifting=state.uplifting & ~moved,
+            extremal=jnp.where(moved, extremum, state.extremal),
+            fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
+            done=over,
+        )
+
+        def happen(passed, needed, inside):
+            return self._happen(state, passed, start, step, (length, opening, velocity), cut, inside)
+
+        stepped = (either if self.taped else when)(step.eventful & (impact | turning | crossing), happen, passed)
+        down = stepped.opening >= jnp.pi / 2
+        overturned = state.overturned | escaped | down if self.scene.falls_flat else state.overturned | escaped
+        # A history goes on to the ground; for an outcome the verdict is enough.
+        ends = overturned & down if self.history else overturned
+        return replace(stepped, overturned=overturned, done=stepped.done | ends)
+
+    def _cut(self, state: State, step: "_Step", needed: Flag, inside) -> "_Cut":
+        """The first event of a step."""
+        length, saddle = inside(step.length), self.scene.table.saddle
+        scaled = [inside(c) for c in rescaled(step.coefficients, length)]
+        one = jnp.ones_like(length)
+        watches = [
+            Watch(0, one, 0.0, True),
+            Watch(1, step.signs[0], 0.0, self._matters(state, scaled)),
+            Watch(2, step.signs[1], 0.0, step.faster),
+            Watch(0, jnp.where(state.beyond, 1.0, -1.0), saddle, True),
+        ]
+        if self.history:
+            watches.append(Watch(0, -one, jnp.pi / 2, state.opening < jnp.pi / 2))
+        landing = first_event(scaled, watches, _clear_start(state, scaled, saddle), needed)
+        opening, speed, bend = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
+        impact, turning, extremum, crossing = landing.hits[:4]
+        ground = landing.hits[4] if self.history else jnp.zeros_like(impact)
+        hits = impact & (speed <= 0), turning, extremum, crossing, ground
+        return _Cut(landing.x * length, opening, speed, bend, hits)
+
+    def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
+        """Let the event at the end of a step happen."""
+        length, opening, velocity = (inside(value) for value in end)
+        shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
+        acceleration, weight = shaking.at(length)
+        # The value of the series, with the derivatives of the equation.
+        law = self.scene.table.acceleration(Angle.of(opening), velocity, state.side * acceleration, weight)
+        bend = with_derivatives_of(cut.bend / start.stretch**2, law)
+        impact, turning, _, crossing, _ = cut.hits
+        noted = self.note(passed, step.signs[0] > 0, turning, crossing, opening, velocity, bend)
+        unit = start.stretch / self.scene.p
+        steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(step.length))
+        reach = (step.length - length) * unit
+        ground = acceleration, weight
+        return self.impact(noted, impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
+
+    def _matters(self, state: State, scaled) -> Flag:
+        """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
+        always = jnp.ones_like(state.beyond)
+        if self.history:
+            return always
+        # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
+        table = self.scene.table
+        fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
+        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
+        top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, table.saddle), table.saddle)
+        least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
+        inward = state.velocity < 0  # it may graze the ground
+        return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # also a near tie
+
+
+class _Cut(NamedTuple):
+    """Where a step ends, its events included; per unit of the step's time."""
+
+    length: Scalar
+    opening: Scalar
+    speed: Scalar
+    bend: Scalar
+    hits: tuple[Flag, ...]  # impact, turning point, velocity extremum, saddle, ground
+
+
+class _Step(NamedTuple):
+    """A Taylor step as far as its series goes, and whether anything may happen within it."""
+
+    coefficients: list[Scalar]
+    length: Scalar
+    full: Flag  # goes as far as there is room
+    rounded: Scalar  # errors of its end [rad]
+    missed: Scalar
+    signs: tuple[Scalar, Scalar]  # with which velocity and acceleration start
+    faster: Flag  # the velocity may become the largest so far within it
+    eventful: Flag
+    whole: _Cut  # its end, if nothing happens
+
+    @classmethod
+    def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
+        """The step from a state on."""
+        scene, order = stepper.scene, stepper.order
+        coefficients = expand(start, order).opening
+        # Relative to the motion itself while it is small: tiny rotations keep their digits too.
+        size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
+        size = jnp.minimum(scene.alpha, size)
+        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, 16.0))
+        full = length >= room * (1 - 1e-9)
+        length = keep(jnp.where(full, room, length), state.local)
+        opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
+
+        signs = _signs(state, coefficients)
+        turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
+        crossing = (opening >= scene.table.saddle) != state.beyond
+        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
+        monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
+        faster = (top > state.fastest * start.stretch) & ~monotone
+        eventful = turning | crossing | faster | (opening <= 0)
+        if stepper.history:
+            eventful = eventful | (opening >= jnp.pi / 2)
+        return cls(
+            coefficients=coefficients,
+            length=length,
+            full=full,
+            rounded=stepper.tolerance * size,
+            missed=last_size(coefficients) * length**order,
+            signs=signs,
+            faster=faster,
+            eventful=eventful & rocking & (length > 0),
+            whole=_Cut(length, opening, speed, jnp.zeros_like(speed), (jnp.zeros_like(full),) * 5),
+        )
+
+
+def _signs(state: State, coefficients) -> tuple[Scalar, Scalar]:
+    """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
+
+    def of(value, following):
+        return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+    velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
+    acceleration = of(jnp.where(state.extremal, 0.0, coefficients[2]), coefficients[3])
+    return velocity, jnp.where(state.uplifting, 1.0, acceleration)
+
+
+def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:
+    """How far the velocity can exceed its end values within a step (an eighth of its largest second derivative)."""
+    one = jnp.ones_like(length)
+    third = jnp.maximum(fall_bound(coefficients, one, 3, length), fall_bound(coefficients, -one, 3, length))
+    return third * length**2 / 8
+
+
+def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
+    """From where to look for events: a block that leaves rest has opening, velocity and (continuous motion)
+    acceleration zero at its start, and all three are positive up to here."""
+    one, zero = jnp.ones_like(saddle), jnp.zeros_like(saddle)
+    lead = jnp.where(state.uplifting, 3 * scaled[3], scaled[2])
+    rest = [zero, zero, zero, jnp.where(state.uplifting, 0.0, scaled[3]), *scaled[4:]]
+    tiny = jnp.finfo(saddle.dtype).tiny
+    clear = jnp.clip(lead / jnp.maximum(fall_bound(rest, one, 2), tiny), 0.0, 0.5)
+    below_saddle = jnp.sqrt(saddle / (4 * sum(jnp.abs(c) for c in scaled) + tiny))
+    leaving = (state.opening == 0) & (state.velocity == 0)
+    return jnp.where(leaving, jnp.minimum(clear, below_saddle), 0.0)

@@ -1,0 +1,370 @@
+"""The quick pass: Taylor steps in one flat loop, for the many scenes that need no care.
+
+A step is a series, a certificate of its shape, the turning point within it if there is one, and the first level that
+it meets (ground or saddle), where it is cut. What has no certificate is postponed: the series engine, which takes every
+care, does it afterwards.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact, Int
+
+from jaxrock.engines.state import State
+from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.expansion import Start, expand
+from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, step_length, tangent
+from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
+from jaxrock.status import Status
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+_SHORTER = (0.4, 0.1)  # shares of a step that are tried for a certificate, after the whole
+
+
+# Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
+# proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
+_FLAT, _TURN, _MEET = (6, 10, 16), (5, 10, 16, 16), (5, 9, 13, 16)
+
+
+_STEPS = 1000
+
+
+def _first_sign(value: Scalar, following: Scalar) -> Scalar:
+    return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+
+
+def _if(needed: Flag, function: Callable, otherwise):
+    """`function()` where needed: skipped if no lane of a vector needs it."""
+    return jax.lax.cond(needed, function, lambda: otherwise)
+
+
+def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
+    """How much of a step is certain to turn once at most, as a share of it; zero if nothing is.
+
+    The acceleration keeps its sign there, or its derivative does.
+    """
+    bend = derivative(derivative(terms))
+    jerk = derivative(bend)
+    jerks = _first_sign(jerk[0], jerk[1])
+
+    def sure(share):
+        return (keeps_sign(bend, rises, share * length) > 0) | (keeps_sign(jerk, jerks, share * length) > 0)
+
+    def shorter():
+        share = jnp.zeros_like(length)
+        for part in reversed(_SHORTER):
+            share = jnp.where(sure(part), part, share)
+        return share
+
+    return _if(~sure(1.0), shorter, jnp.ones_like(length))
+
+
+def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Scalar, Scalar | None]) -> Scalar:
+    """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
+    sign = jnp.where(values[0] > 0, 1.0, -1.0)
+    value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
+    bend = fall - value - slope
+    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * bend, 0.0))
+    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * bend, root - slope)
+    share = jnp.clip(share, 0.0, 1.0)
+    if slopes[1] is None:
+        return share
+    twist = slope + sign * slopes[1] - 2 * (fall - value)
+    for _ in range(2):
+        off, rate = jet([value, slope, bend - twist, twist], share, 1)
+        share = jnp.clip(share - off / rate, 0.0, 1.0)
+    return share
+
+
+def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
+    """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
+
+    The iterations take polynomials of these `degrees`: the first need not be exact.
+    """
+    width, order = end - start, len(terms) - 1
+    degrees = degrees if order > 10 else (degrees[0], order, order)  # the short steps of records
+    x = keep(start + width * _guess(values, tuple(None if s is None else width * s for s in slopes)), end)
+    for degree in degrees:
+        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
+        change = value / slope
+        x = jnp.clip(x - change, start, end)
+    return x, jnp.abs(change)
+
+
+class _Part(NamedTuple):
+    """The part of a step on which the velocity changes sign once at most; time is in the unit of the series."""
+
+    length: Scalar
+    opening: Scalar  # at its end, with its derivatives
+    speed: Scalar
+    bend: Scalar
+    full: Flag  # goes as far as there is room
+    outward: Scalar  # sign of the velocity at its start
+    bends: Flag  # the velocity has an extremum
+    bound: Scalar  # of that
+    certain: Flag
+
+
+def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Part:
+    """As much of a step as is certain; `least`: what the last coefficients may contribute."""
+    one, before, first = start.one, terms[1], 2 * terms[2]
+    longest = step_length(terms, least, jnp.minimum(room, 16.0))
+    reaches = longest >= room * (1 - 1e-9)
+    longest = keep_by(jnp.where(reaches, room, longest), one)
+    rises = jnp.where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
+    outward = jnp.where(start.uplifting, 1.0, _first_sign(before, rises))
+    share = keep_by(_certified(terms, longest, rises), one)
+
+    def extremum(length):
+        opening, speed, bend = (keep_by(x, one) for x in jet(terms, length, 2))
+        bends = rises * bend < 0
+        # Between the tangents at the ends.
+        between = (speed - before - bend * length) / jnp.where(bends, first - bend, 1.0)
+        bound = before + first * between
+        return (opening, speed, bend), bends, bound, bends & (outward * speed >= 0) & (outward * bound <= 0)
+
+    whole = length, *_ = keep_by(share * longest, one), *extremum(share * longest)
+    (_, _, bend), _, _, twice = whole[1:]
+
+    def shorter():
+        # Where the velocity may turn twice, the part ends about where the acceleration is zero.
+        length = keep_by(share * longest * first / jnp.where(twice, first - bend, 1.0), one)
+        return length, *extremum(length)
+
+    length, end, bends, bound, still = _if(twice, shorter, whole)
+    return _Part(length, *end, reaches & (share == 1) & ~twice, outward, bends, bound, (share > 0) & ~still)
+
+
+class _Meeting(NamedTuple):
+    """Where a part of a step ends, and what happens until then."""
+
+    at: Scalar
+    opening: Scalar  # there, with its derivatives
+    speed: Scalar
+    bend: Scalar
+    certain: Flag
+    turned: Flag  # turned back before
+    turn_at: Scalar
+    top: Scalar  # opening angle there
+    top_bend: Scalar
+    crossing: Flag  # ends at the saddle
+    impact: Flag  # ends at the ground
+    stops: Flag  # ends where it turns
+
+
+def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
+    """The turning point within a part, and the first level that it meets, before it turns or after."""
+    one, saddle, zero = start.one, start.table.saddle, jnp.zeros_like(part.length)
+    turns = keep_flag(part.outward * part.speed < 0, state.local)
+
+    def turn():
+        x, last = _root(_TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.bend))
+        x = keep_by(x, one)
+        opening, _, bend = (keep_by(value, one) for value in jet(terms, x, 2))
+        return x, opening, bend, last <= 1e-6 * x
+
+    turn_at, top, top_bend, sure = _if(turns, turn, (part.length, part.opening, part.bend, part.certain))
+    certain = part.certain & sure
+
+    crossing = (top >= saddle) != state.beyond
+    early = crossing | (top <= 0)
+    # If it turns before it crosses, the step ends where it turns.
+    stops = ~early & turns & ((part.opening >= saddle) != (top >= saddle))
+    impact = ~crossing & ((top <= 0) | (turns & ~stops & (part.opening <= 0)))
+    crossing, impact, stops = (keep_flag(x, state.local) for x in (crossing, impact, stops))
+    level = jnp.where(crossing, saddle, 0.0)
+    low, high = jnp.where(early, 0.0, turn_at), jnp.where(early, turn_at, part.length)
+    at_low = jnp.where(early, terms[0], top) - level
+    at_high = jnp.where(early, top, part.opening) - level
+    slopes = jnp.where(early, terms[1], 0.0), jnp.where(early & turns, 0.0, part.speed)
+
+    def meet():
+        x, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
+        x = keep_by(x, one)
+        return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
+
+    def at_end(of_turn, of_part):
+        return jnp.where(stops, of_turn, of_part)
+
+    otherwise = at_end(turn_at, part.length), at_end(top, part.opening), at_end(zero, part.speed)
+    otherwise = *otherwise, at_end(top_bend, part.bend), certain
+    at, opening, speed, bend, certain = _if(crossing | impact, meet, otherwise)
+    turned = turns & (turn_at <= at)
+    return _Meeting(at, opening, speed, bend, certain, turned, turn_at, top, top_bend, crossing, impact, stops)
+
+
+def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
+    """The largest speed between the ends of a step where it exceeds what is known, and whether that is certain."""
+    velocity, zero = derivative(terms), jnp.zeros_like(at)
+
+    def extremum():
+        x, last = _root(_FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.bend), (6 * terms[3], None))
+        return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
+
+    return _if(part.bends & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.bends)))
+
+
+def advance(stepper: TaylorStepper, state: State) -> State:
+    """One step of a lane that rocks."""
+    stepper = stepper.on(state.side)
+    scene, order = stepper.scene, stepper.order
+    shaking, unit = stepper.shaking(state.piece, state.local)
+    start = stepper.start(state, shaking, unit)
+    stretch, one = start.stretch, start.one
+    terms = expand(start, order).opening
+    size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
+    least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
+    part = _part(start, terms, jnp.minimum(stepper.room(state), 32 * unit) / unit, least)
+    meeting = _meeting(start, terms, part, state)
+    at, crossing, impact = meeting.at, meeting.crossing, meeting.impact
+    fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
+    certain = keep_flag(meeting.certain & sure, state.local)
+
+    opening = jnp.where(crossing, scene.table.saddle, jnp.where(impact, 0.0, meeting.opening))
+    velocity = keep_by(meeting.speed / stretch, one)
+    elapsed = keep_by(at * unit, one)
+    full = part.full & ~(crossing | impact | meeting.stops)
+    piece, local, over = stepper.move_on(state, elapsed, full)
+    time = jnp.where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
+    errors = 2 * least, 2 * least * jnp.maximum(order / time, 1.0)
+    spread = stepper.spread_after(state, start.angle, shaking.now, elapsed, errors)
+    passed = replace(
+        state,
+        spread=jax.tree.map(lambda x: keep_by(x, one), spread),
+        local=state.local + meeting.turn_at * unit,  # until the turning point is noted
+        opening=opening,
+        velocity=velocity,
+        beyond=state.beyond ^ crossing,
+        uplifting=jnp.zeros_like(state.uplifting),
+        fastest=jnp.maximum(state.fastest, jnp.maximum(fast / stretch, jnp.abs(velocity))),
+        done=over,
+    )
+
+    def note():
+        return stepper.note(
+            passed,
+            part.outward > 0,
+            meeting.turned & ~crossing,
+            crossing,
+            jnp.where(crossing, scene.table.saddle, meeting.top),
+            jnp.where(crossing, velocity, 0.0),
+            keep_by(jnp.where(crossing, meeting.bend, meeting.top_bend) / stretch**2, one),
+        )
+
+    noted = replace(_if(meeting.turned | crossing, note, passed), piece=piece, local=local)
+
+    def strike():
+        steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(part.length))
+        return stepper.impact(noted, impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
+
+    hit = _if(impact, strike, noted)
+    escaped = stepper.escaped(state, start.angle)
+    postponed = ~certain & ~escaped & (hit.status == Status.successful)
+    after = replace(
+        hit,
+        overturned=state.overturned | escaped,
+        done=hit.done | escaped | ~certain,
+        status=Status.where(postponed, Status.undecided, hit.status),
+    )
+    return stepper.checked(state, after)
+
+
+def wait(stepper: TaylorStepper, state: State) -> State:
+    """At rest: go on to where the acceleration exceeds the threshold, or as far as that is certain not to happen."""
+    scene, order = stepper.scene, stepper.order
+    shaking, unit = stepper.shaking(state.piece, state.local)
+    room = jnp.minimum(stepper.room(state), 32 * unit) / unit
+    length = stepper.longest_wait(shaking, room, order, stepper.tolerance)
+    drives = scene.drives_of(shaking)
+    share = jnp.ones_like(length)
+    for drive, _ in drives if shaking.vertical is not None else drives[:1]:
+        share = jnp.minimum(share, _monotone(drive, length))
+    full = (length >= room * (1 - 1e-9)) & (share == 1)
+    length = keep(share * length, state.local)
+
+    def of(drive, level):
+        """Whether this drive lifts the block at once, touches the threshold, or passes it in the step."""
+        end, slack = horner(drive, length), 8 * jnp.finfo(length.dtype).eps * level
+        lifts = drive[0] > level + slack
+        touching = ~lifts & (drive[0] >= level - slack)
+        return lifts, touching, ~lifts & (end > level + slack), end
+
+    (drive, level), (drive2, level2) = drives
+    (lifts, touching, meets, end), (lifts2, touching2, meets2, end2) = of(drive, level), of(drive2, level2)
+    second = lifts2 | meets2
+    missing = [jnp.where(second, b, a) for a, b in zip(drive, drive2)]
+    missing[0] = jnp.where(second, drive2[0] - level2, drive[0] - level)
+    slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
+    ending = jnp.where(second, end2 - level2, end - level)
+    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
+    both = (lifts | meets) & second
+    lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
+    elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit
+    full = full & ~meets & ~lifts
+    piece, local, over = stepper.move_on(state, elapsed, full)
+    piece = jnp.where(full & ~over, scene.after_quiet(piece), piece)
+    never = pick(scene.drives, state.piece) <= scene.threshold
+    unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & (last > 1e-7 * x)))
+    rested = replace(
+        state,
+        piece=piece,
+        local=local,
+        done=over | never | unclear,
+        steps=state.steps + 1,
+        status=Status.where(unclear, Status.undecided, state.status),
+    )
+    side = jnp.where(second, -1.0, 1.0)
+    return stepper.lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
+
+
+def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
+    """The share of a step within which a series is certain to keep growing or falling."""
+    slope = derivative(terms) or [jnp.zeros_like(length)]
+    rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
+    share = jnp.zeros_like(length)
+    for part in (*reversed(_SHORTER), 1.0):
+        share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
+    steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
+    return jnp.where(steady, 1.0, share)
+
+
+def most_steps(pieces: int) -> int:
+    """After how many steps a scene is left to the careful engine."""
+    return _STEPS + 3 * pieces
+
+
+def has_many_pieces(pieces: int) -> bool:
+    """Whether a motion is a record rather than a pulse."""
+    return pieces > 32
+
+
+def glance(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
+    """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
+    pieces = stepper.scene.pieces
+    limit = jnp.minimum(limit, most_steps(pieces))
+
+    def until(condition, step):
+        return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
+
+    def resting(state):
+        return state.side == 0
+
+    if has_many_pieces(pieces):
+        # Among many lanes under a record some rest at any time: each takes the step it needs.
+        def step(s):
+            return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))
+
+        return until(lambda s: True, step)(state)
+    rest = until(resting, lambda s: wait(stepper, s))
+    rock = until(lambda s: ~resting(s), lambda s: advance(stepper, s))
+    return until(lambda s: True, lambda s: rock(rest(s)))(state)

@@ -1,0 +1,244 @@
+"""A flexible block on its way under a motion: its state, one step, and what came of it.
+
+Each phase (locked base, rocking on either corner) is linear, so a step is exact: a sum of exponentials, and the
+polynomial that answers the motion's Taylor series. Steps end where the series does, at knots, and at events.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
+from jaxrock.numerics.polynomial import step_length
+from jaxrock.status import Status
+
+Scalar = Inexact[ArrayLike, "..."]
+
+
+_ORDER = 16  # of the motion's Taylor series
+
+
+class FlexibleState(eqx.Module):
+    """A flexible block on its way, and what it has seen so far."""
+
+    piece: Int[Array, ""]
+    local: Scalar  # time since the start of the piece [s]
+    motion: Inexact[Array, " states"]  # (q, q', theta)
+    side: Scalar  # 0: the base is locked
+    last_side: Scalar  # from which the base returned last
+    stay: Scalar  # how long the base has rocked on this side [s]
+    braked_stay: Scalar  # the stay that the last impact ended [s]
+    maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
+    impacts: Int[Array, ""]
+    impacted: Bool[Array, ""]  # just now
+    fallen: Bool[Array, ""]
+    done: Bool[Array, ""]
+    status: Status
+    steps: Int[Array, ""]
+
+
+class FlexibleOutcome(eqx.Module):
+    """What came of a flexible block within a duration.
+
+    - `max_rotation`: largest |rotation| of the base [rad]; infinite if the block overturned.
+    - `max_displacement`: largest |displacement| of the top relative to the ground [m]; infinite if it overturned.
+    - `max_bending`: largest part of it that is bending [m]; infinite if the block overturned.
+    - `impact_count`: impacts within the duration.
+    - `overturned`: the verdict, which looks beyond the duration.
+    - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself.
+    - `status`: a `Status`; `undecided` if, at the end, the energy suffices to overturn but the block is not lost.
+    """
+
+    max_rotation: Scalar
+    max_displacement: Scalar
+    max_bending: Scalar
+    impact_count: Int[Array, "..."]
+    overturned: Bool[Array, "..."]
+    energy: Scalar
+    status: Status
+
+
+class FlexibleScene(eqx.Module):
+    """A flexible block under a motion, reduced to what a step needs."""
+
+    block: FlexibleBlock
+    ground: AbstractMotion
+    stop: Scalar
+    numbers: Numbers
+    locked: Phase
+    rocking: Phase
+    whole: Bool[Array, ""]
+    knots: Inexact[Array, " knots"]
+
+    @classmethod
+    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "FlexibleScene":
+        """Build the scene from scalars."""
+        numbers = Numbers.of(block)
+        rocking, whole = rocking_phase(numbers)
+        return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, ground.knots)
+
+    def start(self) -> FlexibleState:
+        """At rest at time 0."""
+        n = 2 * self.numbers.rotation.size + 1
+        zero, count, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        finite = jnp.isfinite(self.rocking.rates).all() & jnp.isfinite(self.stop)
+        status = Status.where(finite, Status.successful, Status.not_finite)
+        return FlexibleState(
+            piece=count,
+            local=zero,
+            motion=jnp.zeros(n),
+            side=zero,
+            last_side=zero,
+            stay=zero,
+            braked_stay=zero,
+            maxima=jnp.zeros(6),
+            impacts=count,
+            impacted=no,
+            fallen=no,
+            done=~(finite & self.whole),
+            status=Status.where(finite & ~self.whole, Status.solver_failed, status),
+            steps=count,
+        )
+
+    def time(self, state: FlexibleState) -> Scalar:
+        """Time of a state [s]."""
+        return self.knots[state.piece] + state.local
+
+    def arc(self, state: FlexibleState) -> tuple[Arc, Scalar, Scalar, Bool[Array, ""]]:
+        """The motion from here: the arc, its length [s], the share of it that belongs to this piece (1, or 0 of a
+        piece without length), and whether it ends with the piece."""
+        last = self.knots.size - 1
+        quiet, inner = state.piece >= last, jnp.minimum(state.piece, last - 1)
+        piece_ends = jnp.where(quiet, jnp.inf, self.knots[jnp.minimum(state.piece + 1, last)])
+        remaining = jnp.minimum(piece_ends, self.stop) - self.knots[state.piece] - state.local
+        left = jax.lax.stop_gradient(jnp.maximum(remaining, 0.0))
+        scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
+        unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, 1.0))
+        load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
+        # Grown by more than e^10, the unstable mode would hide the others.
+        fastest = jax.lax.stop_gradient(jnp.max(self.rocking.rates.real))
+        cap = jnp.minimum(left, 10 / fastest) / unit
+        if len(load) > 4:
+            size = jnp.finfo(left.dtype).eps / 4 * jnp.max(self.ground.bounds)
+            cap = step_length(jax.lax.stop_gradient(load), jax.lax.stop_gradient(size), cap)
+        length = jnp.where(left > 0, cap * unit, 1.0)
+        whole = cap * unit >= left
+        share = jnp.where(whole, remaining / length, 1.0)
+        load = jnp.stack(load) * powers(length / unit, len(load))
+        phase = Phase.where(state.side == 0, self.locked, self.rocking)
+        return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
+
+    def advance(self, state: FlexibleState) -> FlexibleState:
+        """One step: to an event, to the end of a piece, or as far as the motion's series holds."""
+        path, length, share, whole = self.arc(state)
+        rows = path.curves()
+        turned, moment = (jax.tree.map(lambda x, i=i: x[i], rows) for i in (0, 3))
+        rocking, limit = state.side != 0, self.numbers.strength
+        watched = Curve(
+            jnp.where(rocking, state.side * turned.amplitudes, moment.amplitudes),
+            turned.rates,
+            jnp.where(rocking, state.side * turned.coefficients, moment.coefficients),
+            jnp.where(rocking, turned.errors, moment.errors),
+        )
+        low, high = jnp.where(rocking, 0.0, -limit), jnp.where(rocking, jnp.pi / 2, limit)
+        x, below, above = first_exit(watched, low, high, share)
+        value, slope = watched.jet(x)
+        # One step of Newton's method gives the time of the event its derivatives.
+        miss = value - jnp.where(below, low, high)
+        hit = (below | above) & (slope != 0) & (x > 0)
+        at_end = ~(below | above) & (x >= jax.lax.stop_gradient(share))
+        x = jnp.where(hit, x - miss / jnp.where(hit, slope, 1.0), jnp.where(at_end, share, x))
+        motion = path.state(x)
+        maxima, certain = _maxima(rows, state.maxima, x)
+        status = Status.where(certain, state.status, Status.solver_failed)
+        state = eqx.tree_at(lambda s: (s.maxima, s.status), state, (maxima, status))
+        return self._land(state, motion, x * length, below, above, at_end & whole, ~certain)
+
+    def _land(self, state, motion, elapsed, below, above, piece_over, failed) -> FlexibleState:
+        """The state after a step, and after the event that ended it."""
+        numbers, rocking = self.numbers, state.side != 0
+        returned, fallen = rocking & below, rocking & above
+        # A locked base, whose rotation is zero to the last digit.
+        still = motion.at[-1].set(jnp.where(rocking & ~returned, motion[-1], 0.0))
+        stay = jnp.where(rocking, state.stay + elapsed, 0.0)
+        # A column that trembles while the base uplifts must not use up the impact that ends the rocking.
+        counts = (state.side != state.last_side) | (stay > state.braked_stay) | (self.block.impacts == "every")
+        counts &= returned
+        n = numbers.rotation.size
+        after = jnp.where(counts, still.at[n:-1].multiply(self.block.restitution), still)
+        # A damped column may push the base over at once.
+        pushed = numbers.moment(after)
+        over = numbers.damped & (jnp.abs(pushed) > numbers.strength)
+        side = jnp.where(returned, jnp.where(over, jnp.sign(pushed), 0.0), state.side)
+        side = jnp.where(~rocking & (below | above), jnp.where(above, 1.0, -1.0), side)
+        local = jnp.where(piece_over, 0.0, state.local + elapsed)
+        piece = state.piece + piece_over
+        stopped = piece_over & (self.knots[jnp.minimum(state.piece + 1, self.knots.size - 1)] >= self.stop)
+        stopped |= piece_over & (state.piece == self.knots.size - 1)
+        # At the end of the duration: within the piece.
+        local = jnp.where(stopped, state.local + elapsed, local)
+        piece = jnp.where(stopped, state.piece, piece)
+        finite = jnp.isfinite(after).all() & jnp.isfinite(elapsed)
+        return FlexibleState(
+            piece=piece,
+            local=local,
+            motion=after,
+            side=side,
+            last_side=jnp.where(returned, state.side, state.last_side),
+            stay=jnp.where(returned, 0.0, stay),
+            braked_stay=jnp.where(counts, stay, state.braked_stay),
+            maxima=state.maxima,
+            impacts=state.impacts + counts,
+            impacted=counts,
+            fallen=state.fallen | fallen,
+            done=stopped | fallen | ~finite | failed,
+            status=Status.where(finite, state.status, Status.not_finite),
+            steps=state.steps + 1,
+        )
+
+    def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
+        """Kinetic energy, strain energy of the column, potential energy of the base, over m L^2 [1/s^2]."""
+        numbers = self.numbers
+        q, v = jnp.split(motion[:-1], 2)
+        rotation = motion[-1]
+        strain = jnp.sum(numbers.squares * (q - numbers.rotation * rotation) ** 2) / 2
+        base = numbers.strength * jnp.abs(rotation) - numbers.spring_rate * rotation**2 / 2
+        return jnp.sum(v**2) / 2, strain, base
+
+    def conclude(self, state: FlexibleState) -> FlexibleOutcome:
+        """What came of it, from the state at the end."""
+        lost = state.fallen | self._never_returns(state)
+        total = sum(self.energy(state.motion)) / (self.numbers.strength * self.numbers.alpha / 2)
+        quiet = self.time(state) >= self.knots[-1]
+        status = Status.where(lost | (total < 1) | ~quiet, state.status, Status.undecided)
+        status = Status.where(state.status == Status.successful, status, state.status)
+        status = Status.where(state.done, status, Status.step_budget_exhausted)
+        length = jnp.cos(self.numbers.alpha) * self.block.length
+        largest = jnp.maximum(*jnp.split(state.maxima, 2)) * jnp.stack([jnp.ones_like(length), length, length])
+        largest = jnp.where(lost, jnp.inf, largest)
+        return FlexibleOutcome(*largest, state.impacts, lost, total, status)
+
+    def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
+        """Whether, without further shaking, the unstable mode outgrows all others from here on."""
+        side, phase = state.side, self.rocking
+        n = self.numbers.rotation.size
+        center = self.numbers.alpha * side * jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
+        amplitudes = phase.project @ (state.motion - center)
+        growing = phase.rates.real == jnp.max(phase.rates.real)
+        outward = side * jnp.sum(jnp.where(growing, amplitudes.real, 0.0))
+        others = jnp.sum(jnp.where(growing, 0.0, jnp.abs(amplitudes)))
+        quiet = self.time(state) >= self.knots[-1]
+        return quiet & (side != 0) & (outward > 0) & (self.numbers.alpha + outward > others)
+
+
+def _maxima(rows, maxima, x):
+    """The largest values of rotation, displacement and bending, and of their negatives; whether they are certain."""
+    both = jax.tree.map(lambda r: jnp.concatenate([r[:3], r[:3]]), rows)
+    signs = jnp.array([1.0, 1, 1, -1, -1, -1])[:, None]
+    both = Curve(both.amplitudes * signs, both.rates, both.coefficients * signs, both.errors)
+    values, certain = jax.vmap(highest, in_axes=(0, 0, None))(both, maxima, x)
+    return values, certain.all()

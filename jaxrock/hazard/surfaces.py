@@ -1,0 +1,265 @@
+"""Fragility surfaces: how probable it is that a rock topples, against peak acceleration and PGV/PGA.
+
+Peak acceleration alone says whether a block uplifts, the ratio of peak velocity to peak acceleration for how long it is
+pushed: together they say most of what a motion does to a rock.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
+
+from jaxrock._checks import Values, as_real, checked, positive
+from jaxrock.blocks.rigid import GRAVITY, Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.hazard.fragility import (
+    FitStatus,
+    LogNormalFragility,
+    TabulatedFragility,
+    beside,
+    probit,
+    probit_line,
+    rising,
+)
+from jaxrock.hazard.simulated_fragility import STOOD, TOPPLED, UNDECIDED, SimulatedFragility, counts, stacked, verdicts
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.motion import AbstractMotion
+
+
+class SurfaceFragility(eqx.Module):
+    """A lognormal fragility in peak acceleration whose median follows a power of PGV/PGA.
+
+    P = Phi((ln PGA - ln median(ratio))/dispersion), median(ratio) = median (ratio/1 s)^exponent.
+
+    - `median` [g] at a ratio of 1 s; `exponent` [-], negative as a rule; `dispersion` [-].
+    """
+
+    median: Float[Array, ""]
+    exponent: Float[Array, ""]
+    dispersion: Float[Array, ""]
+
+    def __call__(self, acceleration: Values, ratio: Values) -> Inexact[Array, "..."]:
+        """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
+        z = (jnp.log(as_real("acceleration", acceleration)) - jnp.log(self._median(ratio))) / self.dispersion
+        return jax.lax.erfc(-z / math.sqrt(2)) / 2
+
+    def _median(self, ratio):
+        return self.median * positive("ratio", ratio) ** self.exponent
+
+    def at(self, ratio: ArrayLike) -> LogNormalFragility:
+        """The fragility in peak acceleration of motions of one PGV/PGA [s]."""
+        return LogNormalFragility(self._median(ratio), self.dispersion)
+
+    def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
+        """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
+        probability = checked("probability", probability, "be in (0, 1)", lambda x: (x > 0) & (x < 1))
+        return self._median(ratio) * jnp.exp(self.dispersion * jax.scipy.special.ndtri(probability))
+
+
+class SurfaceFit(eqx.Module):
+    """What `fit_surface` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+
+    - `fragility`: the `SurfaceFragility` of largest likelihood.
+    - `covariance`: (3, 3) of (ln median, exponent, ln dispersion); of outcomes in clusters, a sandwich.
+    - `status`: a `FitStatus`.
+    """
+
+    fragility: SurfaceFragility
+    covariance: Float[Array, "3 3"]
+    status: FitStatus
+
+
+def fit_surface(
+    acceleration: Values,
+    ratio: Values,
+    toppled: Values,
+    trials: Values = 1,
+    clusters: Sequence | np.ndarray | None = None,
+) -> SurfaceFit:
+    """The two-measure lognormal fragility under which outcomes are most probable (probit regression).
+
+    **Arguments:**
+
+    - `acceleration`, `ratio`: (n,) peak accelerations [g] and PGV/PGA [s] of the shakings, positive.
+    - `toppled`, `trials`: as in `fit_fragility`.
+    - `clusters`: (n,) labels; outcomes of one label are not independent (those of one record, say).
+
+    **Returns:** a `SurfaceFit`.
+
+    **Raises:** ValueError for arguments outside their ranges, or of other shapes.
+
+    **Source:** the two measures by Purvance, Anooshehpoor & Brune (2008); Liang & Zeger (1986), clusters.
+    """
+    acceleration, ratio = positive("acceleration", acceleration), positive("ratio", ratio)
+    if acceleration.ndim != 1 or acceleration.size < 3 or acceleration.shape != ratio.shape:
+        both = f"{acceleration.shape} and {ratio.shape}"
+        raise ValueError(f"Arguments `acceleration` and `ratio` must be lists of one length above 2, but are {both}.")
+    trials = checked("trials", trials, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+    toppled = beside("toppled", as_real("toppled", toppled), acceleration)
+    toppled = checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+    labels = (
+        np.arange(acceleration.size) if clusters is None else np.unique(np.asarray(clusters), return_inverse=True)[1]
+    )
+    if labels.shape != acceleration.shape:
+        raise ValueError(f"Argument `clusters` must have shape {acceleration.shape}, but has shape {labels.shape}.")
+    found, scores = _fit(acceleration, ratio, toppled, trials - toppled)
+    count = int(labels.max()) + 1
+    if count < 2 or count == acceleration.size:
+        return found
+    summed = jnp.zeros((count, 3)).at[labels].add(scores)
+    middle = summed.T @ summed * count / (count - 1)
+    return eqx.tree_at(lambda f: f.covariance, found, found.covariance @ middle @ found.covariance)
+
+
+@jax.jit
+def _fit(acceleration, ratio, toppled, survived):
+    """The fit, and the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion)."""
+    measures = jnp.log(jnp.stack([acceleration, ratio]))
+    centre = jnp.mean(measures, axis=1, keepdims=True)
+    size = jnp.std(measures, axis=1, keepdims=True)
+    known = jnp.all(size > 1e-9)
+    abscissas = (measures - centre) / jnp.where(size > 1e-9, size, 1.0)
+    line, converged = probit_line(abscissas, toppled, survived)
+    z = line[0] + line[1:] @ abscissas
+    slopes = line[1:] / jnp.where(size > 1e-9, size, 1.0)[:, 0]
+    # z = (ln PGA - exponent ln ratio - ln median)/dispersion
+    growing = slopes[0] > 0
+    dispersion = 1 / jnp.where(growing, slopes[0], 1.0)
+    exponent = -slopes[1] * dispersion
+    logarithm = -(line[0] - slopes @ centre[:, 0]) * dispersion
+    _, by_z, curvature = probit(z, toppled, survived)
+    rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -measures[1] / dispersion, -z])
+    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
+    converged &= known & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
+    status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)
+    status = FitStatus.where(converged, status, FitStatus.not_converged)
+    numbers = jnp.exp(logarithm), exponent, dispersion, covariance
+    *numbers, covariance = (jnp.where(status == FitStatus.successful, x, jnp.nan) for x in numbers)
+    return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T
+
+
+def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFit:
+    """The two-measure fragility of scaled motions, each of which has a PGV/PGA of its own.
+
+    **Arguments:**
+
+    - `found`: from `simulated_fragility`, under motions of different PGV/PGA.
+    - `bound`: as in `SimulatedFragility.counts`.
+
+    **Returns:** a `SurfaceFit`, motions taken as clusters.
+
+    **Raises:** ValueError if a bound is needed.
+    """
+    table = found.table()
+    ratio = table["peak_velocity"] / (GRAVITY * table["peak_acceleration"])
+    return fit_surface(table["peak_acceleration"], ratio, found.counts(bound).ravel(), table["trials"], table["motion"])
+
+
+class SimulatedSurface(eqx.Module):
+    """What became of blocks under pulses, over peak acceleration and PGV/PGA.
+
+    - `acceleration`: (rows,) [g]; `ratio`: (columns,) PGV/PGA [s].
+    - `verdict`: (pulses, rows, columns, draws) 1 toppled, 0 stood, -1 undecided.
+    """
+
+    acceleration: Float[Array, " rows"]
+    ratio: Float[Array, " columns"]
+    verdict: Int8[np.ndarray, "pulses rows columns draws"]
+
+    @property
+    def lower(self) -> Float[np.ndarray, "rows columns"]:
+        """Shares that toppled, if all that is undecided stood."""
+        return np.mean(self.verdict == TOPPLED, axis=(0, 3))
+
+    @property
+    def upper(self) -> Float[np.ndarray, "rows columns"]:
+        """The same if all that is undecided toppled."""
+        return np.mean(self.verdict != STOOD, axis=(0, 3))
+
+    @property
+    def undecided(self) -> int:
+        """Number of scenes without a verdict."""
+        return int(np.sum(self.verdict == UNDECIDED))
+
+    def at(self, ratio: ArrayLike, upper: bool = False) -> TabulatedFragility:
+        """The fragility in peak acceleration at one PGV/PGA [s], between columns by straight lines in its logarithm.
+
+        **Arguments:**
+
+        - `ratio`: within the columns.
+        - `upper`: whether to count what is undecided as toppled.
+
+        **Raises:** ValueError for a ratio outside the columns.
+        """
+        ends = float(self.ratio[0]), float(self.ratio[-1])
+        allowed = f"be in [{ends[0]:g}, {ends[1]:g}]"
+        ratio = checked("ratio", ratio, allowed, lambda x: (x >= ends[0]) & (x <= ends[1]))
+        shares = jnp.asarray(self.upper if upper else self.lower)
+        place = jnp.log(ratio)
+        row = jax.vmap(lambda share: jnp.interp(place, jnp.log(self.ratio), share))(shares)
+        return TabulatedFragility(self.acceleration, row)
+
+    def fit(self, bound: str | None = None) -> SurfaceFit:
+        """The two-measure lognormal fragility of all cells: a smooth summary.
+
+        **Arguments:**
+
+        - `bound`: as in `SimulatedFragility.counts`.
+
+        **Returns:** a `SurfaceFit`. Draws are taken as what is random (clusters): its covariance tells how far their
+        number lets the fit be known, for the pulses as they are; of a single block it says nothing.
+        """
+        toppled = counts(np.moveaxis(self.verdict, 0, -1), bound)  # (rows, columns, draws), of all pulses
+        cells = np.meshgrid(
+            np.asarray(self.acceleration), np.asarray(self.ratio), np.arange(toppled.shape[-1]), indexing="ij"
+        )
+        acceleration, ratio, draws = (x.ravel() for x in cells)
+        return fit_surface(acceleration, ratio, toppled.ravel(), float(len(self.verdict)), draws)
+
+
+def simulated_surface(
+    block: Block,
+    pulses: Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]],
+    acceleration: Values,
+    ratio: Values,
+    model: Model = Housner(),
+    *,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> SimulatedSurface:
+    """Whether blocks topple under pulses, over peak acceleration and PGV/PGA.
+
+    **Arguments:**
+
+    - `block`: a `Block`; with parameters of shape (draws,) uncertain, such as `draw_blocks` makes.
+    - `pulses`: make motions of amplitude [g] and period or duration [s], to which their peaks are proportional: of the
+      first the acceleration, of both the velocity. All have one weight.
+    - `acceleration`: (rows,) peak accelerations [g], positive and rising.
+    - `ratio`: (columns,) PGV/PGA [s], positive and rising.
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+
+    **Returns:** a `SimulatedSurface`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Purvance, Anooshehpoor & Brune (2008), the two measures.
+    """
+    acceleration, ratio = rising("acceleration", acceleration), rising("ratio", ratio)
+    if not pulses:
+        raise ValueError("Argument `pulses` must hold at least one pulse, but is empty.")
+    blocks, parts = stacked(block), []
+    for pulse in pulses:
+        unit = pulse(jnp.ones(()), jnp.ones(()))
+        peak, speed = float(peak_acceleration(unit)), float(peak_velocity(unit))
+        # One motion of amplitude 1 g for every ratio, scaled to every acceleration.
+        period = ratio * GRAVITY * peak / speed
+        group = jax.vmap(lambda t, pulse=pulse: pulse(jnp.ones_like(t), t))(period)
+        factors = np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size))
+        parts.append(verdicts(blocks, group, factors, model, engine, progress).swapaxes(0, 1))
+    return SimulatedSurface(acceleration, ratio, np.stack(parts))

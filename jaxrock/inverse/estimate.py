@@ -1,0 +1,311 @@
+"""The motion that rocks allow: parameters of a pulse, with intervals, from rocks that stand, fell, or rocked so far.
+
+The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals: it is climbed from
+many starts. Intervals are those of the profile likelihood: all values of a parameter with which some values of the
+others explain the observations nearly as well as the best. Where the observations leave a side open they end at the
+range that was searched, and say so.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact
+
+from jaxrock._progress import Progress
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.observations import TOPPLED, Observations
+from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
+from jaxrock.inverse.scatter import NODES
+from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.numerics.climb import Summits, climb
+
+Real = Inexact[Array, "..."]
+
+
+_SCREENED = 4  # points for each start, of which the best are taken
+
+
+_LEAST_SCREENED = 64
+
+
+_AROUND = 0.15  # of the ranges
+
+
+_ROUNDS_BESIDE, _SCREENED_BESIDE, _BESIDE = 3, 64, 0.08  # rounds, points in each, and their extent in ranges
+
+
+_GAIN = 1e-6  # of a round that calls for another
+
+
+_RETRIES = 7  # starts with another scatter
+
+
+_RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
+
+
+_SURPRISED = 3.0  # standard deviations of the observations' log-probability
+
+
+_COMPUTED = 0.5  # of the possible scenes at the maximum
+
+
+_FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
+
+
+class EstimateStatus(eqx.Enumeration):
+    """What became of an estimate; `EstimateStatus[estimate.status]` is the message."""
+
+    successful = "One maximum stands out, and every interval lies within the range that was searched."
+    open_interval = (
+        "The observations leave a parameter open: an interval ends at the range that was searched, not where the "
+        "observations end it. More rocks near the boundary, or a prior, would close it."
+    )
+    no_information = (
+        "The observations tell nothing: every motion in the range explains them about equally well. Intervals are the "
+        "ranges that were searched."
+    )
+    contradictory = (
+        "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
+        "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
+    )
+    not_computed = (
+        "Under the best motion the responses of rocks were mostly too close to call, or could not be computed: nothing "
+        "can be said. Look at the motion, or set the engine."
+    )
+    not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
+
+
+class Estimate(eqx.Module):
+    """The motion that observations allow; arrays have the order of `names`.
+
+    - `names`, `values`: the parameters and where their likelihood (with priors: posterior density) is largest.
+    - `interval`: (parameters, 2) 95 % intervals of the profile likelihood, in the parameters' units; other starts'
+      maxima that are as good lie within.
+    - `open`: (parameters, 2) whether an end is only the end of the range.
+    - `covariance`: (parameters, parameters) of logarithms of the parameters (of a parameter itself that is not searched
+      in its logarithm): the inverse of minus the Hessian at the maximum; infinite where that is singular.
+    - `directions`, `deviations`: (parameters, parameters) rows of unit vectors in ranges of the parameters, and
+      (parameters,) the standard deviation along each, in ranges; those of half a range and more are not determined.
+    - `log_likelihood`: at the maximum, with the priors.
+    - `surprise`: how many standard deviations less probable the observations are than is to be expected; above 3 they
+      contradict each other.
+    - `probability`: (rocks,) that each rock does what it did (that it stands, where a rotation was measured).
+    - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
+      least with which they would not; infinite if there is none up to ten times as large.
+    - `summits`, `summit_values`: (starts, parameters) where each start arrived, and (starts,) the log-likelihood there.
+    - `responses`: how many scenes were computed.
+    - `remarks`: what is to be said about it, in words.
+    - `status`: an `EstimateStatus`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Real
+    interval: Real
+    open: Bool[Array, "parameters 2"]
+    covariance: Real
+    directions: Real
+    deviations: Real
+    log_likelihood: Real
+    surprise: Real
+    probability: Real
+    scatter: Real
+    consistent_scatter: Real
+    summits: Real
+    summit_values: Real
+    responses: int = eqx.field(static=True)
+    remarks: tuple[str, ...] = eqx.field(static=True)
+    status: EstimateStatus
+
+    def __getitem__(self, name: str) -> Real:
+        """The value of a parameter."""
+        return self.values[self.names.index(name)]
+
+
+def estimate_motion(
+    observations: Observations,
+    motion: Callable,
+    unknowns: dict[str, Unknown],
+    scatter: ArrayLike = 0.3,
+    *,
+    lapse: ArrayLike = 0.02,
+    starts: int = 64,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Estimate:
+    """Estimate the parameters of a motion from rocks that stand, fell, or rocked so far.
+
+    **Arguments:**
+
+    - `observations`: an `Observations`.
+    - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
+      own.
+    - `unknowns`: an `Unknown` for each of these parameters.
+    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
+      observation says nothing; see `Likelihood`. They are not estimated.
+    - `starts`: points from which the maximum is looked for, at least 1: the best of four times as many, spread over the
+      ranges.
+    - `model`, `engine`: as in `outcome`.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** an `Estimate`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    if starts < 1:
+        raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
+    if not unknowns:
+        raise ValueError("Argument `unknowns` must name at least one parameter.")
+    problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
+    bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
+    evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
+    found = climb(evaluate, _starts(starts, evaluate))
+    if not np.isfinite(evaluate.lowest):
+        raise ValueError("Argument `unknowns` must have ranges in which there are motions, but all its values are bad.")
+    for _ in range(_ROUNDS_BESIDE):
+        more, before = climb(evaluate, _beside(evaluate, found)), found.values.max()
+        found = _joined(more, found)
+        if found.values.max() < before + _GAIN:
+            break
+    for _ in range(3):
+        best = int(np.argmax(found.values))
+        shape = shape_at(evaluate, found.points[best])
+        profiled = profile(evaluate, found, shape)
+        if profiled.better is None:
+            break
+        # A profile went over a pass to a higher summit.
+        found = _joined(climb(evaluate, profiled.better[None]), found)
+    result = _conclude(evaluate, found, shape, profiled)
+    bar.add(bar.total - bar.done)
+    return result
+
+
+def _starts(count: int, evaluate: Evaluator) -> np.ndarray:
+    """The best of several times as many points that are spread over the ranges; first those that are best around."""
+    places = _spread(max(_SCREENED * count, _LEAST_SCREENED), evaluate)
+    order = np.argsort(-evaluate.at(places)[0], kind="stable")
+    low, high = evaluate.ends
+    share = (places[order] - low) / (high - low)
+    near = np.max(np.abs(share[:, None] - share[None]), axis=2) < _AROUND
+    beside = np.tril(near, -1).any(axis=1)
+    return evaluate.points(places[np.concatenate([order[~beside], order[beside]])[:count]])
+
+
+def _beside(evaluate: Evaluator, found: Summits) -> np.ndarray:
+    """The best of some points around the highest summit: gaps that are narrower than the scatter make small summits
+    beside it."""
+    low, high = evaluate.ends
+    best = evaluate.places(found.points[np.argmax(found.values)])
+    places = best + _BESIDE * (_spread(_SCREENED_BESIDE, evaluate) - (low + high) / 2)
+    places = np.clip(places, low, high)
+    order = np.argsort(-evaluate.at(places)[0], kind="stable")
+    return evaluate.points(places[order[: _SCREENED_BESIDE // _SCREENED]])
+
+
+def _joined(more: Summits, found: Summits) -> Summits:
+    return Summits(*(np.concatenate(pair) for pair in zip(more, found)))
+
+
+def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
+    """Places spread evenly over the ranges: multiples of irrational numbers, modulo one."""
+    low, high = evaluate.ends
+    size = low.size
+    root = np.roots([1, *[0] * (size - 1), -1, -1])
+    ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
+    share = (0.5 + np.outer(np.arange(count), ratio ** -np.arange(1.0, size + 1))) % 1
+    return low + (high - low) * (0.01 + 0.98 * share)
+
+
+def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profile) -> Estimate:
+    problem = evaluate.problem
+    best = int(np.argmax(found.values))
+    places = jnp.asarray(evaluate.places(found.points))
+    logs = np.array([unknown.log for unknown in problem.unknowns.values()])
+    values = {name: x[best] for name, x in problem.values(places).items()}
+    stands, computed, *facts = evaluate.facts(evaluate.places(found.points[best]))
+    surprise = _surprise(facts)
+    probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
+    remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
+    status = EstimateStatus.successful
+    if profiled.open.any():
+        status = EstimateStatus.open_interval
+    if found.values[best] - evaluate.lowest < _RATIO:
+        status = EstimateStatus.no_information
+    elif profiled.open.all():
+        remarks += ("They allow some combinations of these and not others: `feasible_region` maps them.",)
+    if not found.arrived[best] and not profiled.open.any():
+        status = EstimateStatus.not_converged
+    if np.mean(computed) < _COMPUTED:
+        status = EstimateStatus.not_computed
+    interval, covariance = np.where(logs[:, None], np.exp(profiled.ends), profiled.ends), shape.covariance
+    if surprise > _SURPRISED:
+        status = EstimateStatus.contradictory
+        interval, covariance = np.full_like(interval, np.nan), np.full_like(covariance, np.nan)
+        consistent = _consistent(evaluate, found.points[best])
+        names = problem.likelihood.observations.names
+        worst = np.argsort(np.asarray(probability))[:3]
+        worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
+        remarks = (f"Least probable under the best motion: {', '.join(worst)}.",) if worst else ()
+        if np.isfinite(consistent):
+            remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
+    per_point = problem.likelihood.observations.ways.size * NODES
+    return Estimate(
+        names=problem.names,
+        values=jnp.stack(list(values.values())),
+        interval=jnp.asarray(interval),
+        open=jnp.asarray(profiled.open),
+        covariance=jnp.asarray(covariance),
+        directions=jnp.asarray(shape.directions),
+        deviations=jnp.asarray(shape.deviations),
+        log_likelihood=jnp.asarray(found.values[best]),
+        surprise=jnp.asarray(surprise),
+        probability=probability,
+        scatter=problem.likelihood.scatter,
+        consistent_scatter=jnp.asarray(consistent),
+        summits=jnp.stack(list(problem.values(places).values()), axis=-1),
+        summit_values=jnp.asarray(found.values),
+        responses=evaluate.count * per_point,
+        remarks=remarks,
+        status=status,
+    )
+
+
+def _surprise(facts: Sequence[np.ndarray]) -> float:
+    badness, mean, variance = (float(np.sum(x)) for x in facts)
+    # A quarter keeps near certainties, whose variance is nothing, from being surprised by rounding.
+    return (badness - mean) / np.sqrt(variance + 0.25)
+
+
+def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
+    """About the least scatter under which observations do not contradict each other."""
+    for factor in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0):
+        scatter = evaluate.problem.likelihood.scatter * factor
+        problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
+        again = Evaluator(problem)
+        starts = np.concatenate([point[None], _starts(_RETRIES, again)])
+        found = climb(again, starts)
+        evaluate.count += again.count
+        if _surprise(again.facts(again.places(found.points[np.argmax(found.values)]))[2:]) <= _SURPRISED:
+            return float(scatter)
+    return np.inf
+
+
+def _remarks(problem: Problem, shape: Shape, profiled: Profile) -> tuple[str, ...]:
+    """Open intervals and flat directions in words."""
+    remarks = []
+    for name, (below, above) in zip(problem.names, profiled.open):
+        if below and above:
+            remarks.append(f"The observations do not determine {name}.")
+        elif below or above:
+            remarks.append(f"The observations do not bound {name} from {'below' if below else 'above'}.")
+    for direction, deviation in zip(shape.directions, shape.deviations):
+        if deviation > _FLAT and len(problem.names) > 1:
+            turned = direction * np.sign(direction[np.argmax(np.abs(direction))])
+            parts = [f"{x:+.2f} {name}" for x, name in zip(turned, problem.names) if abs(x) > 0.1]
+            remarks.append(f"Near the maximum the likelihood is flat along {', '.join(parts)} (shares of the ranges).")
+    return tuple(remarks)

@@ -1,0 +1,148 @@
+"""Which motions rocks allow, over two parameters: regions of likelihood, and the largest motion nobody has exceeded."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxrock._checks import Values, positive
+from jaxrock._progress import Progress
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.observations import TOPPLED, Observations
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.studies.critical import critical_amplitudes
+from jaxrock.studies.spectra import axis
+
+_LANES = 64  # motions in one call of the compiled program
+
+
+class FeasibleRegion(eqx.Module):
+    """How well motions explain observations, over two parameters.
+
+    - `names`: of the two; `values`: (rows,) of the first and (columns,) of the second.
+    - `log_likelihood`: (rows, columns).
+    - `allowed`: (rows, columns), whether a motion is within the 95 % region of two parameters, that is less than 3.00
+      below the best of the map.
+    """
+
+    names: tuple[str, str] = eqx.field(static=True)
+    values: tuple[Float[Array, " rows"], Float[Array, " columns"]]
+    log_likelihood: Float[Array, "rows columns"]
+    allowed: Bool[Array, "rows columns"]
+
+
+def feasible_region(
+    likelihood: Likelihood,
+    over: dict[str, Values],
+    fixed: dict[str, ArrayLike] | None = None,
+    *,
+    progress: bool | None = None,
+) -> FeasibleRegion:
+    """Map the likelihood of observations over two parameters of a motion.
+
+    **Arguments:**
+
+    - `likelihood`: a `Likelihood`.
+    - `over`: two parameters by name, with lists of values.
+    - `fixed`: the motion's other parameters, if it has more; at those of an `Estimate`, say.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** a `FeasibleRegion`.
+
+    **Raises:** ValueError unless there are two parameters with lists of finite values.
+    """
+    if len(over) != 2:
+        raise ValueError(f"Argument `over` must name two parameters, but names {len(over)}.")
+    lists = {name: jnp.asarray(values, float) for name, values in over.items()}
+    for name, values in lists.items():
+        if values.ndim != 1 or values.size == 0 or not bool(jnp.isfinite(values).all()):
+            raise ValueError(f"Argument `over` must hold lists of finite values, but not for `{name}`.")
+    rows, columns = (x.ravel() for x in jnp.meshgrid(*lists.values(), indexing="ij"))
+    bar, found = Progress(rows.size, "region", progress), []
+    for begin in range(0, rows.size, _LANES):
+        parts = (x[begin : begin + _LANES] for x in (rows, columns))
+        count = min(_LANES, rows.size - begin)
+        parts = (jnp.pad(x, (0, _LANES - count), mode="edge") for x in parts)
+        values = dict(zip(lists, parts)) | {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
+        found.append(np.asarray(_log_likelihood(likelihood, values))[:count])
+        bar.add(count)
+    total = jnp.asarray(np.concatenate(found)).reshape(*(x.size for x in lists.values()))
+    # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
+    return FeasibleRegion(tuple(lists), tuple(lists.values()), total, total > total.max() + np.log(0.05))
+
+
+@eqx.filter_jit
+def _log_likelihood(likelihood, values):
+    return jnp.sum(likelihood.log_terms(values, slopes=False), axis=-1)
+
+
+class Unexceeded(eqx.Module):
+    """The largest motions that all rocks survive, and all weaker ones too.
+
+    - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g] up to which every rock stands; infinite where no
+      amplitude that was looked at topples any.
+    - `by_rock`: (rocks, n) the same for each rock alone that stands.
+    - `weakest`: (n,) the number, from 0, among all rocks of the one that sets it; -1 where none does.
+    - `complete`: (n,) whether every amplitude that was looked at could be decided.
+    """
+
+    durations: Float[Array, " n"]
+    amplitude: Float[Array, " n"]
+    by_rock: Float[Array, "rocks n"]
+    weakest: Int[Array, " n"]
+    complete: Bool[Array, " n"]
+
+
+def unexceeded_motion(
+    observations: Observations,
+    motion: Callable,
+    durations: Values,
+    *,
+    intensity: tuple[float, float] = (1.0, 20.0),
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Unexceeded:
+    """Find the largest motion up to which all rocks that stand would have stood, for every duration.
+
+    Rocks are taken as they are stated, and the motion as the same at all of them: no scatter. Overturning intervals
+    above the first one do not count as safe between them: the motion was not exceeded. A rock of which it is not known
+    which way round it stood counts with the way in which it stands more.
+
+    **Arguments:**
+
+    - `observations`: an `Observations`; rocks that toppled are left out.
+    - `motion`: `motion(amplitude, duration)` makes it, such as `SinePulse`.
+    - `durations`: (n,) durations or periods [s], positive.
+    - `intensity`, `model`, `engine`, `progress`: as in `critical_amplitudes`.
+
+    **Returns:** an `Unexceeded`.
+
+    **Raises:** ValueError for arguments outside their ranges, or if no rock stands.
+    """
+    durations = axis("durations", durations)
+    standing = np.flatnonzero(np.asarray(observations.seen) != TOPPLED)
+    if standing.size == 0:
+        raise ValueError("Argument `observations` must hold a rock that stands.")
+    seen = observations.of(standing)
+    ways, size = seen.ways, durations.size
+    blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, size), len(ways)), seen.blocks)
+    found = critical_amplitudes(
+        blocks,
+        jax.vmap(motion)(jnp.repeat(ways.ravel(), size), jnp.tile(positive("durations", durations), ways.size)),
+        model,
+        intensity=intensity,
+        derivatives=False,
+        engine=engine,
+        progress=progress,
+    )
+    by_rock = found.lowest.reshape(*ways.shape, size).max(axis=0)
+    amplitude = by_rock.min(axis=0)
+    weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
+    complete = found.complete.reshape(-1, size).all(axis=0)
+    return Unexceeded(durations, amplitude, by_rock, weakest, complete)

@@ -1,0 +1,420 @@
+"""Fits to measured histories: the block and the motion that make a simulated rotation follow a measured one.
+
+Least squares by Levenberg and Marquardt, from many starts at once, with exact derivatives of whole histories. A wrong
+period puts a simulated history out of phase, and sums of squares have a minimum at every slip by a cycle: so the fit
+begins with a short window of the data and goes on with longer ones, each from where the one before has ended.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrock._checks import Values, checked, finite, positive, put_down
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.diffrax.arcs import Diffrax
+from jaxrock.engines.scene import check_single, peak_bound
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.taylor.careful import Series
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Equation, Model
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.exponential import RectangularPulse
+from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.responses.rigid import simulate
+from jaxrock.status import Status
+from jaxrock.studies.parameters import named, rebuilt
+
+_OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
+
+
+_GROWTH = 1.6  # from window to window
+
+
+_WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
+
+
+# Open intervals that parameters stay in; of a motion by the last part of their names. Those that begin at zero are
+# fitted by their logarithms: combinations that data do not tell apart are products of powers.
+_BOUNDS = {
+    **dict.fromkeys(("alpha", "alpha1", "alpha2"), (0.0, np.pi / 2)),
+    **dict.fromkeys(("restitution", "inertia_ratio"), (0.0, 1.0)),
+    "initial": (-np.pi / 2, np.pi / 2),
+    "oscillations": (1.0, np.inf),
+    **dict.fromkeys(("p", "p1", "radius_ratio", "duration", "period", "dt", "center"), (0.0, np.inf)),
+    **dict.fromkeys(("restitution1", "restitution2"), (0.0, np.inf)),
+}
+
+
+_USUAL = {
+    Block: ("alpha", "p", "restitution", "initial"),
+    AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
+}
+
+
+class HistoryStatus(eqx.Enumeration):
+    """What became of a fit to a history; `HistoryStatus[fit.status]` is the message."""
+
+    successful = "A minimum of the sum of squares was found, and it tells every parameter."
+    not_identified = (
+        "The data do not tell the parameters apart: along some combination of them the standard error is so wide that "
+        "intervals mean little. See `warnings` for what is known; fit fewer parameters, or larger rotations."
+    )
+    not_converged = "No start came to a minimum of the sum of squares. Better starting values or more starts may help."
+    not_simulated = "No start could be simulated to the end of the data: the numbers are not results."
+
+
+class HistoryFit(eqx.Module):
+    """What `fit_history` finds; parameters in the order of `names`.
+
+    - `names`, `values`: of the parameters.
+    - `covariance`: (parameters, parameters), for independent errors of the measurement.
+    - `robust_covariance`: the same for errors that last, correlated in time as residuals are: wider, if they are.
+    - `scatter`: standard deviation of the measurement [rad]: as given (the root mean square, if there are many), or
+      estimated from the residuals.
+    - `residuals`: (n,) measured less fitted rotation [rad]; `rotation`: (n,) fitted [rad].
+    - `correlation`: of neighbouring residuals [-]; `correlated`: whether that is more than chance.
+    - `misfit`: root mean square of residuals over scatter, counted by degrees of freedom; near 1 for a good model, and
+      exactly 1 where the scatter was estimated.
+    - `agreement`: share of the starts that came to this minimum.
+    - `block`, `motion`, `initial`: the fitted scene, for `simulate`. The motion rests if there was none.
+    - `status`: a `HistoryStatus`; `warnings`: in words, what to beware of. Empty if there is nothing.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    robust_covariance: Float[np.ndarray, "parameters parameters"]
+    scatter: float
+    residuals: Float[np.ndarray, " n"]
+    rotation: Float[np.ndarray, " n"]
+    correlation: float
+    correlated: bool
+    misfit: float
+    agreement: float
+    block: Block | AsymmetricBlock
+    motion: AbstractMotion
+    initial: tuple[float, float]
+    status: HistoryStatus
+    warnings: tuple[str, ...] = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> float:
+        """The estimate of a parameter."""
+        if name not in self.names:
+            raise KeyError(f"{name!r} is not one of the parameters {', '.join(self.names)}.")
+        return float(self.values[self.names.index(name)])
+
+    def intervals(self, confidence: float = 0.95, robust: bool | None = None) -> Float[np.ndarray, "parameters 2"]:
+        """Confidence intervals, each of one parameter by itself.
+
+        **Arguments:**
+
+        - `confidence`: in (0, 1).
+        - `robust`: whether by `robust_covariance`; None: where residuals are correlated.
+
+        **Returns:** (parameters, 2) lower and upper ends.
+
+        **Raises:** ValueError for a confidence outside its range.
+
+        **Source:** Student's t by Abramowitz & Stegun (1964), 26.7.5.
+        """
+        checked("confidence", confidence, "be in (0, 1)", lambda x: (x > 0) & (x < 1))
+        robust = self.correlated if robust is None else robust
+        covariance = self.robust_covariance if robust else self.covariance
+        z = float(jax.scipy.special.ndtri((1 + confidence) / 2))
+        freedom = self.residuals.size - self.values.size
+        t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)  # A&S 26.7.5
+        half = t * np.sqrt(np.diag(covariance))
+        return np.stack([self.values - half, self.values + half], axis=1)
+
+
+def fit_history(
+    time: Values,
+    rotation: Values,
+    block: Block | AsymmetricBlock,
+    motion: AbstractMotion | None = None,
+    model: Model = Housner(),
+    *,
+    parameters: Sequence[str] | None = None,
+    initial: tuple[float, float] | None = None,
+    scatter: Values | None = None,
+    spread: float = 0.2,
+    starts: int = 8,
+    seed: int = 0,
+    engine: AbstractEngine | None = None,
+) -> HistoryFit:
+    """Estimate a block, and the motion under it, from a measured history of its rotation.
+
+    **Arguments:**
+
+    - `time`: (n,) of the measurements from the start of the motion [s], 0 or more and rising.
+    - `rotation`: (n,) measured [rad].
+    - `block`, `motion`: where to start, and what is not fitted; a motion of None rests (free rocking).
+    - `model`: as in `outcome`.
+    - `parameters`: names of what is fitted: "alpha", "p", "restitution" (of an asymmetric block "alpha1", "alpha2",
+      "p1", "inertia_ratio", "radius_ratio", "restitution1", "restitution2"); those of the motion ("amplitude" [g] also
+      of a record, whose peak it is); "initial" [rad] and "velocity" [rad/s] at time 0; and of the measurement its
+      "delay" [s] behind the motion (before it, the block is as it was at time 0) and its "offset" [rad]. None: angles,
+      frequency parameter and restitutions of the block, and "initial".
+    - `initial`: rotation [rad] and angular velocity [rad/s] at time 0, to start from. None: (0, 0) under a motion, the
+      first measured rotation without.
+    - `scatter`: standard deviation of the errors of measurement [rad], one number or (n,); None: from the residuals.
+    - `spread`: how far off the starting values may be, relative; starts are scattered by that much.
+    - `starts`: how many, at least 1; the first is what is given. `seed`: of the others.
+    - `engine`: as in `outcome`; None: series of order 8 to a tolerance of 1e-10, ample for data.
+
+    **Returns:** a `HistoryFit`. Restitution that is not fitted follows the angles if it is not given.
+
+    **Raises:** ValueError for arguments outside their ranges, or names that the scene does not have.
+
+    **Source:** Marquardt (1963); Nielsen (1999), the damping; Brockwell & Davis (1991), 8.1, correlated residuals.
+    """
+    if starts < 1:
+        raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
+    if np.size(rotation) == 0:
+        raise ValueError("Argument `rotation` must hold measurements, but is empty.")
+    spread = float(positive("spread", spread))
+    scene = _Scene.of(block, motion, model, parameters, initial, rotation, engine)
+    time, rotation, weight = _data(time, rotation, scatter, 2 * len(scene.names))
+    places = np.arange(time.size)
+
+    def at(points: np.ndarray, samples: int):
+        """Weighted residuals and their derivatives in a window of the data."""
+        found, slopes, known = map(np.asarray, _histories(jnp.asarray(points), time, time[samples - 1], scene))
+        inside = np.where(places < samples, weight, 0.0)
+        residuals = np.where(inside > 0, (rotation - found) * inside, 0.0)
+        return np.where(known[:, None], residuals, np.inf), -slopes * inside[:, None]
+
+    first, scale, lower, upper = scene.coordinates()
+    if not ((lower < first) & (first < upper)).all():
+        outside = scene.names[int(np.argmin((lower < first) & (first < upper)))]
+        raise ValueError(f"Parameter `{outside}` can be fitted only from within its range, not from its end.")
+    problem = Problem(at, scale, lower, upper)
+    progression = Progression(_windows(time.size, first.size), spread, float(_noise(rotation) * np.median(weight)))
+    found = least_squares(problem, first, progression, starts, seed)
+    return _fit(scene, found, covariance(found, scale, scatter is not None), problem, rotation, weight, scatter)
+
+
+class _Scene(eqx.Module):
+    """What is simulated: what is fitted, and what is not."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    block: Block | AsymmetricBlock
+    motion: AbstractMotion
+    model: Model
+    initial: tuple[Array, Array]
+    engine: AbstractEngine
+
+    @classmethod
+    def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "_Scene":
+        """Check the names, and fill in what was left open."""
+        still = RectangularPulse(0.0, 1.0)
+        check_single(block, still if motion is None else motion)
+        names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
+        motion = still if free else motion
+        if not free and not float(peak_bound(motion)) > 0:
+            raise ValueError("Argument `motion` must move the ground; None is free rocking.")
+        allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
+        allowed += _OF_MEASUREMENT
+        unknown = [name for name in names if name not in allowed]
+        if unknown or not names or len(set(names)) < len(names):
+            wanted = f"be different names out of {', '.join(allowed)}"
+            raise ValueError(f"Argument `parameters` must {wanted}, but is {parameters!r}.")
+        if initial is None:
+            initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
+        block = _given(block, names)
+        if engine is None:
+            engine = Diffrax() if isinstance(model, Equation) else Series(order=8, tolerance=1e-10)
+        return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
+
+    @property
+    def logarithmic(self) -> np.ndarray:
+        """Which parameters are fitted by their logarithms."""
+        return np.array([_BOUNDS.get(_last(name), (1.0,))[0] == 0 for name in self.names])
+
+    def coordinates(self) -> tuple[np.ndarray, ...]:
+        """Where the fit starts, natural sizes of its coordinates, and lower and upper ends of their open intervals."""
+        alpha, p, reach = *map(float, _size(self.block)), float(self._reach)
+        sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha, "shape": 1.0, "phase": 1.0}
+        known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
+        values = np.array([float(known.get(name, 0.0)) for name in self.names])
+        scale = np.array([sizes.get(_last(n), abs(x) or 1.0) for n, x in zip(self.names, values)])
+        bounds = _BOUNDS | {"delay": (-reach, reach)}
+        bounds = np.array([bounds.get(_last(name), (-np.inf, np.inf)) for name in self.names]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values, bounds = (np.where(self.logarithmic, np.log(x), x) for x in (values, bounds))
+        return values, np.where(self.logarithmic, 1.0, scale), *bounds
+
+    def values(self, point):
+        """Parameters from coordinates."""
+        return jnp.where(self.logarithmic, jnp.exp(jnp.where(self.logarithmic, point, 0.0)), point)
+
+    @property
+    def _reach(self) -> Array:
+        """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
+        return 2 / _size(self.block)[1]
+
+    def at(self, values: dict) -> tuple[Block | AsymmetricBlock, AbstractMotion, tuple]:
+        """Block, motion and initial state with other parameters."""
+        before = named(self.block, self.motion)
+        block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
+        return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
+
+    def rotation(self, point, time, until):
+        """Rotation at times up to `until`, and whether the block could be followed."""
+        values = dict(zip(self.names, self.values(point)))
+        duration = until + (self._reach if "delay" in self.names else 0.0)
+        with put_down() as checks:
+            block, motion, initial = self.at(values)
+            response = simulate(
+                block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
+            )
+            rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
+        # A verdict that is too close to call is about what comes after the data.
+        known = (response.status == Status.successful) | (response.status == Status.undecided)
+        for _, failed in checks:
+            known &= ~failed
+        return rotation + values.get("offset", 0.0), known
+
+
+def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
+    """Slenderness angle, of the weaker side, and frequency parameter."""
+    if isinstance(block, Block):
+        return block.alpha, block.p
+    return jnp.minimum(block.alpha1, block.alpha2), block.p1
+
+
+def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
+    """The block with values of its own for what is fitted, and no longer follows from the rest."""
+    if isinstance(block, Block):
+        return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
+    radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
+    pair = None if block.given_restitution1 is None else (block.given_restitution1, block.given_restitution2)
+    if "restitution1" in names or "restitution2" in names:
+        pair = block.restitution1, block.restitution2
+    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, pair)
+
+
+def _last(name: str) -> str:
+    """Name of a parameter within its motion."""
+    return name.split(".")[-1]
+
+
+@jax.jit
+def _histories(points, time, until, scene: _Scene):
+    """Of every start: rotations, their derivatives by the coordinates, and whether there is a history."""
+
+    def one(point):
+        def value_twice(point):
+            rotation, known = scene.rotation(point, time, until)
+            return rotation, (rotation, known)
+
+        slopes, (rotation, known) = jax.jacfwd(value_twice, has_aux=True)(point)
+        good = known & jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(slopes))
+        return rotation, slopes, good
+
+    return jax.vmap(one)(points)
+
+
+def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
+    """Times, rotations and weights of the measurements as arrays of one length."""
+    time = np.asarray(checked("time", time, "be 0 or more and finite", lambda t: (t >= 0) & (t < np.inf)))
+    rotation = np.asarray(finite("rotation", rotation))
+    if time.ndim != 1 or time.size <= least:
+        raise ValueError(f"Argument `time` must be a list of more than {least} values, but has shape {time.shape}.")
+    if not (np.diff(time) > 0).all():
+        raise ValueError("Argument `time` must rise from value to value.")
+    if rotation.shape != time.shape:
+        raise ValueError(f"Argument `rotation` must have the shape {time.shape} of `time`, but has {rotation.shape}.")
+    scatter = np.asarray(positive("scatter", 1.0 if scatter is None else scatter))
+    if scatter.shape not in ((), time.shape) or not np.isfinite(scatter).all():
+        raise ValueError(f"Argument `scatter` must be finite numbers of shape () or {time.shape}.")
+    return time, rotation, np.broadcast_to(1 / scatter, time.shape)
+
+
+def _windows(size: int, count: int) -> tuple[int, ...]:
+    """Numbers of samples of the windows, growing to all."""
+    windows = [size]
+    while windows[0] / _GROWTH > max(4 * count, size / 40):
+        windows.insert(0, int(windows[0] / _GROWTH))
+    return tuple(windows)
+
+
+def _noise(rotation: np.ndarray) -> float:
+    """Size of errors, from second differences, in which a smooth history all but vanishes."""
+    size = float(np.median(np.abs(np.diff(rotation, 2))) / (0.6745 * np.sqrt(6)))
+    return max(size, 1e-7 * float(np.max(np.abs(rotation))), 1e-300)
+
+
+def _fit(scene: _Scene, found: Minimum, spread: Covariance, problem, rotation, weight, scatter) -> HistoryFit:
+    """The result in the units of the data, with what there is to warn of."""
+    size = rotation.size
+    simulated = bool(np.isfinite(found.residuals).all())
+    # Of independent residuals the correlation of neighbours has the standard deviation size^(-1/2); of a perfect fit
+    # the residuals are the rounding of the engine, which means nothing.
+    real = simulated and np.max(np.abs(found.residuals / weight)) > 1e-7 * np.max(np.abs(rotation))
+    correlated = real and spread.correlation > max(3 / np.sqrt(size), 0.1)
+    values = np.asarray(scene.values(found.point))
+    by_coordinates = np.where(scene.logarithmic, values, 1.0)
+    both = np.outer(by_coordinates, by_coordinates)
+    block, motion, initial = scene.at(dict(zip(scene.names, jnp.asarray(values))))
+    status, warnings = HistoryStatus.not_simulated, []
+    if simulated:
+        status, warnings = _judged(scene, found, spread, problem, correlated, scatter)
+    estimated = spread.scatter if scatter is None else float(np.sqrt(np.mean(1 / weight**2)))
+    return HistoryFit(
+        names=scene.names,
+        values=values,
+        covariance=both * spread.independent,
+        robust_covariance=both * spread.robust,
+        scatter=estimated,
+        residuals=found.residuals / weight,
+        rotation=rotation - found.residuals / weight,
+        correlation=spread.correlation,
+        correlated=bool(correlated),
+        misfit=1.0 if scatter is None else spread.scatter,
+        agreement=found.agreement,
+        block=block,
+        motion=motion,
+        initial=tuple(float(x) for x in initial),
+        status=status,
+        warnings=tuple(warnings),
+    )
+
+
+def _judged(scene: _Scene, found: Minimum, spread: Covariance, problem: Problem, correlated, scatter):
+    """Status, and warnings in words."""
+    size, count = found.residuals.size, found.point.size
+    warnings = []
+    used = spread.robust if correlated else spread.independent
+    variances, directions = np.linalg.eigh(used / np.outer(problem.scale, problem.scale))
+    errors = np.sqrt(np.maximum(variances, 0.0))
+    for error, direction in zip(errors, directions.T):
+        if error > _WIDE:
+            terms = " ".join(
+                f"{c:+.2f} {n}" for c, n in zip(direction * np.sign(direction.sum()), scene.names) if abs(c) > 0.05
+            )
+            warnings.append(
+                f"The data hardly tell how far the relative changes {terms} go together: standard error {error:.2g}."
+            )
+    identified = not warnings
+    if correlated:
+        warnings.append(
+            f"Neighbouring residuals are correlated ({spread.correlation:.2f}): intervals are by `robust_covariance`, "
+            "which allows for errors of measurement that last, but not for what the model leaves out."
+        )
+    if scatter is not None and abs(spread.scatter**2 - 1) > 4 * np.sqrt(2 / (size - count)):
+        warnings.append(f"Residuals are {spread.scatter:.3g} times the stated scatter.")
+    if found.agreement < 0.25:
+        warnings.append(f"Only {found.agreement:.0%} of the starts came to this minimum: there may be a lower one.")
+    margin = np.minimum(found.point - problem.lower, problem.upper - found.point)
+    for name, near in zip(scene.names, margin < np.sqrt(np.diag(used))):
+        if near:
+            warnings.append(f"`{name}` is at its bound to within its standard error: its interval reaches beyond.")
+    # Along what is not told a minimum is never reached.
+    status = HistoryStatus.successful if found.converged else HistoryStatus.not_converged
+    return status if identified else HistoryStatus.not_identified, warnings

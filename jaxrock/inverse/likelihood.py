@@ -1,0 +1,254 @@
+"""How probable observations of rocks are under a motion.
+
+What is certain about a rock is the sign of the margin of a known block under a known motion. Neither is known: the
+motion at each rock differs from that of the site by a lognormal factor of its own (`scatter`, its standard deviation in
+ln amplitude: what the ground, its surface and the model of a rigid block in a plane leave open), and alpha, p and
+restitution are uncertain. The probability that a rock stands is the share of these possible scenes with a positive
+margin:
+
+    P(stands) = E[margin > 0],  over  ln amplitude + scatter e0,  ln alpha + (alpha_sd/alpha) e1,  ln p + (p_sd/p) e2,
+                                restitution + restitution_sd e3,  all e independent and normal.
+
+A probit of the margin over its slope (the delta method) would give that where the margin is straight; but overturning
+sets are unions of intervals, narrower than the scatter or wider, and a probit with one slope would be certain where the
+slope vanishes, in the middle of one. So the margin is computed at many amplitudes (see `possible`). No derivatives are
+needed for the likelihood, and only first ones for its slope. Beside counted verdicts probabilities are off by 0.01 to
+0.04 (root of the mean square), and by up to 0.13 where shape and size are known to a tenth or two only
+(`benchmarks/inverse.md`).
+
+Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
+both ways.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jaxtyping import Array, ArrayLike, Bool, Inexact
+
+from jaxrock._checks import as_real, checked, positive, put_down
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
+from jaxrock.inverse.scatter import Possible, levels_around
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.responses.rigid import outcome
+from jaxrock.status import Status
+
+Real = Inexact[Array, "..."]
+
+
+_NO_STRENGTH = 1e-30  # [g]
+
+
+_FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
+
+
+class Likelihood(eqx.Module):
+    """The likelihood of observations as a function of the parameters of a motion.
+
+    **Arguments:**
+
+    - `observations`: an `Observations`.
+    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do.
+    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
+      differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
+    - `model`, `engine`: as in `outcome`.
+    - `lapse`: probability that what was seen of a rock says nothing, in [0, 1): somebody moved it, it was misjudged, or
+      it stands in a gap between two ways of overturning that is too narrow to be resolved. One rock can then speak
+      against a motion no more strongly than 2/lapse to 1.
+
+    **Raises:** ValueError for a value outside its range.
+    """
+
+    observations: Observations
+    scatter: Real
+    lapse: Real
+    motion: Callable = eqx.field(static=True)
+    model: Model
+    engine: AbstractEngine | None
+
+    def __init__(
+        self,
+        observations: Observations,
+        motion: Callable,
+        scatter: ArrayLike = 0.3,
+        model: Model = Housner(),
+        engine: AbstractEngine | None = None,
+        lapse: ArrayLike = 0.02,
+    ):
+        if isinstance(motion, AbstractMotion):
+            raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
+        self.observations, self.motion, self.model, self.engine = observations, motion, model, engine
+        self.scatter = positive("scatter", scatter)
+        self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+
+    def log_terms(self, values: dict[str, ArrayLike], slopes: bool = True) -> Real:
+        """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
+
+        For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
+        [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has first
+        derivatives if `slopes`, and is computed faster without; those of second order raise NotImplementedError (take
+        differences of slopes). Many motions at once take less time than `jax.vmap` of one.
+        """
+        return self._terms(*self._possible(values, slopes))
+
+    def _terms(self, possible: Possible, impossible: Bool[Array, "..."]) -> Real:
+        seen = self.observations
+        variance = possible.rotation_width**2 + seen.rotation_sd**2
+        density = -((seen.rotation - possible.rotation) ** 2) / (2 * variance) - jnp.log(2 * jnp.pi * variance) / 2
+        # Of a rotation in a scene that was not computed nothing is known.
+        density = jnp.where(possible.known, density, _FLAT)
+        ends = jnp.full_like(density[:1], _FLAT)
+        density = jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0)
+        stands, topples = possible.log_probability(True, density), possible.log_probability(False)
+        found = jnp.where(seen.seen == TOPPLED, topples, stands)
+        found = self._or_lapse(found, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
+        return jnp.where(impossible[..., None], -jnp.inf, found)
+
+    def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
+        """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
+        return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
+
+    def survival(self, values: dict[str, ArrayLike]) -> Real:
+        """Probability that each rock stands, (..., rocks), without derivatives."""
+        return jnp.exp(self._possible(values)[0].log_probability(True))
+
+    def surprise(self, values: dict[str, ArrayLike]) -> tuple[Real, Real, Real]:
+        """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
+
+        The badness is minus the log-probability; for a measured rotation half its squared distance from what is
+        expected, in standard deviations, and minus the log-probability that it stands. Without derivatives.
+        """
+        return self._surprise(self._possible(values)[0])
+
+    def terms_and_facts(self, values: dict[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
+        """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
+        of the first."""
+        possible, impossible = self._possible(values, slopes=True)
+        stands = jnp.exp(possible.log_probability(True))
+        return self._terms(possible, impossible), (stands, possible.share_known, *self._surprise(possible))
+
+    def _surprise(self, possible: Possible) -> tuple[Real, Real, Real]:
+        seen = self.observations
+        both = (self._or_lapse(possible.log_probability(which)) for which in (True, False))
+        stands, topples = (jnp.maximum(x, -1e3) for x in both)
+        share, lost = jnp.exp(stands), jnp.exp(topples)
+        badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
+        mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2
+
+        # The rotation to be expected of a rock that stands.
+        weight = jnp.where(possible.known, possible.weight * ndtr(possible.y / possible.width), 0.0)
+        weight = weight / possible.y.shape[-2]
+        total = jnp.maximum(jnp.sum(weight, axis=(0, -2)), 1e-9)
+        centre = jnp.sum(weight * possible.rotation, axis=(0, -2)) / total
+        spread = possible.rotation_width**2 + (possible.rotation - centre[..., None, :]) ** 2
+        spread = seen.rotation_sd**2 + jnp.sum(weight * spread, axis=(0, -2)) / total
+        measured = jnp.where((seen.seen == ROTATION) & (total > 1e-6), 0.5, 0.0)
+        return badness + measured * (seen.rotation - centre) ** 2 / spread, mean + measured, variance + measured
+
+    def _possible(self, values: dict[str, ArrayLike], slopes: bool = False) -> tuple[Possible, Bool[Array, "..."]]:
+        """What becomes of every rock in every possible scene, with first derivatives, if `slopes`; and whether there is
+        no such motion."""
+        seen, names = self.observations, tuple(values)
+        parameters = jnp.stack(jnp.broadcast_arrays(*(as_real(name, x) for name, x in values.items())), axis=-1)
+        if not slopes:
+            parameters = _without_slopes(parameters)
+        outer = parameters.shape[:-1]
+        strength, impossible = jax.vmap(lambda x: self._strength(names, x))(parameters.reshape(-1, len(names)))
+        strength, impossible = strength.reshape(outer), impossible.reshape(outer)
+        levels, where = levels_around(seen, self.scatter, strength)
+        shape = (*levels.strength.shape[:-1], *seen.ways.shape)
+
+        def one(parameters, level, way, block):
+            def results(parameters):
+                with put_down():  # those of the motion are looked at before, and the rocks are known to be good
+                    motion = self.motion(**dict(zip(names, parameters)))
+                    motion = _of_strength(motion, level, way)
+                    found = outcome(block, motion, self.model, engine=self.engine)
+                rotation = jnp.where(found.overturned, 0.0, found.max_rotation)
+                real = jnp.stack([found.margin, rotation])
+                return real, (real, found.overturned, found.status == Status.successful)
+
+            if not slopes:
+                return None, results(parameters)[1]
+            # The product of a small Jacobian: in reverse it is computed once, with the values.
+            _, back, found = jax.vjp(results, parameters, has_aux=True)
+            return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
+
+        def lanes(x):
+            return jnp.broadcast_to(x[..., None, :], shape).ravel()
+
+        parameters = jnp.broadcast_to(parameters[..., None, None, :], (*shape, len(names))).reshape(-1, len(names))
+        blocks = jax.tree.map(lanes, seen.blocks_at(levels.alpha, levels.p, levels.restitution))
+        ways = jnp.broadcast_to(seen.ways, shape).ravel()
+        # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
+        fixed, level = jax.lax.stop_gradient((parameters, lanes(levels.strength)))
+        rows, (real, lost, known) = jax.vmap(one)(fixed, level, ways, blocks)
+        if slopes:
+            real = _sloping(real, jnp.where(jnp.isfinite(rows), rows, 0.0), parameters)
+        margin, rotation, lost, known = (x.reshape(shape) for x in (*real.T, lost, known))
+        verge = jnp.broadcast_to((levels.alpha * seen.weaker_alpha / seen.alpha)[..., None, :], shape)
+        rotation = jnp.where(known, rotation, 0.0)
+        return Possible.of(where[..., None, :], margin, rotation, known, lost, verge), impossible
+
+    def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
+        """Logarithm of the strength of a motion, and whether there is no such motion."""
+        with put_down() as checks:
+            strength = _log_strength(self.motion(**dict(zip(names, parameters))))
+        failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in checks)]).any()
+        return jnp.where(failed, 0.0, strength), failed
+
+
+def _log_strength(motion: AbstractMotion) -> Real:
+    """Logarithm of a measure of the acceleration: any that grows with it will do."""
+    return jnp.log(jnp.maximum(jnp.max(motion.bounds), _NO_STRENGTH))
+
+
+def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> AbstractMotion:
+    """The motion made so strong, one way or (-1) the other.
+
+    The amplitude of a pulse, which would cancel, is left out, so that nothing is differentiated by it.
+    """
+    if isinstance(motion, AbstractPulse):
+        motion = eqx.tree_at(lambda pulse: pulse.amplitude, motion, jnp.sign(motion.amplitude))
+    return motion * (way * jnp.exp(logarithm - _log_strength(motion)))
+
+
+@jax.custom_jvp
+def _sloping(values: Real, rows: Real, parameters: Real) -> Real:
+    """Values, (..., results), with the rows of their Jacobian by parameters, (..., results, parameters)."""
+    return values
+
+
+@_sloping.defjvp
+def _(primals, tangents):
+    values, rows, parameters = primals
+    return values, jnp.einsum("...ij,...j->...i", _constant(rows, parameters), tangents[2])
+
+
+@jax.custom_jvp
+def _constant(rows: Real, parameters: Real) -> Real:
+    """Rows that are known at these parameters only."""
+    return rows
+
+
+@jax.custom_jvp
+def _without_slopes(parameters: Real) -> Real:
+    """Parameters by which nobody may differentiate."""
+    return parameters
+
+
+@_without_slopes.defjvp
+def _(primals, tangents):
+    raise NotImplementedError("This was computed without derivatives: use `log_terms(values)`, which has them.")
+
+
+@_constant.defjvp
+def _(primals, tangents):
+    raise NotImplementedError("A likelihood has first derivatives only: for second ones take differences of slopes.")

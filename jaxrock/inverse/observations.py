@@ -1,0 +1,251 @@
+"""What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock._checks import Values, as_real, checked, put_down
+from jaxrock._label import Label
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+
+SEEN = ("survived", "toppled", "rotation")
+
+
+SURVIVED, TOPPLED, ROTATION = range(3)
+
+
+Rocks = Inexact[Array, " rocks"]
+
+
+class OtherSide(eqx.Module):
+    """How side 2 of asymmetric rocks differs from side 1, and which way round they stand; (..., rocks) each.
+
+    - `alpha_ratio`: alpha2/alpha1; `radius_ratio`: R2/R1.
+    - `inertia_ratio`: m R1^2/I1.
+    - `restitution_ratio`: that of an impact that ends the stay on side 1 over that of one that ends it on side 2.
+    - `ways`: (ways, rocks) signs of the motion that each rock may have felt, all equally likely: one row, or two where
+      that is not known of some rocks.
+    """
+
+    alpha_ratio: Rocks
+    radius_ratio: Rocks
+    inertia_ratio: Rocks
+    restitution_ratio: Rocks
+    ways: Inexact[Array, "ways rocks"]
+
+
+class Observations(eqx.Module):
+    """Rocks at one site, and what each of them did in one shaking.
+
+    Symmetric ones; `Observations.asymmetric` makes those of rocks whose sides differ.
+
+    **Arguments:**
+
+    - `alpha`: (rocks,) slenderness angles [rad], in (0, pi/2).
+    - `p`: (rocks,) frequency parameters [rad/s], positive.
+    - `seen`: for each rock "survived", "toppled", or "rotation" (its largest rotation was measured, and it stands).
+    - `restitution`: (rocks,) in [0, 1]; None, or NaN for a rock, is Housner's value, which follows alpha.
+    - `alpha_sd`, `p_sd`, `restitution_sd`: (rocks,) or one number: standard deviations, 0 or more, in the units of what
+      they belong to. Alpha and p are uncertain by lognormal factors, the restitution by a normal sum within [0, 0.99].
+    - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive;
+      not read for rocks without one.
+    - `names`: of the rocks; None numbers them.
+    - `other`: what `Observations.asymmetric` knows of their second sides; None: symmetric ones.
+
+    **Raises:** ValueError for values outside their ranges, or of different lengths.
+    """
+
+    alpha: Rocks
+    p: Rocks
+    restitution: Rocks
+    alpha_sd: Rocks
+    p_sd: Rocks
+    restitution_sd: Rocks
+    rotation: Rocks
+    rotation_sd: Rocks
+    follows: Bool[Array, " rocks"]
+    seen: Int[Array, " rocks"]
+    other: OtherSide | None
+    label: Label = eqx.field(static=True)
+
+    def __init__(
+        self,
+        alpha: Values,
+        p: Values,
+        seen: Sequence[str],
+        restitution: Values | None = None,
+        *,
+        alpha_sd: Values = 0.0,
+        p_sd: Values = 0.0,
+        restitution_sd: Values = 0.0,
+        rotation: Values | None = None,
+        rotation_sd: Values | None = None,
+        names: Sequence[str] | None = None,
+        other: OtherSide | None = None,
+    ):
+        alpha = as_real("alpha", alpha)
+        if alpha.ndim != 1 or alpha.size == 0:
+            raise ValueError(f"Argument `alpha` must be a list of at least one rock, but has shape {alpha.shape}.")
+        count = alpha.size
+        self.seen = _words(seen, count)
+        restitution = _list("restitution", np.nan if restitution is None else restitution, count)
+        self.follows, self.other = jnp.isnan(restitution), other
+        given = checked("restitution", jnp.where(self.follows, 0.5, restitution), "be in [0, 1]", _in_share)
+        block = Block(alpha, _list("p", p, count), given)
+        self.alpha, self.p = block.alpha, block.p
+        if other is None:
+            own = np.asarray(alpha)[np.asarray(self.follows)]
+            Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
+        self.restitution = jnp.where(self.follows, self.by_momentum(self.alpha), given)
+        deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
+        self.alpha_sd, self.p_sd, self.restitution_sd = (
+            checked(name, _list(name, value, count), "be 0 or more and finite", lambda x: (x >= 0) & (x < np.inf))
+            for name, value in deviations.items()
+        )
+        measured = np.asarray(self.seen) == ROTATION
+        self.rotation, self.rotation_sd = (
+            _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
+        )
+        self.label = Label(tuple(f"rock {i + 1}" for i in range(count)) if names is None else tuple(map(str, names)))
+        if len(self.names) != count:
+            raise ValueError(f"Argument `names` must have {count} names, but has {len(self.names)}.")
+
+    @classmethod
+    def asymmetric(
+        cls,
+        blocks: AsymmetricBlock,
+        seen: Sequence[str],
+        restitution: Values | None = None,
+        *,
+        facing: Values = 0.0,
+        **known,
+    ) -> "Observations":
+        """Observations of rocks whose sides differ.
+
+        **Arguments:**
+
+        - `blocks`: an `AsymmetricBlock` of (rocks,) arrays.
+        - `seen`: as in `Observations`.
+        - `restitution`: (rocks,) root of the energy that two impacts keep, one on each side, in [0, 1]; their ratio is
+          that of `blocks`. None, or NaN for a rock: that of `blocks`, where none was given by angular momentum.
+        - `facing`: (rocks,) or one number: 1 where positive ground acceleration drives the rock from side 1 to side 2,
+          as it does a block; -1 where it stands the other way round; 0 where that is not known, which is each rock's
+          own coin: its probabilities are the means over both ways. (For a shaking whose direction is not known, but is
+          one for all, state how rocks face each other, and let the amplitude be of either sign.)
+        - `known`: the rest, as in `Observations`. `alpha_sd` and `p_sd` belong to side 1: both angles are off by the
+          same factor, and so are both frequency parameters.
+
+        **Returns:** an `Observations`.
+
+        **Raises:** ValueError for values outside their ranges, or of different lengths.
+        """
+        count = len(seen)
+        leaves = ("alpha1", "alpha2", "p1", "p2", "inertia_ratio", "radius_ratio", "restitution1", "restitution2")
+        alpha1, alpha2, p1, p2, inertia, radii, first, second = (
+            _list(f"blocks.{name}", getattr(blocks, name), count) for name in leaves
+        )
+        facing = checked("facing", _list("facing", facing, count), "be 1, -1 or 0", _is_facing)
+        # By momentum the numerators of both restitutions are the same, and their ratio is I1/I2.
+        ratio = jnp.where((first > 0) & (second > 0), first / second, (p2 / p1) ** 2 / radii)
+        ways = [jnp.where(facing == 0, sign, facing) for sign in (1.0, -1.0)]
+        ways = jnp.stack(ways if np.any(np.asarray(facing) == 0) else ways[:1])
+        other = OtherSide(alpha2 / alpha1, radii, inertia, ratio, ways)
+        restitution = _list("restitution", np.nan if restitution is None else restitution, count)
+        if blocks.given_restitution1 is not None:
+            restitution = jnp.where(jnp.isnan(restitution), jnp.sqrt(first * second), restitution)
+        return cls(alpha1, p1, seen, restitution, other=other, **known)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the rocks."""
+        return self.label.value
+
+    @property
+    def ways(self) -> Inexact[Array, "ways rocks"]:
+        """Signs of the motion that each rock may have felt, all equally likely."""
+        return jnp.ones((1, self.alpha.size)) if self.other is None else self.other.ways
+
+    @property
+    def weaker_alpha(self) -> Rocks:
+        """Slenderness angle of the weaker side."""
+        return self.alpha if self.other is None else self.alpha * jnp.minimum(1.0, self.other.alpha_ratio)
+
+    @property
+    def widest(self) -> Rocks:
+        """The largest alpha of side 1 that a rock may have."""
+        if self.other is None:
+            return jnp.where(self.follows, 0.955, 1.55)
+        return 1.55 / jnp.maximum(1.0, self.other.alpha_ratio)
+
+    def by_momentum(self, alpha: Inexact[Array, "*shape rocks"]) -> Inexact[Array, "*shape rocks"]:
+        """Restitution by angular momentum: Housner's, or the root of the product of both."""
+        if self.other is None:
+            return jnp.maximum(1 - 1.5 * jnp.sin(alpha) ** 2, 0.0)  # Housner (1963)
+        block = self.blocks_at(alpha, self.p, None)
+        return jnp.sqrt(block.restitution1 * block.restitution2)
+
+    def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
+        """The rocks, were these their values on side 1, (..., rocks): one block of arrays; they are not checked."""
+        with put_down():
+            if self.other is None:
+                return Block(alpha, p, restitution)
+            root, there = jnp.sqrt(self.other.restitution_ratio), self.other
+            pair = None if restitution is None else (restitution * root, restitution / root)
+            values = (alpha, there.alpha_ratio * alpha, p, there.inertia_ratio, there.radius_ratio)
+            shape = jnp.shape(alpha)
+            return AsymmetricBlock(*(jnp.broadcast_to(x, shape) for x in values), pair)
+
+    @property
+    def blocks(self) -> Block | AsymmetricBlock:
+        """The rocks as they are stated: one `Block` or `AsymmetricBlock` of arrays."""
+        return self.blocks_at(self.alpha, self.p, self.restitution)
+
+    def of(self, which: ArrayLike) -> "Observations":
+        """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
+        index = np.arange(self.alpha.size)[np.asarray(which)]
+        known = {
+            name: getattr(self, name)[index]
+            for name in ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
+        }
+        restitution = jnp.where(self.follows, jnp.nan, self.restitution)[index]
+        words = [SEEN[k] for k in np.asarray(self.seen)[index]]
+        names = [self.names[i] for i in index]
+        other = jax.tree.map(lambda x: x[..., index], self.other)
+        return Observations(self.alpha[index], self.p[index], words, restitution, **known, names=names, other=other)
+
+
+def _in_share(x):
+    return (x >= 0) & (x <= 1)
+
+
+def _is_facing(x):
+    return (x == 0) | (abs(x) == 1)
+
+
+def _list(name: str, value: Values, count: int) -> Rocks:
+    array = as_real(name, value)
+    if array.shape not in ((), (count,)):
+        raise ValueError(f"Argument `{name}` must have a value for each of {count} rocks, but has shape {array.shape}.")
+    return jnp.broadcast_to(array, (count,))
+
+
+def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
+    if isinstance(seen, str) or len(seen) != count:
+        raise ValueError(f"Argument `seen` must have a word for each of {count} rocks, but is {seen!r}.")
+    for word in seen:
+        if word not in SEEN:
+            raise ValueError(f"Argument `seen` must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.")
+    return jnp.asarray([SEEN.index(word) for word in seen])
+
+
+def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
+    """Values of the rocks with a measured rotation; 1 for the others."""
+    if value is None and measured.any():
+        raise ValueError(f'Argument `{name}` must be given where `seen` is "rotation".')
+    array = _list(name, 1.0 if value is None else value, measured.size)
+    return checked(name, jnp.where(measured, array, 1.0), "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))

@@ -1,0 +1,250 @@
+"""Samples of the posterior distribution of a motion's parameters (with NumPyro's diagnostics, an extra).
+
+The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
+where it is first (see `proposals`), from the maxima of an estimate and from everywhere. Whether chains agree tells
+whether they have arrived; not whether there is a maximum that neither the estimate nor any proposal has met. (Ensembles
+of walkers, by NumPyro's AIES, take many times as many points: benchmarks/inverse.md.)
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact
+
+from jaxrock._progress import Progress
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
+from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.observations import Observations
+from jaxrock.inverse.scatter import NODES
+from jaxrock.inverse.unknowns import Problem, Unknown, in_batches
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.numerics.proposals import ROUNDS, around, begin, learn
+
+Real = Inexact[Array, "..."]
+
+
+_CHAINS = 8
+
+
+_ROUND = 512  # points of a round: those of all chains together
+
+
+_LANES = 64  # points in one call of the compiled program
+
+
+_PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
+
+
+_DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
+
+
+_AROUND, _EVENLY = 0.05, 0.85  # how far from them, in ranges; share of the first points that is spread over everything
+
+
+_ALIKE = 1.01  # R-hat
+
+
+_END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
+
+
+class PosteriorStatus(eqx.Enumeration):
+    """Whether samples can be trusted; `PosteriorStatus[posterior.status]` is the message."""
+
+    successful = "The chains agree, and hold enough independent samples."
+    open_interval = (
+        "The chains agree. The observations leave a parameter open: its distribution reaches the end of the range, "
+        "which bounds it as a prior does."
+    )
+    not_converged = "The chains do not agree, or there are too few independent samples. Raise `steps`."
+    contradictory = (
+        "The observations contradict each other (see the estimate): samples say what would hold if they did not."
+    )
+
+
+class Posterior(eqx.Module):
+    """Samples of a posterior distribution.
+
+    - `names`: the parameters; `samples`: (chains, steps, parameters), in their units.
+    - `log_density`: (chains, steps) log-likelihood and log-prior.
+    - `effective_size`: (parameters,) number of independent samples that would know the mean as well.
+    - `r_hat`: (parameters,) between halves of all chains, 1 if they agree.
+    - `open`: (parameters, 2) whether the distribution reaches the end of its range.
+    - `responses`: how many scenes were computed, without those of the estimate.
+    - `estimate`: the `Estimate`, by whose maxima the distribution was looked for.
+    - `status`: a `PosteriorStatus`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    samples: Real
+    log_density: Real
+    effective_size: Real
+    r_hat: Real
+    open: Bool[Array, "parameters 2"]
+    responses: int = eqx.field(static=True)
+    estimate: Estimate
+    status: PosteriorStatus
+
+    def __getitem__(self, name: str) -> Real:
+        """All samples of a parameter, (samples,)."""
+        return self.samples[..., self.names.index(name)].ravel()
+
+    def interval(self, share: float = 0.95) -> Real:
+        """(parameters, 2) intervals that leave equal shares of the samples on both sides."""
+        flat = self.samples.reshape(-1, len(self.names))
+        return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
+
+    def summary(self) -> str:
+        """Mean, standard deviation, quantiles and diagnostics as a table, and the status."""
+        lines = [f"{'':<12}{'mean':>10}{'sd':>10}{'2.5 %':>10}{'50 %':>10}{'97.5 %':>10}{'effective':>11}{'R-hat':>8}"]
+        for i, name in enumerate(self.names):
+            x = self[name]
+            numbers = jnp.concatenate([jnp.stack([x.mean(), x.std()]), jnp.quantile(x, jnp.array([0.025, 0.5, 0.975]))])
+            cells = "".join(f"{float(number):>10.4g}" for number in numbers)
+            lines.append(f"{name:<12}{cells}{float(self.effective_size[i]):>11.0f}{float(self.r_hat[i]):>8.3f}")
+        return "\n".join([*lines, PosteriorStatus[self.status]])
+
+
+def sample_motion(
+    observations: Observations,
+    motion: Callable,
+    unknowns: dict[str, Unknown],
+    scatter: ArrayLike = 0.3,
+    *,
+    lapse: ArrayLike = 0.02,
+    estimate: Estimate | None = None,
+    effective_size: int = 1000,
+    steps: int = 4000,
+    seed: int = 0,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Posterior:
+    """Sample the parameters of a motion given rocks that stand, fell, or rocked so far.
+
+    Priors are those of the `Unknown`s, uniform over their ranges (in the logarithm if `log`) where they have none: the
+    posterior is proper even where the observations tell nothing, and then as wide as the ranges.
+
+    **Arguments:**
+
+    - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `model`, `engine`: as in `estimate_motion`.
+    - `estimate`: what `estimate_motion` found: where to look first. None makes one.
+    - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
+    - `steps`: of each of eight chains, at most; at least 1. Those before chains began anew are counted, but not used.
+    - `seed`: of the random numbers.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** a `Posterior`.
+
+    **Raises:** ValueError for arguments outside their ranges, and for an estimate of other unknowns; ImportError
+    without NumPyro (`pip install "jaxrock[posterior]"`).
+
+    **Source:** Hastings (1970), independent proposals; Cappe et al. (2004), populations of them that learn; Gelman et
+    al. (2013, 11.4), R-hat between halves of chains, and effective size, by NumPyro.
+    """
+    try:
+        import numpyro.diagnostics  # noqa: F401
+    except ImportError as error:
+        raise ImportError('Sampling needs NumPyro: pip install "jaxrock[posterior]".') from error
+    for name, value in (("effective_size", effective_size), ("steps", steps)):
+        if value < 1:
+            raise ValueError(f"Argument `{name}` must be at least 1, but is {value}.")
+    if estimate is None:
+        estimate = estimate_motion(
+            observations, motion, unknowns, scatter, lapse=lapse, model=model, engine=engine, progress=progress
+        )
+    problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
+    random, density = np.random.default_rng(seed), _Density(problem)
+    bar = Progress(ROUNDS + -(-steps * _CHAINS // _ROUND), "posterior", progress)
+    low, high = np.asarray(problem.ends).T
+    first = around(_summits(problem, estimate), _AROUND, _EVENLY, low, high)
+    drawn = learn(density, first, _ROUND, random, lambda: bar.add(1))
+    chains = begin(drawn, _CHAINS, random)
+    for done in range(0, steps, _ROUND // _CHAINS):
+        if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
+            chains = begin(chains.drawn, _CHAINS, random)  # they have met something, from which there is more to learn
+        chains = chains.follow(density, min(_ROUND // _CHAINS, steps - done), random)
+        sizes, r_hat = diagnostics(chains.places[1:])
+        bar.add(1)
+        if sizes.min() >= effective_size and r_hat.max() < _ALIKE:
+            break
+    bar.add(bar.total - bar.done)
+    places, values = chains.places[1:], chains.log_density[1:]
+    return _conclude(problem, estimate, places, values, sizes, r_hat, effective_size, density.count)
+
+
+@eqx.filter_jit
+def _log_density(problem: Problem, places: Real) -> Real:
+    return problem.log_density(places, slopes=False)
+
+
+class _Density:
+    """Log-densities at any number of places, in batches of one compiled program; it counts."""
+
+    def __init__(self, problem: Problem):
+        self.problem, self.count = problem, 0
+
+    def __call__(self, places: np.ndarray) -> np.ndarray:
+        self.count += len(places)
+        (found,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
+        return np.where(np.isnan(found), -np.inf, found)
+
+
+def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
+    """Places of the best maxima of the estimate, (maxima, parameters)."""
+    values = np.asarray(estimate.summit_values)
+    summits = np.asarray(estimate.summits)[values > values.max() - _DEPTH]
+    logs = np.array([unknown.log for unknown in problem.unknowns.values()])
+    places = np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
+    low, high = np.asarray(problem.ends).T
+    slack = 1e-9 * (high - low)
+    if estimate.names != problem.names or not ((places > low - slack) & (places < high + slack)).all():
+        raise ValueError("Argument `estimate` must be of these unknowns in these ranges, but is of others.")
+    return np.clip(places, low, high)
+
+
+def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Effective sizes and R-hat, (parameters,) each, of places (steps, chains, parameters); few steps tell nothing."""
+    from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
+
+    if len(places) < 4:
+        return np.zeros(places.shape[-1]), np.full(places.shape[-1], np.inf)
+    by_chain = places.swapaxes(0, 1)
+    sizes, r_hat = np.asarray(effective_sample_size(by_chain)), np.asarray(split_gelman_rubin(by_chain))
+    # Chains that never moved.
+    return np.where(np.isnan(sizes), 0.0, sizes), np.where(np.isnan(r_hat), np.inf, r_hat)
+
+
+def _conclude(
+    problem: Problem,
+    estimate: Estimate,
+    places: np.ndarray,
+    density: np.ndarray,
+    sizes: np.ndarray,
+    r_hat: np.ndarray,
+    wanted: int,
+    points: int,
+) -> Posterior:
+    low, high = np.asarray(problem.ends).T
+    share = ((places - low) / (high - low)).reshape(-1, low.size)
+    open_ = np.stack([(share < _END).mean(axis=0), (share > 1 - _END).mean(axis=0)], axis=1) > _END / 5
+    status = PosteriorStatus.open_interval if open_.any() else PosteriorStatus.successful
+    if not (sizes.min() >= wanted and r_hat.max() < _ALIKE):
+        status = PosteriorStatus.not_converged
+    if bool(estimate.status == EstimateStatus.contradictory):
+        status = PosteriorStatus.contradictory
+    values = problem.values(jnp.asarray(places.swapaxes(0, 1)))
+    return Posterior(
+        names=problem.names,
+        samples=jnp.stack(list(values.values()), axis=-1),
+        log_density=jnp.asarray(density.swapaxes(0, 1)),
+        effective_size=jnp.asarray(sizes),
+        r_hat=jnp.asarray(r_hat),
+        open=jnp.asarray(open_),
+        responses=points * problem.likelihood.observations.ways.size * NODES,
+        estimate=estimate,
+        status=status,
+    )

@@ -1,0 +1,155 @@
+"""The likelihood around its maximum: its curvature there, and profiles, which are intervals of parameters."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrock.inverse.unknowns import Evaluator
+from jaxrock.numerics.climb import Summits, climb
+
+_RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
+
+
+_ROOT = np.sqrt(2 * _RATIO)
+
+
+_AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
+
+
+class Shape(NamedTuple):
+    """The likelihood near its maximum, by places."""
+
+    place: np.ndarray
+    covariance: np.ndarray  # infinite where singular
+    directions: np.ndarray
+    deviations: np.ndarray
+
+
+def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
+    """The Hessian by differences of slopes over a third of a standard deviation: on a finer scale there are steps."""
+    place = evaluate.places(point)
+    low, high = evaluate.ends
+    size, count = high - low, place.size
+    step = np.full(count, 0.02)  # of the range
+    for _ in range(2):
+        moves = np.concatenate([np.diag(step), -np.diag(step)]) * size
+        at = np.clip(place + moves, low, high)
+        slopes = evaluate.at(at)[1] * size
+        distance = np.diagonal(at[:count] - at[count:]) / size
+        hessian = (slopes[:count] - slopes[count:]) / np.maximum(distance, 1e-12)[:, None]
+        hessian = -(hessian + hessian.T) / 2
+        spread = 1 / np.sqrt(np.maximum(np.diagonal(hessian), 1e-6))
+        step = np.clip(spread / 3, 1e-4, 0.05)
+    eigenvalues, vectors = np.linalg.eigh(hessian)
+    deviations = 1 / np.sqrt(np.maximum(eigenvalues, 1e-6))
+    covariance = np.full_like(hessian, np.inf)
+    if eigenvalues[0] > 1e-6 * max(eigenvalues[-1], 1.0):
+        covariance = np.linalg.inv(hessian) * np.outer(size, size)
+    return Shape(place, covariance, vectors.T, deviations)
+
+
+class Profile(NamedTuple):
+    """Intervals by the profile likelihood."""
+
+    ends: np.ndarray  # (parameters, 2), places
+    open: np.ndarray  # whether an end is only that of the range
+    better: np.ndarray | None  # a point above the maximum
+
+
+class _Row(NamedTuple):
+    """A value of the parameter that is held, the root of twice the likelihood ratio there, and where the others are."""
+
+    value: float
+    root: float
+    place: np.ndarray
+
+
+def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
+    """Ends of the intervals in which the profile of the log-likelihood is less than 1.92 below its maximum.
+
+    For every parameter and side: some values outward to the end of the range, the others climbing at each; then the
+    root of the likelihood ratio, which is nearly straight, by secants in the outermost bracket.
+    """
+    low, high = evaluate.ends
+    size = high - low
+    sides = _Sides(evaluate, found.values.max(), shape.place)
+    variance = np.diagonal(shape.covariance)
+    spread = np.minimum(np.sqrt(np.where(np.isfinite(variance), variance, np.inf)), size / 8)
+    for multiple in (1.0, 2.0, 3.5, np.inf):
+        values = [shape.place[j] + s * multiple * spread[j] for j, s in sides.rows]
+        inside = [np.clip(v, low[j], high[j]) for v, (j, _) in zip(values, sides.rows)]
+        sides.follow(dict(zip(sides.rows, inside)))
+    sides.recall()
+    for _ in range(4):
+        brackets = {side: sides.bracket(side) for side in sides.rows}
+        sides.follow({side: _secant(*pair, 0.05) for side, pair in brackets.items() if pair is not None})
+    ends, open_ = np.stack([low, high], axis=1), np.ones((low.size, 2), bool)
+    for j, s in sides.rows:
+        pair = sides.bracket((j, s))
+        if pair is not None:
+            ends[j, (s + 1) // 2], open_[j, (s + 1) // 2] = _secant(*pair, 0.0), False
+    better = sides.highest[1] if sides.highest[0] > sides.best + 1e-6 else None
+    return Profile(ends, open_, better)
+
+
+def _secant(inner: _Row, outer: _Row, margin: float) -> float:
+    """Where the root is 1.96, between two values; not nearer to them than a share of their distance."""
+    share = (_ROOT - inner.root) / max(outer.root - inner.root, 1e-12)
+    return inner.value + (outer.value - inner.value) * np.clip(share, margin, 1 - margin)
+
+
+class _Sides:
+    """What is known of the profiles on both sides of each parameter; a side is a parameter and -1 or 1."""
+
+    def __init__(self, evaluate: Evaluator, best: float, place: np.ndarray):
+        self.evaluate, self.best = evaluate, best
+        self.rows = {(j, s): [_Row(place[j], 0.0, place)] for j in range(place.size) for s in (-1, 1)}
+        self.highest = (-np.inf, None)
+
+    def follow(self, wanted: dict[tuple[int, int], float]) -> None:
+        """Climb with one parameter held at a value, for each of some sides: from the nearest place on the profile, and
+        from the best of all places nearby."""
+        if not wanted:
+            return
+        begin, free = [], []
+        for (j, s), value in wanted.items():
+            nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
+            for place in (nearest.place, self._nearby(j, value, abs(nearest.value - value), nearest.place)):
+                held = np.arange(place.size) == j
+                begin.append(np.where(held, value, place))
+                free.append(~held)
+        low, high = self.evaluate.ends
+        inner = np.clip(begin, low + _AWAY * (high - low), high - _AWAY * (high - low))
+        points = self.evaluate.points(np.where(free, inner, begin))
+        group = np.repeat(np.arange(len(wanted)), 2)
+        reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-3, group=group)
+        places, values = self.evaluate.places(reached.points), reached.values
+        for number, (side, value) in enumerate(wanted.items()):
+            best = 2 * number + int(values[2 * number + 1] > values[2 * number])
+            self.rows[side].append(_Row(value, np.sqrt(2 * max(self.best - values[best], 0.0)), places[best]))
+        top = int(np.argmax(values))
+        self.highest = max(self.highest, (values[top], reached.points[top]), key=lambda pair: pair[0])
+
+    def recall(self) -> None:
+        """Add to each side the outermost of all known places that are within 95 %: it may lie beyond a valley."""
+        places, values = self.evaluate.known
+        within = values > self.best - _RATIO
+        places, values = places[within], values[within]
+        for (j, s), rows in self.rows.items():
+            if values.size:
+                i = np.argmax(s * places[:, j])
+                rows.append(_Row(places[i, j], np.sqrt(2 * max(self.best - values[i], 0.0)), places[i]))
+
+    def _nearby(self, j: int, value: float, reach: float, otherwise: np.ndarray) -> np.ndarray:
+        """The best place known with parameter `j` nearer to a value than to that of a row so far away."""
+        places, values = self.evaluate.known
+        near = np.abs(places[:, j] - value) <= reach / 2
+        return places[near][np.argmax(values[near])] if near.any() else otherwise
+
+    def bracket(self, side: tuple[int, int]) -> tuple[_Row, _Row] | None:
+        """The outermost neighbours between which the root passes 1.96; None if the last is below it."""
+        rows = sorted(self.rows[side], key=lambda row: side[1] * row.value)
+        if rows[-1].root < _ROOT:
+            return None
+        inside = max(i for i, row in enumerate(rows) if row.root < _ROOT)
+        return rows[inside], rows[inside + 1]

@@ -1,0 +1,186 @@
+"""What is looked for: unknown parameters of a motion, their ranges and priors, and the likelihood over them."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact
+
+from jaxrock._checks import finite, positive, scalar
+from jaxrock.inverse.likelihood import Likelihood
+
+Real = Inexact[Array, "..."]
+
+
+_LANES = 4  # points in one call of the compiled program
+
+
+_FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
+
+
+class Unknown(eqx.Module):
+    """A parameter that is looked for, and where.
+
+    **Arguments:**
+
+    - `low`, `high`: the range, in the unit of the parameter; positive if `log`.
+    - `log`: whether it is searched, and its prior is uniform, in its logarithm (default) or in itself.
+    - `prior`: median and standard deviation of a normal prior on the logarithm (or on itself); None: a uniform one,
+      with which the fit is that of maximum likelihood.
+
+    **Raises:** ValueError for values outside their ranges, and for a prior more than five standard deviations away from
+    the range.
+    """
+
+    low: Real
+    high: Real
+    prior: tuple[Real, Real] | None
+    log: bool = eqx.field(static=True)
+
+    def __init__(
+        self, low: ArrayLike, high: ArrayLike, log: bool = True, prior: tuple[ArrayLike, ArrayLike] | None = None
+    ):
+        check = positive if log else finite
+        self.low, self.high = (scalar(name, check(name, x)) for name, x in (("low", low), ("high", high)))
+        if not self.low < self.high:
+            raise ValueError(f"Argument `high` must be above `low`, but is {high} with {low}.")
+        self.log = log
+        if prior is not None and np.shape(prior) != (2,):
+            raise ValueError(f"Argument `prior` must be a median and a standard deviation, but is {prior!r}.")
+        self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
+        if prior is not None and not _FARTHEST >= self._away:
+            found = f"{prior} with a range of {low} to {high}"
+            raise ValueError(f"Argument `prior` must be within five standard deviations of the range, but is {found}.")
+
+    @property
+    def ends(self) -> Float[Array, "2"]:
+        """Both ends of the range, as logarithms if `log`."""
+        ends = jnp.stack([self.low, self.high])
+        return jnp.log(ends) if self.log else ends
+
+    @property
+    def _middle(self) -> Real:
+        """The place of the prior's median."""
+        return jnp.log(self.prior[0]) if self.log else self.prior[0]
+
+    @property
+    def _away(self) -> Real:
+        """How far the range is from the prior's median, in its standard deviations."""
+        low, high = self.ends
+        return jnp.maximum(low - self._middle, self._middle - high) / self.prior[1]
+
+    def log_prior(self, place: Real) -> Real:
+        """Logarithm of the prior's density at a place in the range, but for a constant."""
+        if self.prior is None:
+            return jnp.zeros_like(place)
+        return -(((place - self._middle) / self.prior[1]) ** 2) / 2
+
+
+class Problem(eqx.Module):
+    """A likelihood and the parameters that are unknown in it; places are their logarithms, or they themselves."""
+
+    likelihood: Likelihood
+    unknowns: dict[str, Unknown]
+
+    def __check_init__(self):
+        for name, unknown in self.unknowns.items():
+            if isinstance(unknown, (int, float, tuple, list)):
+                raise ValueError(f"Argument `unknowns` must hold an `Unknown` for `{name}`, but holds {unknown!r}.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The unknown parameters, in the order of coordinates."""
+        return tuple(self.unknowns)
+
+    @property
+    def ends(self) -> Float[Array, "parameters 2"]:
+        """Ranges of the places: logarithms of parameters, or parameters themselves."""
+        return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
+
+    def values(self, places: Real) -> dict[str, Real]:
+        """Parameters by name."""
+        return {
+            name: jnp.exp(places[..., i]) if unknown.log else places[..., i]
+            for i, (name, unknown) in enumerate(self.unknowns.items())
+        }
+
+    def log_prior(self, places: Real) -> Real:
+        """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
+        return sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
+
+    def log_density(self, places: Real, slopes: bool = True) -> Real:
+        """Log-likelihood and log-prior (by the places) at places, (..., parameters); with first derivatives."""
+        terms = self.likelihood.log_terms(self.values(places), slopes)
+        return jnp.sum(terms, axis=-1) + self.log_prior(places)
+
+
+@eqx.filter_jit
+def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
+    def density(places):
+        terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
+        return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
+
+    # The places do not depend on one another, so that the slopes of the sum are those of each.
+    value, back, facts = jax.vjp(density, places, has_aux=True)
+    return value, back(jnp.ones_like(value))[0], facts
+
+
+def in_batches(
+    function: Callable, places: np.ndarray, lanes: int, progress: Callable[[int], None] = lambda more: None
+) -> list[np.ndarray]:
+    """Results of `function`, each (n, ...), at any number of places, (n, parameters): so many of them at a time that
+    one compiled program serves for all."""
+    found = []
+    for begin in range(0, len(places), lanes):
+        part = places[begin : begin + lanes]
+        padded = np.pad(part, ((0, lanes - len(part)), (0, 0)), mode="edge")
+        found.append([np.asarray(x)[: len(part)] for x in function(padded)])
+        progress(len(part))
+    return [np.concatenate(x) for x in zip(*found)]
+
+
+class Evaluator:
+    """Values and slopes at any number of points, in batches of one compiled program; it counts.
+
+    Points are angles, with places at low + (high - low) (1 + sin angle)/2: all of space is allowed, and a maximum at
+    the end of a range is one like others, where the slope vanishes and the curvature does not.
+    """
+
+    def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
+        self.problem, self.count, self.progress = problem, 0, progress
+        self.ends = np.asarray(problem.ends).T
+        self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
+
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, slopes = self.at(self.places(points))
+        low, high = self.ends
+        return values, slopes * (high - low) * np.cos(points) / 2
+
+    def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and slopes at places, and by them."""
+        values, slopes = in_batches(lambda part: _batch(self.problem, part)[:2], places, _LANES, self.progress)
+        self.count += len(places)
+        self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
+        return values, slopes
+
+    @property
+    def lowest(self) -> float:
+        """The lowest value that was met."""
+        return float(np.min(self.known[1], initial=np.inf, where=np.isfinite(self.known[1])))
+
+    def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
+        """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
+        self.count += 1
+        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(place, (_LANES, 1)))[2])
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """Places of points."""
+        low, high = self.ends
+        return low + (high - low) * (1 + np.sin(points)) / 2
+
+    def points(self, places: np.ndarray) -> np.ndarray:
+        """Points of places, and of those outside the ranges the points at their ends."""
+        low, high = self.ends
+        return np.arcsin(np.clip(2 * (places - low) / (high - low) - 1, -1.0, 1.0))

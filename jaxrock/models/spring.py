@@ -1,0 +1,63 @@
+"""Rigid columns on a rotational spring."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxrock._checks import checked, one_of
+from jaxrock.blocks.rigid import Block, Side
+from jaxrock.models.coefficients import Table
+from jaxrock.numerics.elementary import sine_cosine
+
+
+class Spring(eqx.Module):
+    """A rigid column on a rotational spring without play: the spring models of a rigid block.
+
+    **Arguments:**
+
+    - `kind`: `"SM1"` (the mass at a distance R above the spring), `"SM2"` (the mass at the pivot, shaken by a moment)
+      or `"SM3"` (the mass at the height R cos(alpha) above the spring); all with the block's moment of inertia.
+    - `law`: moment of the spring over m g R at the opening angle x: `"sine"`: sin(alpha - x), the block's own;
+      `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight
+      of the leaning column pulls by sin(x) (SM1) or cos(alpha) sin(x) (SM2, SM3).
+
+    All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
+    differ by the law "plastic" alone. It balances at x = alpha (SM1), or where sin(x) = tan(alpha) (SM2, SM3): there
+    alpha must be below pi/4, for a stouter block on this spring never overturns.
+
+    Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
+    SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.
+
+    Under vertical motion a spring is not a block: its moment does not change with the weight. That raises ValueError.
+
+    The rigid multi-mass model (mmSM) of n lumped masses is "SM1" of a block with p/sqrt(1 + 1/(2 (n - 1)^2)).
+
+    **Raises:** ValueError for other words; at use, for a block of alpha >= pi/4 where that is not allowed.
+
+    **Source:** Diamantopoulos & Fragiadakis (2017), equations 4-6 (SM1), 7-9 (SM2), 10-12 (SM3), 13-15 (mmSM).
+    """
+
+    kind: str = eqx.field(static=True)
+    law: str = eqx.field(static=True)
+
+    def __init__(self, kind: str = "SM1", law: str = "linear"):
+        self.kind = one_of("kind", kind, ("SM1", "SM2", "SM3"))
+        self.law = one_of("law", law, ("sine", "linear", "plastic"))
+
+    def table(self, block: Block | Side) -> Table:
+        """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""
+        alpha = block.alpha
+        if self.law == "plastic" and self.kind != "SM1":
+            message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
+            alpha = checked("block.alpha", alpha, message, lambda angle: angle < jnp.pi / 4)
+        sine, cosine = sine_cosine(alpha)
+        if self.law == "sine":
+            return Table(rs=-cosine, rc=sine, mc=cosine)  # D&F 2017, 4, 7, 10
+        if self.law == "linear":
+            return Table(r0=sine, r1=-sine / alpha, mc=cosine)  # D&F 2017, 5, 8, 11
+        weight = jnp.ones_like(alpha) if self.kind == "SM1" else cosine
+        return Table(r0=sine, rs=-weight, mc=cosine)  # D&F 2017, 6; 9, 12
+
+    @property
+    def falls_flat(self) -> bool:
+        """Whether a rotation of pi/2 means that the column lies on the ground."""
+        return True

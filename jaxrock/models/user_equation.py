@@ -1,0 +1,170 @@
+"""An equation of motion of the user's own, written as functions."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxrock.blocks.rigid import Block, Side
+from jaxrock.models.coefficients import Angle, Scalar, Table
+from jaxrock.models.rigid import Housner, Linear
+from jaxrock.models.spring import Spring
+
+
+class Equation(eqx.Module):
+    """A model of your own, written as functions; the diffrax engine solves it.
+
+    With the opening angle x = |rotation| [rad], velocity v = dx/d(p t), side s and ground acceleration u [g]:
+
+        d^2x/d(p t)^2 = -[restoring(x, block) + s u arm(x, block) + dissipation(x, v, block)]
+
+    **Arguments:**
+
+    - `restoring`: restoring moment over m g R; positive at x = 0. Its first zero is the unstable equilibrium.
+    - `arm`: overturning arm over R; positive at x = 0. None: 1.
+    - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
+    - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
+    - `falls_flat`: whether a rotation of pi/2 means that the block lies on its side.
+
+    A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
+
+    The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
+    Equinox modules may carry parameters to differentiate. A block that has stopped below its unstable equilibrium
+    after the motion counts as safe: what dissipates does not lift.
+
+    **Raises:** ValueError where neither or both ways are used.
+    """
+
+    _acceleration: "_Function"
+    falls_flat: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        restoring: Callable | None = None,
+        arm: Callable | None = None,
+        dissipation: Callable | None = None,
+        *,
+        acceleration: Callable | None = None,
+        falls_flat: bool = True,
+    ):
+        if (restoring is None) == (acceleration is None) or (acceleration is not None and (arm or dissipation)):
+            raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
+        parts = (restoring, arm, dissipation) if acceleration is None else (acceleration,)
+        self._acceleration = _Function(parts)
+        self.falls_flat = falls_flat
+
+    def table(self, block: Block | Side) -> "EquationTable":
+        """What the engine asks of the equation, for one block."""
+        return EquationTable(self._acceleration, block)
+
+
+class _Function(eqx.Module):
+    """Functions, as leaves where they are modules (with parameters) and static where they are plain."""
+
+    modules: tuple
+    plain: tuple = eqx.field(static=True)
+
+    def __init__(self, parts: tuple):
+        self.modules = tuple(f if isinstance(f, eqx.Module) else None for f in parts)
+        self.plain = tuple(None if isinstance(f, eqx.Module) else f for f in parts)
+
+    def __call__(self, x: Scalar, v: Scalar, push: Scalar, block: Block | Side) -> Scalar:
+        parts = [m if m is not None else f for m, f in zip(self.modules, self.plain)]
+        if len(parts) == 1:
+            return parts[0](x, v, push, block)
+        restoring, arm, dissipation = parts
+        moment = restoring(x, block) + push * (1.0 if arm is None else arm(x, block))
+        return -moment if dissipation is None else -moment - dissipation(x, v, block)
+
+
+class EquationTable(eqx.Module):
+    """What a `Table` tells, for a model that is given as functions."""
+
+    function: _Function
+    block: Block | Side
+    factor: Scalar | None  # of all accelerations (see `Table.times`)
+    restoring_at_rest: Scalar
+    arm_at_rest: Scalar
+    saddle: Scalar  # first zero of the restoring moment, at most pi/2
+
+    def __init__(self, function: _Function, block: Block | Side, factor: Scalar | None = None):
+        self.function, self.block, self.factor = function, block, factor
+        zero = Angle.of(jnp.zeros_like(block.alpha))
+        self.restoring_at_rest = eqx.error_if(
+            self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."
+        )
+        self.arm_at_rest = eqx.error_if(
+            self.arm(zero), self.arm(zero) <= 0, "The overturning arm must be positive at rotation 0."
+        )
+        self.saddle = self._first_zero()
+
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        value = self._value(angle, velocity, push)
+        return value if weight is None else value - (weight - 1) * self.restoring(angle)
+
+    def _value(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
+        value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
+        return value if self.factor is None else self.factor * value
+
+    def times(self, factor: Scalar) -> "EquationTable":
+        """As in `Table`."""
+        return EquationTable(self.function, self.block, factor)
+
+    def restoring(self, angle: Angle) -> Scalar:
+        """Restoring moment over m g R at an opening angle."""
+        zero = jnp.zeros_like(angle.value)
+        return -self._value(angle, zero, zero)
+
+    def arm(self, angle: Angle) -> Scalar:
+        """Overturning moment over m R u g at an opening angle."""
+        zero = jnp.zeros_like(angle.value)
+        return self._value(angle, zero, zero) - self._value(angle, zero, zero + 1)
+
+    def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """How fast nearby angles part, per angle."""
+        zero = jnp.zeros_like(angle.value)
+        return jax.grad(lambda x: self.acceleration(Angle.of(x), zero, push, weight))(angle.value)
+
+    @property
+    def stiffness(self) -> Scalar:
+        """One, or the factor: nothing else is known of the shape of the function."""
+        return jnp.ones_like(self.saddle) if self.factor is None else self.factor
+
+    @property
+    def threshold(self) -> Scalar:
+        """Ground acceleration at which the block uplifts [g]."""
+        return self.restoring_at_rest / self.arm_at_rest
+
+    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
+        """As in `Table`."""
+        return Table.change_at_rest(self, horizontal, vertical)
+
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """As in `Table`; infinite, because nothing is known of the function beyond this angle."""
+        return jnp.full_like(hold, jnp.inf)
+
+    def _first_zero(self) -> Scalar:
+        """Where the block balances: a scan, bisection, and a Newton step that carries the derivatives."""
+
+        def moment(x):
+            return self.restoring(Angle.of(x))
+
+        grid = jnp.linspace(0.0, jnp.pi / 2, 257, dtype=self.block.alpha.dtype)
+        falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
+        first = jnp.argmax(falls)
+
+        def halve(_, bracket):
+            low, high = bracket
+            middle = (low + high) / 2
+            above = jax.lax.stop_gradient(moment(middle)) > 0
+            return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+        low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
+        low = jax.lax.stop_gradient(low)
+        root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
+        return jnp.where(jnp.any(falls), root, jnp.pi / 2)
+
+
+Model = Housner | Linear | Spring | Equation

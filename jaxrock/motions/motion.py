@@ -1,0 +1,329 @@
+"""Ground motions: what every motion must tell the engines, and motions made of motions.
+
+A motion is smooth on pieces. It gives the times that separate them (`knots`), for each piece a time
+scale and a bound of its acceleration, and its Taylor series at any point of a piece. Accelerations are
+in units of g; positive acceleration drives negative rotation.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact, Int
+
+from jaxrock._checks import Values, checked, finite
+from jaxrock.numerics.polynomial import horner, rescaled, shifted
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+class Shaking(NamedTuple):
+    """Taylor coefficients of the ground's acceleration [g]; `vertical` (upward) is None where there is none."""
+
+    horizontal: list[Scalar]
+    vertical: list[Scalar] | None = None
+
+    def each(self, function) -> "Shaking":
+        """The same with the coefficients that a function makes of those of each component."""
+        return Shaking(function(self.horizontal), None if self.vertical is None else function(self.vertical))
+
+    def at(self, x: Scalar) -> tuple[Scalar, Scalar | None]:
+        """Horizontal acceleration [g], and the weight of a mass over that at rest (None: 1), at x units of time."""
+        return horner(self.horizontal, x), None if self.vertical is None else 1 + horner(self.vertical, x)
+
+    @property
+    def now(self) -> tuple[Scalar, Scalar | None]:
+        """As `at` no time at all."""
+        return self.horizontal[0], None if self.vertical is None else 1 + self.vertical[0]
+
+    def rescaled(self, length: Scalar) -> "Shaking":
+        """Coefficients in time/length."""
+        return self.each(lambda terms: rescaled(terms, length))
+
+    def shifted(self, by: Scalar) -> "Shaking":
+        """Coefficients about a time `by` later."""
+        return self.each(lambda terms: shifted(terms, by))
+
+    def steepest(self, within: Scalar | float = 1.0) -> tuple[Scalar, Scalar | None]:
+        """Bounds of how fast the components change in so many units of time, per unit."""
+
+        def bound(terms):
+            slopes = [k * jnp.abs(c) for k, c in enumerate(terms)][1:]
+            return horner(slopes or [jnp.zeros_like(terms[0])], within)
+
+        return bound(self.horizontal), None if self.vertical is None else bound(self.vertical)
+
+
+class AbstractMotion(eqx.Module):
+    """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
+
+    @property
+    @abc.abstractmethod
+    def knots(self) -> Inexact[Array, " knots"]:
+        """Times that bound the smooth pieces, from 0 to the end of the motion [s], never decreasing."""
+
+    @property
+    @abc.abstractmethod
+    def scales(self) -> Inexact[Array, " pieces"]:
+        """Time in which the acceleration of each piece changes [s]; infinite for a straight line."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> Inexact[Array, " pieces"]:
+        """An upper bound of the absolute acceleration within each piece [g]."""
+
+    @abc.abstractmethod
+    def series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
+        """Taylor coefficients of the acceleration [g] about `local` seconds after knot `piece`.
+
+        Coefficient k multiplies (elapsed time / unit)^k. A motion that is a polynomial returns
+        fewer than order + 1 coefficients: the others are zero.
+        """
+
+    @property
+    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
+        """An upper bound of the absolute vertical acceleration within each piece [g]; None: the ground has none."""
+        return None
+
+    def vertical_series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
+        """As `series`, of the vertical acceleration, positive upward [g]."""
+        return None
+
+    @property
+    def end(self) -> Scalar:
+        """Time at which the ground comes to rest [s]."""
+        return self.knots[-1]
+
+    def acceleration(self, time: Values) -> Inexact[Array, "..."]:
+        """Ground acceleration.
+
+        **Arguments:**
+
+        - `time`: any shape, time from the start of the motion [s].
+
+        **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
+        value after it.
+        """
+        time = jnp.asarray(time, self.knots.dtype)
+        knots = self.knots
+
+        def at(t):
+            piece = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+            value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
+            return jnp.where((t >= 0) & (t < knots[-1]), value, 0.0)
+
+        return jax.vmap(at)(time.ravel()).reshape(time.shape)
+
+    def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
+        """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
+        return WithVertical(self, vertical)
+
+    def shifted(self, delay: ArrayLike) -> "Shifted":
+        """The same motion after `delay` seconds of quiet (0 or more)."""
+        return Shifted(self, delay)
+
+    def __mul__(self, factor: ArrayLike) -> "Scaled":
+        return Scaled(self, factor)
+
+    def __rmul__(self, factor: ArrayLike) -> "Scaled":
+        return Scaled(self, factor)
+
+    def __neg__(self) -> "Scaled":
+        return Scaled(self, -1.0)
+
+    def __add__(self, other: "AbstractMotion") -> "Summed":
+        return Summed(self, other)
+
+    def __sub__(self, other: "AbstractMotion") -> "Summed":
+        return Summed(self, -other)
+
+
+class Scaled(AbstractMotion):
+    """A motion times a factor (`factor * motion`)."""
+
+    motion: AbstractMotion
+    factor: Inexact[Array, "..."]
+
+    def __init__(self, motion: AbstractMotion, factor: ArrayLike):
+        self.motion = motion
+        self.factor = finite("factor", factor)
+
+    @property
+    def knots(self):
+        return self.motion.knots
+
+    @property
+    def scales(self):
+        return self.motion.scales
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.factor) * self.motion.bounds
+
+    def series(self, piece, local, unit, order):
+        return [self.factor * u for u in self.motion.series(piece, local, unit, order)]
+
+    @property
+    def vertical_bounds(self):
+        bounds = self.motion.vertical_bounds
+        return None if bounds is None else jnp.abs(self.factor) * bounds
+
+    def vertical_series(self, piece, local, unit, order):
+        terms = self.motion.vertical_series(piece, local, unit, order)
+        return None if terms is None else [self.factor * v for v in terms]
+
+
+class Shifted(AbstractMotion):
+    """A motion after `delay` seconds of quiet (`motion.shifted(delay)`)."""
+
+    motion: AbstractMotion
+    delay: Inexact[Array, "..."]
+
+    def __init__(self, motion: AbstractMotion, delay: ArrayLike):
+        self.motion = motion
+        self.delay = checked("delay", delay, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+
+    @property
+    def knots(self):
+        knots = self.motion.knots + self.delay
+        return jnp.concatenate([jnp.zeros_like(knots[:1]), knots])
+
+    @property
+    def scales(self):
+        scales = self.motion.scales
+        return jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
+
+    @property
+    def bounds(self):
+        return self._after_quiet(self.motion.bounds)
+
+    @property
+    def vertical_bounds(self):
+        bounds = self.motion.vertical_bounds
+        return None if bounds is None else self._after_quiet(bounds)
+
+    @staticmethod
+    def _after_quiet(bounds):
+        return jnp.concatenate([jnp.zeros_like(bounds[:1]), bounds])
+
+    def series(self, piece, local, unit, order):
+        inner = self.motion.series(jnp.maximum(piece - 1, 0), local, unit, order)
+        return [jnp.where(piece > 0, u, 0.0) for u in inner]
+
+    def vertical_series(self, piece, local, unit, order):
+        inner = self.motion.vertical_series(jnp.maximum(piece - 1, 0), local, unit, order)
+        return None if inner is None else [jnp.where(piece > 0, v, 0.0) for v in inner]
+
+
+class _Pieces(NamedTuple):
+    """Where the pieces of one motion lie among the finer ones of two."""
+
+    motion: AbstractMotion
+    knots: Inexact[Array, " knots"]  # of both
+
+    def inside(self, middle: Inexact[Array, "..."]):
+        """Piece of the motion at a time strictly between knots, and whether it moves then."""
+        piece = jnp.searchsorted(self.motion.knots, middle, side="right") - 1
+        last = self.motion.knots.size - 2
+        return jnp.clip(piece, 0, last), (piece >= 0) & (piece <= last)
+
+    def spread(self, values: Inexact[Array, " pieces"], quiet: float) -> Inexact[Array, " finer"]:
+        """Values of the motion's pieces for the finer ones; `quiet` where it does not move."""
+        piece, moving = self.inside((self.knots[:-1] + self.knots[1:]) / 2)
+        return jnp.where(moving, values[piece], quiet)
+
+    def series(self, series, piece, local, unit, order) -> list[Scalar] | None:
+        """What `series`, the motion's horizontal or vertical one, gives in a finer piece."""
+        inner, moving = self.inside((self.knots[piece] + self.knots[piece + 1]) / 2)
+        offset = self.knots[piece] - self.motion.knots[inner] + local
+        terms = series(inner, offset, unit, order)
+        return None if terms is None else [jnp.where(moving, u, 0.0) for u in terms]
+
+
+def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None:
+    """Coefficients of a sum; None is zero."""
+    if first is None or second is None:
+        return first if second is None else second
+    longer, shorter = (first, second) if len(first) > len(second) else (second, first)
+    return [a + b for a, b in zip(longer, shorter)] + longer[len(shorter) :]
+
+
+class Summed(AbstractMotion):
+    """The sum of two motions (`motion + motion`); its pieces end wherever a piece of either ends."""
+
+    first: AbstractMotion
+    second: AbstractMotion
+
+    @property
+    def knots(self):
+        return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
+
+    @property
+    def _parts(self) -> tuple[_Pieces, _Pieces]:
+        return _Pieces(self.first, self.knots), _Pieces(self.second, self.knots)
+
+    @property
+    def scales(self):
+        return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
+
+    @property
+    def bounds(self):
+        return sum(part.spread(part.motion.bounds, 0.0) for part in self._parts)
+
+    def series(self, piece, local, unit, order):
+        return sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts))
+
+    @property
+    def vertical_bounds(self):
+        found = [(part, part.motion.vertical_bounds) for part in self._parts]
+        found = [part.spread(bounds, 0.0) for part, bounds in found if bounds is not None]
+        return sum(found) if found else None
+
+    def vertical_series(self, piece, local, unit, order):
+        return sum_of_series(
+            *(part.series(part.motion.vertical_series, piece, local, unit, order) for part in self._parts)
+        )
+
+
+class WithVertical(AbstractMotion):
+    """A horizontal motion together with a vertical one (`horizontal.with_vertical(vertical)`).
+
+    **Arguments:**
+
+    - `horizontal`: as any motion, positive acceleration drives negative rotation.
+    - `vertical`: positive upward [g]; it makes the block heavier. Where it comes to -1 g the block leaves the ground,
+      which is no longer rocking: see `contact_forces`.
+
+    Both begin at time 0. What scales or shifts the motion scales or shifts both.
+    """
+
+    horizontal: AbstractMotion
+    vertical: AbstractMotion
+
+    @property
+    def knots(self):
+        return jnp.sort(jnp.concatenate([self.horizontal.knots, self.vertical.knots]))
+
+    @property
+    def _parts(self) -> tuple[_Pieces, _Pieces]:
+        return _Pieces(self.horizontal, self.knots), _Pieces(self.vertical, self.knots)
+
+    @property
+    def scales(self):
+        return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
+
+    @property
+    def bounds(self):
+        return self._parts[0].spread(self.horizontal.bounds, 0.0)
+
+    def series(self, piece, local, unit, order):
+        return self._parts[0].series(self.horizontal.series, piece, local, unit, order)
+
+    @property
+    def vertical_bounds(self):
+        return self._parts[1].spread(self.vertical.bounds, 0.0)
+
+    def vertical_series(self, piece, local, unit, order):
+        return self._parts[1].series(self.vertical.series, piece, local, unit, order)

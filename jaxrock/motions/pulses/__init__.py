@@ -1,0 +1,26 @@
+"""Pulses: one family a file. What a file here defines is a pulse of the package: public, and known to the command line.
+
+Imports `motions.motion` and `numerics`. Start with `pulse`, then `sinusoidal`.
+"""
+
+import importlib
+import pkgutil
+
+from jaxrock.motions.pulses.pulse import AbstractPulse
+
+
+def _defined() -> dict[str, type[AbstractPulse]]:
+    """Every pulse that a module of this folder defines, by the name of its class."""
+    names = sorted(f"{__name__}.{found.name}" for found in pkgutil.iter_modules(__path__))
+    kinds = [kind for name in names for kind in vars(importlib.import_module(name)).values()]
+    return {
+        kind.__name__: kind
+        for kind in kinds
+        if isinstance(kind, type) and issubclass(kind, AbstractPulse) and kind is not AbstractPulse
+    }
+
+
+_KINDS = _defined()
+PULSES = {kind.word(): kind for kind in _KINDS.values()}  # by the word of the command line
+globals().update(_KINDS)
+__all__ = [*_KINDS, "PULSES"]

@@ -1,0 +1,167 @@
+"""Single-lobe pulses: rectangle, triangle, and the exponential family that holds both."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Int
+
+from jaxrock._checks import finite, not_nan, positive
+from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.numerics.lookup import pick
+
+
+class RectangularPulse(AbstractPulse):
+    """Constant `amplitude` [g] for `duration` [s] (positive): the limit shape -> -inf of `ExponentialPulse`."""
+
+    amplitude: Real
+    duration: Real
+
+    @classmethod
+    def word(cls) -> str:
+        """What the command line calls it."""
+        return "rectangle"
+
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.duration = positive("duration", duration)
+
+    @property
+    def knots(self):
+        return one_piece(self.duration)
+
+    @property
+    def scales(self):
+        return jnp.full_like(self.knots[1:], jnp.inf)
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.amplitude)[None]
+
+    def series(self, piece, local, unit, order):
+        return [self.amplitude + 0.0 * local]
+
+
+class TriangularPulse(AbstractPulse):
+    """Straight up to `amplitude` [g] at mid `duration` [s] and straight down: shape 0 of `ExponentialPulse`."""
+
+    amplitude: Real
+    duration: Real
+
+    @classmethod
+    def word(cls) -> str:
+        """What the command line calls it."""
+        return "triangle"
+
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.duration = positive("duration", duration)
+
+    @property
+    def knots(self):
+        return jnp.stack([jnp.zeros_like(self.duration), self.duration / 2, self.duration])
+
+    @property
+    def scales(self):
+        return jnp.full_like(self.knots[1:], jnp.inf)
+
+    @property
+    def bounds(self):
+        return jnp.stack([jnp.abs(self.amplitude)] * 2)
+
+    def series(self, piece, local, unit, order):
+        slope = 2 * self.amplitude / self.duration
+        rising = piece == 0
+        value = jnp.where(rising, slope * local, self.amplitude - slope * local)
+        return [value, jnp.where(rising, slope, -slope) * unit][: order + 1]
+
+
+def _growth_ratio(x: Real) -> Real:
+    """(e^x - 1)/x for x <= 0, smooth through 0."""
+    small = jnp.abs(x) < 1e-2
+    far = jnp.where(small, -1.0, x)
+    near = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
+    return jnp.where(small, near, jnp.expm1(far) / far)
+
+
+class ExponentialPulse(AbstractPulse):
+    """The single-lobe pulse family that runs from rectangle through triangle to spike.
+
+    With x = time/duration, u = amplitude (1 - e^(2 shape x))/(1 - e^shape) up to x = 1/2, then mirrored.
+
+    **Arguments:**
+
+    - `amplitude`: peak acceleration [g]; positive drives negative rotation.
+    - `duration`: [s], positive.
+    - `shape`: from -inf (rectangle) through 0 (triangle) to +inf (spike, which moves nothing).
+
+    Smooth and differentiable in all three, also at shape 0. **Raises:** ValueError for a
+    duration that is not positive, or NaN.
+
+    **Source:** Voyagaki, Psycharis & Mylonakis (2012), equation 2.1, with the opposite sign of the motion.
+    """
+
+    amplitude: Real
+    duration: Real
+    shape: Real
+
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.duration = positive("duration", duration)
+        self.shape = not_nan("shape", shape)
+
+    @property
+    def _layer(self) -> Real:
+        """Part of the duration in which the exponential is not yet negligible (e^-40), at most one half.
+
+        Outside the layers the pulse is constant to rounding. They get pieces of their own, so that a
+        pulse of any shape costs a bounded number of steps.
+        """
+        return 20.0 / jnp.maximum(jnp.abs(self.shape), 40.0)
+
+    @property
+    def knots(self):
+        # The layers of a rectangle-like pulse lie at both ends; those of a spike on both sides of the peak.
+        inner = jnp.where(self.shape > 0, 0.5 - self._layer, self._layer)
+        zero = jnp.zeros_like(inner)
+        return self.duration * jnp.stack([zero, inner, zero + 0.5, 1 - inner, zero + 1])
+
+    def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
+        """Whether a piece is a layer; one thinner than rounding is left out."""
+        middle = (piece == 1) | (piece == 2)
+        in_layer = jnp.where(self.shape > 0, middle, ~middle)
+        return in_layer & (jnp.abs(self.shape) < 1e24)
+
+    @property
+    def scales(self):
+        scale = self.duration / jnp.clip(2 * jnp.abs(self.shape), 1e-3, 1e25)
+        return jnp.where(self._curved(jnp.arange(4)), scale, jnp.inf)
+
+    @property
+    def bounds(self):
+        size = jnp.abs(self.amplitude)
+        outer = jnp.where(self.shape > 40, 0.0, size)
+        return jnp.stack([outer, size, size, outer])
+
+    def series(self, piece, local, unit, order):
+        shape = jnp.clip(self.shape, -1e25, 1e25)
+        layer, y = self._layer, local / self.duration
+        spiked = shape > 0
+        down, up = jnp.where(spiked, 0.0, shape), jnp.where(spiked, shape, 0.0)
+        # Distance from the nearer foot and from the peak, each without cancellation where it matters.
+        foot = pick(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
+        peak = pick(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
+        fall = jnp.exp(2 * down * foot) / _growth_ratio(down)
+        rise = jnp.exp(-2 * up * peak) / _growth_ratio(-up)
+        value_down = 2 * foot * _growth_ratio(2 * down * foot) / _growth_ratio(down)
+        value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
+        # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
+        flat, middle = layer < 0.5, (piece == 1) | (piece == 2)
+        value_up = jnp.where(~middle & flat, 0.0, value_up)
+        value_down = jnp.where(middle & flat, 1.0, value_down)
+        direction = jnp.where(piece < 2, 1.0, -1.0)
+        step = direction * unit / self.duration
+        terms = [self.amplitude * jnp.where(spiked, value_up, value_down)]
+        term = self.amplitude * 2 * jnp.where(spiked, rise, fall) * step
+        curved = self._curved(piece)
+        for k in range(1, order + 1):
+            terms.append(jnp.where(curved, term, 0.0))
+            term = term * 2 * shape * step / (k + 1)
+        return terms

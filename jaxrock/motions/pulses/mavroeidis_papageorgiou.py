@@ -1,0 +1,66 @@
+"""The near-fault pulse of Mavroeidis and Papageorgiou."""
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from jaxrock._checks import checked, finite, positive
+from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.motions.pulses.sinusoidal import sinusoid
+
+
+class MavroeidisPapageorgiouPulse(AbstractPulse):
+    """The near-fault pulse of Mavroeidis & Papageorgiou: a cosine velocity under a cosine bell.
+
+    velocity = V/2 [1 + cos(2 pi x/(oscillations period))] cos(2 pi x/period + phase), x = t - center,
+    |x| <= oscillations period/2; `amplitude` g = 2 pi V/period.
+
+    **Arguments:**
+
+    - `amplitude`: acceleration amplitude 2 pi V/(g period) [g], V the peak of the velocity's envelope.
+    - `period`: [s], positive.
+    - `oscillations`: number of cycles under the bell (gamma of the source), above 1.
+    - `phase`: phase of the cosine [rad] (nu of the source).
+
+    **Raises:** ValueError for a value outside its range.
+
+    **Source:** Mavroeidis & Papageorgiou (2003), equation 3 (velocity); its derivative is used.
+    """
+
+    amplitude: Real
+    period: Real
+    oscillations: Real
+    phase: Real
+
+    def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
+        self.amplitude = finite("amplitude", amplitude)
+        self.period = positive("period", period)
+        self.oscillations = checked(
+            "oscillations", oscillations, "be above 1 and finite", lambda x: (x > 1) & (x < jnp.inf)
+        )
+        self.phase = finite("phase", phase)
+
+    @property
+    def knots(self):
+        return one_piece(self.oscillations * self.period)
+
+    @property
+    def scales(self):
+        return (self.period / (2 * math.pi) / (1 + 1 / self.oscillations))[None]
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.amplitude)[None] * (1 + 0.5 / self.oscillations)
+
+    def series(self, piece, local, unit, order):
+        # The product of cosines is a sum of three: at the period, and at the two side frequencies.
+        time = local - self.oscillations * self.period / 2
+        total = [0.0] * (order + 1)
+        for weight, ratio in ((0.5, 1.0), (0.25, 1 + 1 / self.oscillations), (0.25, 1 - 1 / self.oscillations)):
+            rate = ratio * 2 * math.pi / self.period
+            angle = rate * time + self.phase
+            size = self.amplitude * weight * ratio
+            terms = sinusoid(-size, rate, angle, unit, order, local)
+            total = [a + b for a, b in zip(total, terms)]
+        return total

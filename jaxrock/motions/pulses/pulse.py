@@ -1,0 +1,27 @@
+"""What pulses have in common: an amplitude [g], and a start at time 0."""
+
+import re
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+from jaxrock.motions.motion import AbstractMotion
+
+Real = Inexact[Array, "..."]
+
+
+def one_piece(end: Real) -> Real:
+    """Knots of a motion that is smooth from 0 to `end`."""
+    return jnp.stack([jnp.zeros_like(end), end])
+
+
+class AbstractPulse(AbstractMotion):
+    """A motion that is proportional to its `amplitude` [g]."""
+
+    amplitude: eqx.AbstractVar[Real]
+
+    @classmethod
+    def word(cls) -> str:
+        """What the command line calls it: `half-sine` for `HalfSinePulse`."""
+        return re.sub("(?<=[a-z])(?=[A-Z])", "-", cls.__name__.removesuffix("Pulse")).lower()

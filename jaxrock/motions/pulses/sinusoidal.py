@@ -1,0 +1,108 @@
+"""Pulses that are parts of a sinusoid: half a sine, one cycle of a sine or cosine."""
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from jaxrock._checks import finite, positive
+from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.numerics.elementary import sine_cosine_of_any
+from jaxrock.numerics.xla_cpu import keep
+
+
+def sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, local: Real) -> list[Real]:
+    """Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
+    sine, cosine = sine_cosine_of_any(angle)
+    return harmonic(keep(amplitude * sine, local), keep(amplitude * cosine, local) * rate * unit, rate * unit, order)
+
+
+def harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
+    """Taylor coefficients of the solution of u'' = -rate^2 u with the given value and slope."""
+    terms, square = [value, slope], rate**2
+    for k in range(order - 1):
+        terms.append(square * terms[k] * (-1 / ((k + 1) * (k + 2))))
+    return terms[: order + 1]
+
+
+class HalfSinePulse(AbstractPulse):
+    """amplitude sin(pi t/duration) [g] for `duration` [s] (positive)."""
+
+    amplitude: Real
+    duration: Real
+
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.duration = positive("duration", duration)
+
+    @property
+    def knots(self):
+        return one_piece(self.duration)
+
+    @property
+    def scales(self):
+        return (self.duration / math.pi)[None]
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.amplitude)[None]
+
+    def series(self, piece, local, unit, order):
+        rate = math.pi / self.duration
+        return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
+
+
+class SinePulse(AbstractPulse):
+    """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
+
+    amplitude: Real
+    period: Real
+
+    def __init__(self, amplitude: ArrayLike, period: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.period = positive("period", period)
+
+    @property
+    def knots(self):
+        return one_piece(self.period)
+
+    @property
+    def scales(self):
+        return (self.period / (2 * math.pi))[None]
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.amplitude)[None]
+
+    def series(self, piece, local, unit, order):
+        rate = 2 * math.pi / self.period
+        return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
+
+
+class CosinePulse(AbstractPulse):
+    """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
+
+    amplitude: Real
+    period: Real
+
+    def __init__(self, amplitude: ArrayLike, period: ArrayLike):
+        self.amplitude = finite("amplitude", amplitude)
+        self.period = positive("period", period)
+
+    @property
+    def knots(self):
+        return one_piece(self.period)
+
+    @property
+    def scales(self):
+        return (self.period / (2 * math.pi))[None]
+
+    @property
+    def bounds(self):
+        return jnp.abs(self.amplitude)[None]
+
+    def series(self, piece, local, unit, order):
+        rate = 2 * math.pi / self.period
+        sine, cosine = sine_cosine_of_any(rate * local)
+        value, slope = keep(self.amplitude * cosine, local), keep(-self.amplitude * sine, local) * rate * unit
+        return harmonic(value, slope, rate * unit, order)

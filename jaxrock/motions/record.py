@@ -1,0 +1,69 @@
+"""Accelerograms: straight lines between equally spaced samples."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import Values, finite, positive
+from jaxrock._label import Label
+from jaxrock.motions.motion import AbstractMotion
+
+
+class Record(AbstractMotion):
+    """An accelerogram: straight lines between equally spaced samples.
+
+    **Arguments:**
+
+    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1.
+    - `dt`: time between samples [s], positive.
+    - `name`: where it comes from; shown in tables and figures.
+
+    **Raises:** ValueError for samples that are not a finite one-dimensional array, or dt <= 0.
+
+    Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
+    """
+
+    samples: Inexact[Array, "*batch n"]
+    dt: Inexact[Array, "..."]
+    label: Label = eqx.field(static=True)
+
+    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
+        samples = finite("acceleration", acceleration)
+        if samples.ndim == 0 or samples.shape[-1] == 0:
+            raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
+        self.samples = samples
+        self.dt = positive("dt", dt)
+        self.label = Label(name)
+
+    @property
+    def name(self) -> str:
+        """Where the record comes from."""
+        return self.label.value
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        # A single sample is a piece of no length: the ground never moves.
+        if self.samples.shape[-1] == 1:
+            return jnp.zeros(2, self.samples.dtype)
+        return self.dt * jnp.arange(self.samples.shape[-1])
+
+    @property
+    def _ends(self) -> tuple[Inexact[Array, " pieces"], Inexact[Array, " pieces"]]:
+        """Acceleration at both ends of each piece [g]."""
+        if self.samples.shape[-1] == 1:
+            return self.samples, self.samples
+        return self.samples[:-1], self.samples[1:]
+
+    @property
+    def scales(self) -> Inexact[Array, " pieces"]:
+        return jnp.full_like(self._ends[0], jnp.inf)
+
+    @property
+    def bounds(self) -> Inexact[Array, " pieces"]:
+        left, right = self._ends
+        return jnp.maximum(jnp.abs(left), jnp.abs(right))
+
+    def series(self, piece, local, unit, order):
+        left, right = self._ends
+        slope = (right[piece] - left[piece]) / self.dt
+        return [left[piece] + slope * local, slope * unit][: order + 1]

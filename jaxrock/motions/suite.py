@@ -1,0 +1,95 @@
+"""Suites: many ground motions, of any kinds, with their peaks."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.record import Record
+
+
+class Suite(eqx.Module):
+    """Ground motions of any kinds, with their peaks.
+
+    **Arguments:**
+
+    - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Records are
+      brought to one length by zeros; one that does not end at zero comes to it within one more sample.
+    - `names`: of the motions; None: those of records, or the kind, with numbers.
+
+    `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,).
+
+    **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move.
+    """
+
+    groups: tuple[AbstractMotion, ...]  # each of many motions; of samples that all of it share, there is one set
+    names: tuple[str, ...] = eqx.field(static=True)
+    peak_acceleration: Float[Array, " motions"]
+    peak_velocity: Float[Array, " motions"]
+
+    def __init__(self, motions: Sequence[AbstractMotion], names: Sequence[str] | None = None):
+        motions = tuple(motions)
+        if not motions:
+            raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
+        lengths = [m.samples.shape[-1] for m in motions if isinstance(m, Record)]
+        self.groups = tuple(_ensemble(_padded(m, max(lengths, default=0))) for m in motions)
+        own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
+        self.names = tuple(own if names is None else names)
+        if len(self.names) != len(own):
+            raise ValueError(f"Argument `names` must name {len(own)} motions, but has {len(self.names)} names.")
+        self.peak_acceleration = jnp.concatenate([_each(peak_acceleration, group) for group in self.groups])
+        self.peak_velocity = jnp.concatenate([_each(peak_velocity, group) for group in self.groups])
+        for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
+            if not peak > 0:
+                raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def _padded(motion: AbstractMotion, length: int) -> AbstractMotion:
+    """A record of a given length; any other motion as it is."""
+    if not isinstance(motion, Record):
+        return motion
+    missing = length - motion.samples.shape[-1]
+    return Record(jnp.pad(motion.samples, (0, missing)), motion.dt) if missing else motion
+
+
+def _shared(path) -> bool:
+    return jax.tree_util.keystr(path).endswith(".samples")
+
+
+def _ensemble(motion: AbstractMotion) -> AbstractMotion:
+    """A motion whose numbers all have the shape (n,); samples stay as they are."""
+    leaves = jax.tree_util.tree_leaves_with_path(motion)
+    for path, leaf in leaves:
+        if jnp.ndim(leaf) > 1:
+            raise ValueError(
+                f"Motions of a suite must hold numbers or lists of them, but `{jax.tree_util.keystr(path)}` has shape "
+                f"{jnp.shape(leaf)}."
+            )
+    shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for path, leaf in leaves if not _shared(path)))
+    return jax.tree_util.tree_map_with_path(lambda p, x: x if _shared(p) else jnp.broadcast_to(x, shape), motion)
+
+
+def size_of(group: AbstractMotion) -> int:
+    return next(x.shape[0] for path, x in jax.tree_util.tree_leaves_with_path(group) if not _shared(path))
+
+
+def _names(motion: AbstractMotion, size: int) -> list[str]:
+    name = getattr(motion, "name", "") or type(motion).__name__
+    return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
+
+
+def pick(group, index):
+    """One motion, or block, out of a stack of them."""
+    return jax.tree_util.tree_map_with_path(lambda path, x: x if _shared(path) else x[index], group)
+
+
+def _each(measure: Callable, group: AbstractMotion):
+    return jax.vmap(lambda index: measure(pick(group, index)))(jnp.arange(size_of(group)))

@@ -1,0 +1,326 @@
+"""From a program of scalars, traced by JAX, to LLVM's language: every scalar becomes a vector of lanes. Needs llvmlite.
+
+A small array is a NumPy array of such vectors, so that what moves its elements about takes no instructions.
+Loops go on until the last lane is done, and what is done does not change any more. A case of a condition is skipped
+if no lane is in it. What no loop changes is computed before it.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import Literal
+from llvmlite import ir
+
+from jaxrock.native.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported
+
+SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
+
+
+_KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
+
+
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
+
+
+WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
+
+
+class Memory(NamedTuple):
+    """A list of numbers in memory, of which single ones are looked up."""
+
+    pointer: Any
+    size: int
+    starts: list | None  # where each lane's own begins; None: all look up the same
+
+
+class Emitter:
+    """Writes the instructions of programs into a function of LLVM."""
+
+    def __init__(self, builder: ir.IRBuilder, lanes: int):
+        self.b, self.lanes = builder, lanes
+        self.before = []  # the blocks before the loops that are being written
+        self._depths = {}  # in how many of them a value is made anew, by the identity of the value
+        self._alive = []  # so that identities are not used again
+
+    # Types and small things
+
+    def kind(self, dtype) -> ir.Type:
+        """LLVM's type of one number."""
+        name = np.dtype(dtype).str[1:]
+        if name not in _KINDS:
+            raise Unsupported(f"numbers of type {dtype}")
+        return _KINDS[name]
+
+    def vector(self, dtype) -> ir.VectorType:
+        """LLVM's type of a number per lane."""
+        return ir.VectorType(self.kind(dtype), self.lanes)
+
+    def constant(self, value, dtype):
+        """One number for all lanes."""
+        return self.constant_of(np.asarray(value, dtype)[()], self.vector(dtype))
+
+    def constant_of(self, value, kind: ir.VectorType):
+        """One number for all lanes, of a known type."""
+        value = int(value) if isinstance(kind.element, ir.IntType) else float(value)
+        return ir.Constant(kind, [ir.Constant(kind.element, value)] * self.lanes)
+
+    def intrinsic(self, name: str, *values):
+        """One of LLVM's own functions."""
+        kind = values[0].type
+        short = "f64" if isinstance(kind.element, ir.DoubleType) else "f32"
+        return self.b.call(self._declared(f"llvm.{name}.v{self.lanes}{short}", kind, len(values)), values)
+
+    def each(self, name: str, *values):
+        """A function of the mathematical library, lane by lane."""
+        kind = values[0].type.element
+        function = self._declared(name if isinstance(kind, ir.DoubleType) else name + "f", kind, len(values))
+        return self.gather([self.b.call(function, [self.lane(v, i) for v in values]) for i in range(self.lanes)])
+
+    def _declared(self, name: str, kind, count: int) -> ir.Function:
+        module = self.b.module
+        return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
+
+    def splat(self, scalar):
+        """A number in all lanes."""
+        kind = ir.VectorType(scalar.type, self.lanes)
+        first = self.b.insert_element(ir.Constant(kind, ir.Undefined), scalar, _I32(0))
+        zeros = ir.Constant(ir.VectorType(_I32, self.lanes), [_I32(0)] * self.lanes)
+        return self.b.shuffle_vector(first, ir.Constant(kind, ir.Undefined), zeros)
+
+    def lane(self, vector, i: int):
+        """The number of one lane."""
+        return self.b.extract_element(vector, _I32(i))
+
+    def gather(self, scalars: list):
+        """One vector of a number for each lane."""
+        total = ir.Constant(ir.VectorType(scalars[0].type, self.lanes), ir.Undefined)
+        for i, scalar in enumerate(scalars):
+            total = self.b.insert_element(total, scalar, _I32(i))
+        return total
+
+    def any(self, mask):
+        """Whether any lane is set."""
+        bits = ir.IntType(self.lanes)
+        return self.b.icmp_unsigned("!=", self.b.bitcast(mask, bits), bits(0))
+
+    # Programs
+
+    def run(self, program, arguments: list, active) -> list:
+        """The results of a program (closed) of these arguments; loops in it serve the lanes that are `active`."""
+        jaxpr = getattr(program, "jaxpr", program)
+        values = dict(zip(jaxpr.invars, arguments))
+        for variable, value in zip(jaxpr.constvars, getattr(program, "consts", ())):
+            values[variable] = self.known(value, variable.aval.dtype)
+
+        def read(atom):
+            return self.known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+
+        for equation in jaxpr.eqns:
+            found = self._place(equation, [read(x) for x in equation.invars], active)
+            values.update(zip(equation.outvars, found))
+        return [read(x) for x in jaxpr.outvars]
+
+    def known(self, value, dtype):
+        """A number or an array that is known beforehand."""
+        if isinstance(value, jax.core.Tracer):
+            raise Unsupported("a number from outside")
+        value = np.asarray(value, dtype)
+        if value.size > SMALL**2:
+            raise Unsupported("a large array in the program")
+        return (
+            _each(lambda x: self.constant(x, value.dtype), value) if value.ndim else self.constant(value, value.dtype)
+        )
+
+    def _place(self, equation, inputs: list, active) -> list:
+        """Apply an operation, before the loops that do not change its operands."""
+        if equation.primitive.name in WITH_PROGRAMS:
+            return self._apply(equation, inputs, active)
+        vectors = flat([x for x in inputs if not isinstance(x, Memory)])
+        depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
+        if depth == len(self.before):
+            found = self._apply(equation, inputs, active)
+        else:
+            with self.b.goto_block(self.before[depth]):
+                found = self._apply(equation, inputs, active)
+        self.remember(flat([x for x in found if not isinstance(x, Memory)]), depth)
+        return found
+
+    def remember(self, values: list, depth: int) -> None:
+        """That values are made anew in so many of the loops that are being written."""
+        self._alive += values
+        # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
+        self._depths.update((id(x), min(depth, self._depths.get(id(x), depth))) for x in values)
+
+    def _apply(self, equation, inputs: list, active) -> list:
+        name, parameters = equation.primitive.name, equation.params
+        if name == "while":
+            return self.loop(parameters, inputs, active)[0]
+        if name == "cond":
+            return self._branch(parameters["branches"], inputs, active)
+        if name in WITH_PROGRAMS:
+            return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
+        if isinstance(inputs[0] if inputs else None, Memory):
+            return [self._of_memory(name, parameters, *inputs)]
+        if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
+            raise Unsupported(f"{name} of a long list")
+        if name in MOVES:
+            found = MOVES[name](parameters, *map(boxed, inputs))
+            return [unboxed(x) for x in (found if isinstance(found, list) else [found])]
+        if name in SUMS and boxed(inputs[0]).size:
+            array = boxed(inputs[0])
+            for axis in sorted(parameters["axes"], reverse=True):
+                parts = list(np.moveaxis(array, axis, 0))
+                array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)
+            return [unboxed(array)]
+        if name not in OPERATIONS:
+            raise Unsupported(f"operation {name}")
+        return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
+
+    def _of_memory(self, name: str, parameters: dict, memory, *more):
+        if name == "slice" and not parameters["strides"]:
+            (start,), (stop,) = parameters["start_indices"], parameters["limit_indices"]
+            return Memory(self.b.gep(memory.pointer, [_I64(start)]), stop - start, memory.starts)
+        if name == "squeeze":
+            return self._look_up(memory, self.constant(0, np.int32))
+        if name == "dynamic_slice" and parameters["slice_sizes"] == (1,):
+            return boxed([self._look_up(memory, *more)])
+        if name in NOTHING:
+            return memory
+        raise Unsupported(f"{name} of a long list")
+
+    def _look_up(self, memory: Memory, index):
+        # An index outside is moved to the nearest inside, as `dynamic_slice` does.
+        zero, last = (self.constant_of(k, index.type) for k in (0, memory.size - 1))
+        index = self.b.select(self.b.icmp_signed("<", index, zero), zero, index)
+        index = self.b.select(self.b.icmp_signed(">", index, last), last, index)
+        found = []
+        for i in range(self.lanes):
+            place = self.lane(index, i)
+            place = self.b.sext(place, _I64) if place.type != _I64 else place
+            place = place if memory.starts is None else self.b.add(place, memory.starts[i])
+            found.append(self.b.load(self.b.gep(memory.pointer, [place])))
+        return self.gather(found)
+
+    def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
+        """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""
+        n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
+        of_cond, of_body, carry = inputs[:n_cond], inputs[n_cond : n_cond + n_body], inputs[n_cond + n_body :]
+        before, firsts = self.b.block, flat(carry)
+        head, inside, after = (self.b.append_basic_block(name) for name in ("head", "body", "after"))
+        self.b.branch(head)
+        self.b.position_at_end(head)
+        phis = [self.b.phi(x.type) for x in firsts]
+        state = like(carry, phis)
+        self.before.append(before)
+        self.remember(phis, len(self.before))
+        (going,) = self.run(parameters["cond_jaxpr"], [*of_cond, *state], active)
+        going = self.b.and_(going, active)
+        goes = self.any(going)
+        if leaves is not None:
+            goes = self.b.and_(goes, self.b.not_(leaves(going)))
+        self.b.cbranch(goes, inside, after)
+        self.b.position_at_end(inside)
+        found = flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
+        kept = [phi if new is phi else self.b.select(going, new, phi) for new, phi in zip(found, phis)]
+        for phi, first, later in zip(phis, firsts, kept):
+            phi.add_incoming(first, before)
+            phi.add_incoming(later, self.b.block)
+        self.b.branch(head)
+        self.b.position_at_end(after)
+        self.before.pop()
+        self.remember(phis, len(self.before))  # they change no more
+        return state, going
+
+    def _branch(self, branches, inputs: list, active) -> list:
+        which, *inputs = inputs
+        if len(branches) != 2:
+            raise Unsupported("a choice of many")
+        if not isinstance(which.type.element, ir.IntType) or which.type.element.width > 1:
+            which = self.b.icmp_signed("!=", which, self.constant_of(0, which.type))
+        first, second = branches
+        if first.jaxpr.eqns:
+            found = self._case(first, inputs, self.b.and_(self.b.not_(which), active), None)
+        else:
+            found = self.run(first, inputs, active)
+        return self._case(second, inputs, self.b.and_(which, active), found)
+
+    def _case(self, program, inputs: list, mask, others: list | None) -> list:
+        """The results of a case in the lanes of `mask`, `others` in the rest (None: whatever it is)."""
+        before = self.b.block
+        inside, after = self.b.append_basic_block("case"), self.b.append_basic_block("join")
+        self.b.cbranch(self.any(mask), inside, after)
+        self.b.position_at_end(inside)
+        # What only depends on values from outside the loops goes before them, even if it is not needed there.
+        found = self.run(program, inputs, mask)
+        results = flat(found)
+        others = [ir.Constant(x.type, ir.Undefined) for x in results] if others is None else flat(others)
+        chosen = [new if new is old else self.b.select(mask, new, old) for new, old in zip(results, others)]
+        end = self.b.block
+        self.b.branch(after)
+        self.b.position_at_end(after)
+        joined = [self.b.phi(x.type) for x in results]
+        for phi, new, old in zip(joined, chosen, others):
+            phi.add_incoming(new, end)
+            phi.add_incoming(old, before)
+        self.remember(joined, len(self.before))
+        return like(found, joined)
+
+
+def boxed(x) -> np.ndarray:
+    """An array of vectors of what may be one vector; NumPy would look into them."""
+    if isinstance(x, np.ndarray):
+        return x
+    box = np.empty(len(x) if isinstance(x, list) else (), object)
+    box[...] = x
+    return box
+
+
+def unboxed(x):
+    return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
+
+
+def _each(function: Callable, *inputs):
+    """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
+    if not any(isinstance(x, np.ndarray) for x in inputs):
+        return function(*inputs)
+    inputs = np.broadcast_arrays(*map(boxed, inputs))
+    found = np.empty(inputs[0].shape, object)
+    for place in np.ndindex(found.shape):
+        found[place] = function(*(x[place] for x in inputs))
+    return found
+
+
+def flat(values: list) -> list:
+    """The single vectors in vectors and arrays."""
+    if any(isinstance(value, Memory) for value in values):
+        raise Unsupported("a long list that changes")
+    return [x for value in values for x in (value.ravel() if isinstance(value, np.ndarray) else [value])]
+
+
+def like(values: list, vectors: list) -> list:
+    """Vectors and arrays like `values`, of other vectors."""
+    rest, found = iter(vectors), []
+    for value in values:
+        if isinstance(value, np.ndarray):
+            array = np.empty(value.shape, object)
+            array.ravel()[:] = [next(rest) for _ in range(value.size)]
+            found.append(array)
+        else:
+            found.append(next(rest))
+    return found
+
+
+def is_known(equation) -> bool:
+    """Whether an operation may be written; in the end only writing it tells."""
+    if equation.primitive.name not in WITH_PROGRAMS:
+        return equation.primitive.name in OPERATIONS | MOVES | SUMS or equation.primitive.name == "dynamic_slice"
+    programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
+    return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
+
+
+def _listed(value) -> tuple | list:
+    return value if isinstance(value, (tuple, list)) else (value,)

@@ -1,0 +1,257 @@
+"""Functions of LLVM that run a program over arrays of many lanes, a vector of lanes at a time. Needs llvmlite.
+
+In arrays the axis of lanes is the last, but for lists of which single numbers are looked up: there it is the first.
+Several threads may call such a function with the same arguments: each takes lanes that nobody has taken before.
+"""
+
+import math
+
+import numpy as np
+from jax.extend.core import Literal
+from llvmlite import ir
+
+from jaxrock.native.emitter import SMALL, Emitter, Memory, boxed, flat, like, unboxed
+from jaxrock.native.operations import Unsupported
+
+_I8, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
+
+
+def is_long(shape: tuple[int, ...]) -> bool:
+    """Whether an array stays in memory, where single numbers of it are looked up."""
+    if len(shape) > 1 and math.prod(shape) > SMALL**2:
+        raise Unsupported(f"an array of shape {shape}")
+    return len(shape) == 1 and shape[0] > SMALL
+
+
+class _Frame:
+    """A function `void name(void **outputs, void **inputs, int64 *next)`.
+
+    The first input tells for how many lanes there is room in the arrays, and how many are wanted (int32 both); `next`
+    is the first that nobody has taken.
+    """
+
+    def __init__(self, jaxpr, lanes: int, name: str):
+        self.module = ir.Module(name)
+        table = _I8.as_pointer().as_pointer()
+        kinds = [table, table, _I64.as_pointer()]
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
+        # Or else LLVM spills vectors across the lines of the cache, which takes twice as long.
+        function.attributes.add("nounwind")  # llvmlite writes the alignment only after another attribute
+        function.attributes.alignstack = 64
+        outputs, inputs, self.next = function.args
+        self.b = ir.IRBuilder(function.append_basic_block("entry"))
+        self.e = Emitter(self.b, lanes)
+        self.sources = [self._array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
+        self.targets = [self._array(outputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.outvars)]
+        sizes = self._array(inputs, 0, np.int32)
+        self.width, self.count = (self.b.sext(self.b.load(self.b.gep(sizes, [_I32(i)])), _I64) for i in (0, 1))
+
+    def _array(self, of, index: int, dtype):
+        kind = _I8 if dtype == np.bool_ else self.e.kind(dtype)
+        return self.b.bitcast(self.b.load(self.b.gep(of, [_I32(index)])), kind.as_pointer())
+
+    def take(self, more: int):
+        """The first of some lanes that nobody else takes."""
+        return self.b.atomic_rmw("add", self.next, _I64(more), "monotonic")
+
+    def place(self, number: int, lane):
+        """Where the number of a lane lies in an array."""
+        return self.b.add(self.b.mul(self.width, _I64(number)), lane)
+
+    def vector(self, pointer, at):
+        """A place of as many numbers as there are lanes in a vector."""
+        return self.b.bitcast(self.b.gep(pointer, [at]), ir.VectorType(pointer.type.pointee, self.e.lanes).as_pointer())
+
+    def load(self, pointer, at):
+        """Numbers for all lanes; flags are bytes in memory."""
+        return self._as_flag(pointer, self.b.load(self.vector(pointer, at), align=1))
+
+    def load_shared(self, pointer, number: int):
+        """A number that all lanes share."""
+        return self._as_flag(pointer, self.e.splat(self.b.load(self.b.gep(pointer, [_I64(number)]))))
+
+    def _as_flag(self, pointer, value):
+        is_flag = pointer.type.pointee == _I8
+        return self.b.icmp_unsigned("!=", value, self.e.constant_of(0, value.type)) if is_flag else value
+
+    def store(self, value, pointer, at):
+        """Numbers of all lanes."""
+        if pointer.type.pointee == _I8:
+            value = self.b.zext(value, ir.VectorType(_I8, self.e.lanes))
+        self.b.store(value, self.vector(pointer, at), align=1)
+
+    def argument(self, variable, source, shared: bool, load, starts):
+        """What stands for an input of the program: `load(source, number)` loads a lane's own numbers, `starts(size)`
+        tells where its long list begins."""
+        shape = variable.aval.shape
+        if is_long(shape):
+            return Memory(source, shape[0], None if shared else starts(shape[0]))
+        load = self.load_shared if shared else load
+        numbers = boxed([load(source, k) for k in range(math.prod(shape))])
+        return unboxed(numbers.reshape(shape))
+
+
+def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
+    """A function `void name(void **outputs, void **inputs, int64 *next)` that runs a program over arrays of many lanes.
+
+    Before the inputs of the program stands how many lanes there are (a multiple of `lanes`), and how many are wanted
+    (at least 1). What is not `shared` has an axis of lanes.
+    """
+    jaxpr = program.jaxpr
+    f = _Frame(jaxpr, lanes, name)
+    b, e = f.b, f.e
+    head, inside, after = (b.append_basic_block(name) for name in ("lanes", "program", "end"))
+    b.branch(head)
+    b.position_at_end(head)
+    first = f.take(lanes)
+    b.cbranch(b.icmp_signed("<", first, f.count), inside, after)
+    b.position_at_end(inside)
+
+    def load(source, number):
+        return f.load(source, f.place(number, first))
+
+    def starts(size):
+        return [b.mul(b.add(first, _I64(i)), _I64(size)) for i in range(lanes)]
+
+    given = zip(jaxpr.invars, f.sources, shared, strict=True)
+    found = e.run(program, [f.argument(*each, load, starts) for each in given], e.constant(True, bool))
+    for values, target in zip(found, f.targets):
+        for number, value in enumerate(flat([values])):
+            f.store(value, target, f.place(number, first))
+    b.branch(head)
+    b.position_at_end(after)
+    b.ret_void()
+    return f.module
+
+
+def emit_loop(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
+    """As `emit`, of a program that is one loop: a lane that is done takes the next scene, and waits for no other."""
+    jaxpr = program.jaxpr
+    f = _Frame(jaxpr, lanes, name)
+    return _Refilled(f, jaxpr, shared).module()
+
+
+class _Refilled:
+    """A loop whose lanes are filled again. What changes with a lane's scene is kept on the stack meanwhile."""
+
+    def __init__(self, frame: _Frame, jaxpr, shared: list[bool]):
+        self.f, self.b, self.e = frame, frame.b, frame.e
+        (self.equation,) = jaxpr.eqns
+        self.jaxpr, self.shared = jaxpr, dict(zip(jaxpr.invars, shared, strict=True))
+        self.of = dict(zip(jaxpr.invars, frame.sources))
+        parameters = self.equation.params
+        consts = parameters["cond_nconsts"] + parameters["body_nconsts"]
+        self.consts, self.carry = self.equation.invars[:consts], self.equation.invars[consts:]
+        # Before all loops, where what only depends on them goes, too.
+        given = dict.fromkeys(v for v in self.consts if not isinstance(v, Literal) and self.shared[v])
+        self.known = {v: frame.argument(v, self.of[v], True, None, None) for v in given}
+        self.scene, self.active, self.ready = (self._room(kind) for kind in (_I64, _I8, _I8))
+        # Stack of every number that is a lane's own: (source in memory, number in it, room).
+        own = dict.fromkeys(v for v in self.consts if self._is_own(v))
+        self.own = [each for v in own for each in self._rooms(v)]
+        self.changing = [each for v in self.carry for each in self._rooms(v)]
+
+    def _room(self, kind):
+        room = self.b.alloca(kind, self.e.lanes)
+        room.align = 64
+        return room
+
+    def _is_own(self, variable) -> bool:
+        return not isinstance(variable, Literal) and not self.shared[variable] and not is_long(variable.aval.shape)
+
+    def _rooms(self, variable) -> list:
+        if is_long(variable.aval.shape):
+            raise Unsupported("a long list that changes")
+        kind = _I8 if variable.aval.dtype == np.bool_ else self.e.kind(variable.aval.dtype)
+        return [(variable, k, self._room(kind)) for k in range(math.prod(variable.aval.shape))]
+
+    def module(self) -> ir.Module:
+        """The function."""
+        f, b, e = self.f, self.b, self.e
+        for i in range(e.lanes):
+            b.store(_I64(-1), b.gep(self.scene, [_I64(i)]))
+            b.store(_I8(1), b.gep(self.ready, [_I64(i)]))
+        outer, run, end = (b.append_basic_block(name) for name in ("refill", "run", "end"))
+        e.before.append(b.block)
+        b.branch(outer)
+        b.position_at_end(outer)
+        self._each_lane(self._exchange)
+        active = f.load(self.active, _I64(0))
+        b.cbranch(e.any(active), run, end)
+        b.position_at_end(run)
+        carry = like([self._like(v) for v in self.carry], [self._take(room) for *_, room in self.changing])
+        more = b.icmp_signed("<", b.load_atomic(f.next, "monotonic", 8), f.count)
+
+        def leaves(going):
+            return b.and_(more, e.any(b.and_(active, b.not_(going))))
+
+        state, going = e.loop(self.equation.params, self._consts() + carry, active, leaves)
+        for value, (_, _, room) in zip(flat(state), self.changing, strict=True):
+            f.store(value, room, _I64(0))
+        f.store(b.not_(going), self.ready, _I64(0))
+        b.branch(outer)
+        b.position_at_end(end)
+        b.ret_void()
+        return f.module
+
+    def _take(self, room):
+        value = self.f.load(room, _I64(0))
+        self.e.remember([value], 1)
+        return value
+
+    def _like(self, variable):
+        shape = variable.aval.shape
+        return np.empty(shape, object) if shape else None
+
+    def _consts(self) -> list:
+        """What stands for the constants of the loop."""
+        rooms = iter([room for *_, room in self.own])
+        found = dict(self.known)
+        for v in self.consts:
+            if not isinstance(v, Literal) and v not in found:
+                found[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
+        return [self.e.known(v.val, v.aval.dtype) if isinstance(v, Literal) else found[v] for v in self.consts]
+
+    def _starts(self, size: int) -> list:
+        b = self.b
+        return [b.mul(b.load(b.gep(self.scene, [_I64(i)])), _I64(size)) for i in range(self.e.lanes)]
+
+    def _each_lane(self, function) -> None:
+        b = self.b
+        before, head, after = b.block, b.append_basic_block("lane"), b.append_basic_block("lanes")
+        b.branch(head)
+        b.position_at_end(head)
+        lane = b.phi(_I64)
+        with b.if_then(b.icmp_signed("!=", b.load(b.gep(self.ready, [lane])), _I8(0))):
+            function(lane)
+        following = b.add(lane, _I64(1))
+        lane.add_incoming(_I64(0), before)
+        lane.add_incoming(following, b.block)
+        b.cbranch(b.icmp_signed("<", following, _I64(self.e.lanes)), head, after)
+        b.position_at_end(after)
+
+    def _exchange(self, lane) -> None:
+        """Store what a lane has found, and load its next scene; where there is none, the last, for nothing."""
+        b, count = self.b, self.f.count
+        scene, active = b.gep(self.scene, [lane]), b.gep(self.active, [lane])
+        old = b.load(scene)
+        with b.if_then(b.icmp_signed(">=", old, _I64(0))), b.if_then(b.icmp_signed("!=", b.load(active), _I8(0))):
+            targets = [t for v, t in zip(self.carry, self.f.targets) for _ in range(math.prod(v.aval.shape))]
+            for (_, k, room), target in zip(self.changing, targets, strict=True):
+                b.store(b.load(b.gep(room, [lane])), b.gep(target, [self.f.place(k, old)]))
+        new = self.f.take(1)
+        there = b.icmp_signed("<", new, count)
+        b.store(b.zext(there, _I8), active)
+        new = b.select(there, new, b.sub(count, _I64(1)))
+        b.store(new, scene)
+        for variable, k, room in self.own + self.changing:
+            b.store(self._of_scene(variable, k, new), b.gep(room, [lane]))
+
+    def _of_scene(self, variable, k: int, scene):
+        """One number of a scene."""
+        if isinstance(variable, Literal):
+            value = np.asarray(variable.val, variable.aval.dtype).ravel()[k]
+            kind = _I8 if value.dtype == np.bool_ else self.e.kind(value.dtype)
+            return kind(int(value) if isinstance(kind, ir.IntType) else float(value))
+        at = _I64(k) if self.shared[variable] else self.f.place(k, scene)
+        return self.b.load(self.b.gep(self.of[variable], [at]))

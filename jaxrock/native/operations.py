@@ -1,0 +1,275 @@
+"""What JAX's operations on scalars are in LLVM: one vector of lanes in, one out. Needs llvmlite.
+
+Each is a function of the emitter, the equation in JAX's program, and the operands.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from llvmlite import ir
+
+from jaxrock.numerics.elementary import (
+    arcsine,
+    arctangent_of,
+    exponential,
+    exponential_less_one,
+    hyperbolic_arcsine,
+    hyperbolic_arctangent,
+    hyperbolic_tangent,
+    logarithm,
+    sine_cosine_of_any,
+    tangent,
+)
+
+_BOOL = np.dtype(bool)
+
+
+_CONTRACT = ("contract",)  # a product and a sum may be rounded once
+
+
+class Unsupported(Exception):
+    """What a program does that is not known here."""
+
+
+def is_float(x) -> bool:
+    """Whether a vector holds real numbers."""
+    return isinstance(x.type.element, (ir.DoubleType, ir.FloatType))
+
+
+def _is_flag(x) -> bool:
+    return x.type.element == ir.IntType(1)
+
+
+def _arithmetic(of_floats: str, of_integers: str):
+    def operation(e, _, x, y):
+        return getattr(e.b, of_floats)(x, y, flags=_CONTRACT) if is_float(x) else getattr(e.b, of_integers)(x, y)
+
+    return operation
+
+
+def _quotient(of_rest: bool):
+    """Quotient or remainder, of integers as JAX has it where the divisor is zero or the result is too large."""
+
+    def operation(e, equation, x, y):
+        if is_float(x):
+            return e.each("fmod", x, y) if of_rest else e.b.fdiv(x, y)
+        limits = np.iinfo(equation.invars[0].aval.dtype)
+        zero, one, least = (e.constant_of(k, x.type) for k in (0, 1, limits.min))
+        none = e.b.icmp_signed("==", y, zero)
+        huge = e.b.and_(e.b.icmp_signed("==", x, least), e.b.icmp_signed("==", y, e.b.neg(one)))
+        # The processor would stop there, if only in a lane that is done.
+        divisor = e.b.select(e.b.or_(none, huge), one, y)
+        found = e.b.srem(x, divisor) if of_rest else e.b.sdiv(x, divisor)
+        return e.b.select(none, x if of_rest else e.b.neg(one), found)
+
+    return operation
+
+
+def _compare(sign: str):
+    def operation(e, _, x, y):
+        if is_float(x):
+            return e.b.fcmp_unordered(sign, x, y) if sign == "!=" else e.b.fcmp_ordered(sign, x, y)
+        return (e.b.icmp_unsigned if _is_flag(x) else e.b.icmp_signed)(sign, x, y)
+
+    return operation
+
+
+def _extremum(sign: str):
+    def operation(e, _, x, y):
+        if _is_flag(x):
+            return e.b.or_(x, y) if sign == ">" else e.b.and_(x, y)
+        if not is_float(x):
+            return e.b.select(e.b.icmp_signed(sign, x, y), x, y)
+        # What is not a number goes through, from either side.
+        first = e.b.or_(e.b.fcmp_ordered(sign, x, y), e.b.fcmp_unordered("uno", x, x))
+        return e.b.select(first, x, y)
+
+    return operation
+
+
+def _negative(e, _, x):
+    return e.b.fneg(x) if is_float(x) else e.b.neg(x)
+
+
+def _size(e, _, x):
+    return e.intrinsic("fabs", x) if is_float(x) else e.b.select(e.b.icmp_signed("<", x, e.b.neg(x)), e.b.neg(x), x)
+
+
+def _sign(e, equation, x):
+    zero, one = (e.constant(c, equation.invars[0].aval.dtype) for c in (0, 1))
+    if not is_float(x):
+        minus = e.b.select(e.b.icmp_signed("<", x, zero), e.b.neg(one), zero)
+        return e.b.select(e.b.icmp_signed(">", x, zero), one, minus)
+    # Zeros keep their sign, and what is not a number stays so.
+    is_other = e.b.or_(e.b.fcmp_ordered("<", x, zero), e.b.fcmp_ordered(">", x, zero))
+    return e.b.select(is_other, e.intrinsic("copysign", one, x), x)
+
+
+def _power(e, equation, x):
+    exponent = equation.params["y"]
+    if not is_float(x) or exponent == 0:
+        raise Unsupported(f"power {exponent}")
+    power = functools.reduce(e.b.fmul, [x] * abs(exponent))
+    return power if exponent > 0 else e.b.fdiv(e.constant(1, equation.invars[0].aval.dtype), power)
+
+
+def _convert(e, equation, x):
+    old, new = equation.invars[0].aval.dtype, np.dtype(equation.params["new_dtype"])
+    if old == new:
+        return x
+    kind, b = e.vector(new), e.b
+    if new == _BOOL:
+        return _compare("!=")(e, equation, x, e.constant(0, old))
+    if old == _BOOL:
+        return b.uitofp(x, kind) if new.kind == "f" else b.zext(x, kind)
+    if old.kind == new.kind == "f":
+        return b.fpext(x, kind) if new.itemsize > old.itemsize else b.fptrunc(x, kind)
+    if old.kind == new.kind == "i":
+        return b.sext(x, kind) if new.itemsize > old.itemsize else b.trunc(x, kind)
+    return b.sitofp(x, kind) if new.kind == "f" else _to_integer(e, x, np.iinfo(new), old, kind)
+
+
+def _to_integer(e, x, limits, dtype, kind):
+    """Towards zero; what is too large becomes the largest, and what is not a number zero, as in JAX."""
+    low, high = (e.constant(limit, dtype) for limit in (limits.min, limits.max))
+    inside = e.b.and_(e.b.fcmp_ordered(">=", x, low), e.b.fcmp_ordered("<", x, high))
+    whole = e.b.fptosi(e.b.select(inside, x, e.constant(0, dtype)), kind)
+    limited = e.b.select(
+        e.b.fcmp_ordered("<", x, low), e.constant_of(limits.min, kind), e.constant_of(limits.max, kind)
+    )
+    known = e.b.fcmp_ordered("ord", x, x)
+    return e.b.select(inside, whole, e.b.select(known, limited, e.constant_of(0, kind)))
+
+
+def _choose(e, _, which, *cases):
+    if len(cases) != 2 or not _is_flag(which):
+        raise Unsupported("a choice of many")
+    return e.b.select(which, cases[1], cases[0])
+
+
+def _round(e, equation, x):
+    to_even = equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    return e.intrinsic("rint" if to_even else "round", x)
+
+
+def _is_finite(e, equation, x):
+    return e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.constant(math.inf, equation.invars[0].aval.dtype))
+
+
+def _by(function: Callable):
+    """An operation that consists of others: a call of a scalar function would be slow."""
+
+    def operation(e, equation, *values):
+        like = [jax.ShapeDtypeStruct((), v.aval.dtype) for v in equation.invars]
+        (found,) = e.run(jax.make_jaxpr(function)(*like), list(values), None)
+        return found
+
+    return operation
+
+
+def _logarithm_of_any(x):
+    inside = jnp.where(x > 0, jnp.where(x < jnp.inf, logarithm(x), jnp.inf), -jnp.inf)
+    return jnp.where(x >= 0, inside, jnp.nan)
+
+
+OPERATIONS: dict[str, Callable] = {
+    "add": _arithmetic("fadd", "add"),
+    "add_any": _arithmetic("fadd", "add"),
+    "sub": _arithmetic("fsub", "sub"),
+    "mul": _arithmetic("fmul", "mul"),
+    "div": _quotient(of_rest=False),
+    "rem": _quotient(of_rest=True),
+    "min": _extremum("<"),
+    "max": _extremum(">"),
+    "neg": _negative,
+    "abs": _size,
+    "sign": _sign,
+    "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
+    "integer_pow": _power,
+    "sqrt": lambda e, _, x: e.intrinsic("sqrt", x),
+    "rsqrt": lambda e, q, x: e.b.fdiv(e.constant(1, q.invars[0].aval.dtype), e.intrinsic("sqrt", x)),
+    "floor": lambda e, _, x: e.intrinsic("floor", x),
+    "ceil": lambda e, _, x: e.intrinsic("ceil", x),
+    "round": _round,
+    "is_finite": _is_finite,
+    "exp": _by(exponential),
+    "expm1": _by(exponential_less_one),
+    "log": _by(_logarithm_of_any),
+    "sin": _by(lambda x: sine_cosine_of_any(x)[0]),
+    "cos": _by(lambda x: sine_cosine_of_any(x)[1]),
+    "tan": _by(tangent),
+    "asin": _by(arcsine),
+    "atan": _by(lambda x: arctangent_of(x, jnp.ones_like(x))),
+    "atan2": _by(arctangent_of),
+    "one_minus_square": _by(lambda x: (1 - x) * (1 + x)),  # of jax 0.11 and later, in derivatives
+    "tanh": _by(hyperbolic_tangent),
+    "asinh": _by(hyperbolic_arcsine),
+    "atanh": _by(hyperbolic_arctangent),
+    "lt": _compare("<"),
+    "le": _compare("<="),
+    "gt": _compare(">"),
+    "ge": _compare(">="),
+    "eq": _compare("=="),
+    "ne": _compare("!="),
+    "and": lambda e, _, x, y: e.b.and_(x, y),
+    "or": lambda e, _, x, y: e.b.or_(x, y),
+    "xor": lambda e, _, x, y: e.b.xor(x, y),
+    "not": lambda e, _, x: e.b.not_(x),
+    "shift_left": lambda e, _, x, y: e.b.shl(x, y),
+    "shift_right_arithmetic": lambda e, _, x, y: e.b.ashr(x, y),
+    "select_n": _choose,
+    "convert_element_type": _convert,
+    "bitcast_convert_type": lambda e, q, x: e.b.bitcast(x, e.vector(q.params["new_dtype"])),
+}
+
+
+# What changes no value.
+NOTHING = ("stop_gradient", "copy", "reshard", "pvary", "pcast")
+
+
+OPERATIONS |= dict.fromkeys(NOTHING, lambda e, _, x: x)
+
+
+# Of all numbers along axes of an array.
+SUMS = {"reduce_" + name: OPERATIONS[name] for name in ("min", "max", "and", "or")} | {"reduce_sum": OPERATIONS["add"]}
+
+
+def _broadcast(parameters, x):
+    shape = parameters["shape"]
+    places = dict(zip(parameters["broadcast_dimensions"], x.shape))
+    return np.broadcast_to(x.reshape([places.get(axis, 1) for axis in range(len(shape))]), shape)
+
+
+def _slice(parameters, x):
+    ends = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or [1] * x.ndim
+    return x[tuple(slice(*each) for each in zip(*ends))]
+
+
+def _pad(parameters, x, filling):
+    config = parameters["padding_config"]
+    if any(min(each) < 0 for each in config):
+        raise Unsupported("padding that takes away")
+    inner = [n + max(n - 1, 0) * between for n, (_, _, between) in zip(x.shape, config)]
+    found = np.full([low + n + high for n, (low, high, _) in zip(inner, config)], filling[()], object)
+    places = zip(inner, config)
+    found[tuple(slice(low, low + n, between + 1) for n, (low, _, between) in places)] = x
+    return found
+
+
+# What moves the elements of small arrays about: functions of the parameters and NumPy arrays of vectors.
+MOVES: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast,
+    "slice": _slice,
+    "squeeze": lambda parameters, x: np.squeeze(x, parameters["dimensions"]),
+    "reshape": lambda parameters, x: x.reshape(parameters["new_sizes"]),
+    "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
+    "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
+    "pad": _pad,
+    "split": lambda parameters, x: np.split(x, np.cumsum(parameters["sizes"])[:-1], parameters["axis"]),
+    "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
+    "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
+}

@@ -1,0 +1,129 @@
+"""Maxima of a function whose values and slopes come in batches: many climbers at once, each at its own pace.
+
+Each climber has a BFGS matrix of its own; there are few dimensions. It tries one point in every round; whether that was
+good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's
+line search, and a round is one call of one compiled program, whatever the climbers are at. (`optax.lbfgs` under
+`jax.vmap` would wait for the longest line search; its search also fails where the function has a batching rule of its
+own, as outcomes have. `optax.adam` takes many times as many points: benchmarks/inverse.md.)
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+_FARTHEST = 1.0  # a step, in the units of the points
+
+
+_ENOUGH = 1e-4  # of the gain that the slope promises
+
+
+_SHORTEST = 1e-9  # step below which there is a jump
+
+
+# Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
+# points, and finds a higher summit now and then; more starts do, too.
+_HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1))
+
+
+_SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
+
+
+_NOWHERE = -1e300  # the value where there is none
+
+
+class Summits(NamedTuple):
+    """Where climbers arrived: (climbers, dimensions), (climbers,), and whether each is on a summit."""
+
+    points: np.ndarray
+    values: np.ndarray
+    arrived: np.ndarray
+
+
+def climb(
+    evaluate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    starts: np.ndarray,
+    free: np.ndarray | bool = True,
+    rounds: int = 150,
+    promise: float = 1e-8,
+    group: np.ndarray | int = 0,
+) -> Summits:
+    """Climb from many starts.
+
+    **Arguments:**
+
+    - `evaluate`: values (points,) and slopes (points, dimensions) at points (points, dimensions).
+    - `starts`: (climbers, dimensions).
+    - `free`: (climbers, dimensions), which coordinates of a climber may change.
+    - `rounds`: at most.
+    - `promise`: gain that the slope promises for a whole step below which a climber has arrived.
+    - `group`: (climbers,) numbers; those of the same look for the same summit, so that climbers far below the best of
+      them, or beside a higher one, are given up.
+
+    **Returns:** `Summits`.
+    """
+    points, free = np.array(starts, float), np.broadcast_to(free, np.shape(starts))
+    group = np.broadcast_to(group, len(points))
+    values, slopes = _finite(*evaluate(points))
+    slopes = slopes * free
+    count, size = points.shape
+    inverse = np.tile(np.eye(size), (count, 1, 1))  # of minus the Hessian
+    fresh, done, arrived = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+    ahead, step = np.zeros_like(points), np.ones(count)
+    for number in range(rounds):
+        found = np.einsum("cij,cj->ci", inverse, slopes)
+        found *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(found), axis=1), 1e-300))[:, None]
+        ahead[fresh], step[fresh] = found[fresh], 1.0
+        promised = np.sum(ahead * slopes, axis=1)
+        level = fresh & ~done & (promised < promise)
+        arrived |= level & (values > _NOWHERE)
+        done |= level | (step < _SHORTEST)
+        done |= _given_up(number, points, values, group)
+        if done.all():
+            break
+        active = np.flatnonzero(~done)
+        trial = points[active] + step[active, None] * ahead[active]
+        higher, new = _finite(*evaluate(trial))
+        gain, asked = higher - values[active], step[active] * promised[active]
+        good = gain >= _ENOUGH * asked
+        fresh = np.zeros(count, bool)
+        moved = active[good]
+        fresh[moved] = True
+        new = (new * free[active])[good]
+        inverse[moved] = _learned(inverse[moved], trial[good] - points[moved], slopes[moved] - new)
+        points[moved], values[moved], slopes[moved] = trial[good], higher[good], new
+        # The parabola through both values and the slope tells where to try next.
+        bad = active[~good]
+        shorter = asked[~good] / np.maximum(2 * (asked[~good] - gain[~good]), 1e-300)
+        step[bad] *= np.clip(shorter, 0.1, 0.5)
+    return Summits(points, values, arrived)
+
+
+def _learned(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """BFGS: the matrices with which the change of the slope gives the move; as they were where it is not concave."""
+    product = np.sum(move * change, axis=1)
+    concave = product > 1e-8 * np.linalg.norm(move, axis=1) * np.linalg.norm(change, axis=1)
+    weight = 1 / np.where(concave, product, 1.0)
+    across = np.eye(move.shape[1]) - weight[:, None, None] * move[:, :, None] * change[:, None, :]
+    new = across @ inverse @ across.swapaxes(1, 2) + weight[:, None, None] * move[:, :, None] * move[:, None, :]
+    return np.where(concave[:, None, None], new, inverse)
+
+
+def _given_up(number: int, points: np.ndarray, values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Which climbers are far below the best of their group after so many rounds, or beside a higher one."""
+    alike = group[:, None] == group
+    below = np.where(alike, values, -np.inf).max(axis=1) - values
+    hopeless = np.any([(number >= rounds) & (below > depth) for rounds, depth in _HOPELESS], axis=0)
+    if number >= _HOPELESS[0][0]:
+        order = np.arange(values.size)
+        higher = (values > values[:, None]) | ((values == values[:, None]) & (order < order[:, None]))
+        near = np.max(np.abs(points[:, None] - points), axis=2) < _SAME
+        hopeless |= (alike & higher & near).any(axis=1)
+    return hopeless
+
+
+def _finite(values, slopes) -> tuple[np.ndarray, np.ndarray]:
+    """What is not a number is no place to climb to."""
+    values, slopes = np.array(values), np.array(slopes)
+    bad = ~np.isfinite(values) | ~np.isfinite(slopes).all(axis=1)
+    return np.where(bad, _NOWHERE, values), np.where(bad[:, None], 0.0, slopes)

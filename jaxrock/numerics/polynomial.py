@@ -1,0 +1,205 @@
+"""Polynomials on [0, 1] as lists of coefficients, and their first sign change, certified.
+
+A list entry is a scalar (or, under vmap, one per lane); the lists have fixed length, so that every
+operation unrolls into straight-line code that vectorises over lanes.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact
+
+from jaxrock.numerics.xla_cpu import keep
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+Flag = Bool[ArrayLike, ""]
+
+
+def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
+    """Coefficients in x/length from those in x."""
+    scaled, power = [coefficients[0]], length
+    for c in coefficients[1:]:
+        scaled.append(c * power)
+        power = power * length
+    return scaled
+
+
+def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
+    """Value and the first derivatives of a polynomial at x."""
+    values = [jnp.zeros_like(x)] * (derivatives + 1)
+    for c in reversed(coefficients):
+        for j in range(derivatives, 0, -1):
+            values[j] = values[j] * x + values[j - 1]
+        values[0] = values[0] * x + c
+    factorial = 1
+    for j in range(2, derivatives + 1):
+        factorial *= j
+        values[j] = factorial * values[j]
+    return values
+
+
+def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
+    """Value and slope of a polynomial of degree 1 or more at x: even and odd powers side by side, where the last digit
+    does not matter."""
+    square = x * x
+    even, even_slope = jet(coefficients[::2], square, 1)
+    odd, odd_slope = jet(coefficients[1::2], square, 1)
+    return even + x * odd, odd + 2 * x * (even_slope + x * odd_slope)
+
+
+def shifted(coefficients: list[Scalar], by: Scalar) -> list[Scalar]:
+    """Coefficients about a point `by` further on (synthetic division)."""
+    terms = list(coefficients)
+    for start in range(len(terms) - 1):
+        for j in range(len(terms) - 2, start - 1, -1):
+            terms[j] = terms[j] + by * terms[j + 1]
+    return terms
+
+
+def derivative(coefficients: list[Scalar]) -> list[Scalar]:
+    """Coefficients of the derivative."""
+    return [k * c for k, c in enumerate(coefficients)][1:]
+
+
+def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
+    """Value of a polynomial at x."""
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total
+
+
+def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scalar:
+    """Positive only if sign times the polynomial is certainly positive on (0, length].
+
+    As long as the leading coefficients are not negative, x^m times their sum is a lower bound of
+    their part; every later negative coefficient takes away at most its size times x^m.
+    """
+    leading, kept = jnp.ones_like(sign, bool), []
+    for k, c in enumerate(coefficients):
+        term = sign * c
+        leading = leading & (term >= 0) if k < 4 else jnp.zeros_like(leading)
+        kept.append(jnp.where(leading, term, jnp.minimum(term, 0.0)) if k < 4 else jnp.minimum(term, 0.0))
+    return horner(kept, length)
+
+
+def _falls(coefficients: list[Scalar], sign: Scalar, order: int) -> list[Scalar]:
+    """Coefficients of a bound of how negative this derivative of sign times the polynomial can be from 0 on."""
+    falls = []
+    for k, c in enumerate(coefficients[order:], start=order):
+        weight = 1
+        for j in range(order):
+            weight *= k - j
+        falls.append(weight * jnp.maximum(-sign * c, 0.0))
+    return falls or [jnp.zeros_like(sign)]
+
+
+def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
+    """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
+    return horner(_falls(coefficients, sign, order), length)
+
+
+def last_size(coefficients: list[Scalar]) -> Scalar:
+    """Size of the last coefficients.
+
+    Where the large ones are every second or third (a resonance, a steep ramp), the last two may both be small: those
+    before count, too, with a weight that does not matter for others.
+    """
+    last = jnp.maximum(jnp.abs(coefficients[-1]), jnp.abs(coefficients[-2]))
+    return jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
+
+
+def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
+    """Step at which the last coefficients drop below `size`, at most `cap`."""
+    order, last = len(coefficients) - 1, last_size(coefficients)
+    tiny = jnp.finfo(last.dtype).tiny
+    ratio = size / jnp.maximum(last, tiny)
+    return jnp.minimum(jnp.where(last > tiny, root_of(ratio, order), jnp.inf), cap)
+
+
+def root_of(value: Scalar, degree: int) -> Scalar:
+    """The root of this degree (6 or more) of a positive number, to about one per cent.
+
+    The bits of a float, read as an integer, are nearly its logarithm: a power function would not vectorise.
+    """
+    value = jnp.asarray(value)
+    info = jnp.finfo(value.dtype)
+    integer = jnp.int64 if info.bits == 64 else jnp.int32
+    one, bias = 1 << info.nmant, info.maxexp - 1
+    logarithm = (jax.lax.bitcast_convert_type(value, integer).astype(value.dtype) / one - bias) / degree
+    whole = jnp.floor(logarithm)
+    part = logarithm - whole
+    power = jax.lax.bitcast_convert_type((whole.astype(integer) + bias) * one, value.dtype)
+    return power * (1 + part * (0.6565 + 0.3435 * part))
+
+
+class Watch(NamedTuple):
+    """A quantity whose first sign change is wanted: sign (derivative of the polynomial - offset), positive at first."""
+
+    derivative: int
+    sign: Scalar
+    offset: Scalar | float
+    active: Flag | bool
+
+
+class Landing(NamedTuple):
+    """Where the march stopped, the polynomial's jet there, and which watched quantities reached zero."""
+
+    x: Scalar
+    jet: list[Scalar]
+    hits: list[Flag]
+
+
+def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
+    """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
+    root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
+    rising = slope > 0
+    # The zero of the parabola without cancellation: of its two forms the one that adds.
+    sum_ = keep(jnp.where(rising, slope + root, slope - root), fall)
+    above, below = jnp.where(rising, sum_, 2 * value), jnp.where(rising, fall, -sum_)
+    # Nothing pulls it down: clear for ever, unless it is at zero and does not rise.
+    endless = jnp.where((value > 0) | rising, jnp.inf, 0.0)
+    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), endless)
+
+
+def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
+    """March from `start` to the first point of [0, 1] where a watched quantity changes sign.
+
+    Each stride is the largest on which a parabola below every watched quantity stays positive, so no
+    zero is stepped over, be it one of two in a narrow dip; near a simple zero the strides are Newton's.
+    When the strides do not come to an end (a zero that is nearly double), the march stops where it
+    is, with no hit: everything before that point is certain. Where not `needed` it does not start (lanes
+    march together under vmap, as long as the slowest). It has no derivatives.
+    """
+    highest = max(w.derivative for w in watches) + 1
+    falls = [_falls(coefficients, w.sign, w.derivative + 2) for w in watches]
+    eps = jnp.finfo(start.dtype).eps
+
+    def clear(x, radius):
+        """For every quantity the length after x on which it has no zero."""
+        values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
+        lengths = [
+            _clear_length(
+                w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end)
+            )
+            for w, fall in zip(watches, falls)
+        ]
+        return [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
+
+    def march(carry):
+        x, radius, _, count = carry
+        stride = keep(jnp.clip(functools.reduce(jnp.minimum, clear(x, radius)), 0.0, radius), x)
+        reached = jnp.minimum(x + stride, 1.0)
+        going = (stride > 2 * eps * reached) & (reached < 1) & (count < 100)
+        # The lower parabola only has to hold as far as the next stride may go: near is tight.
+        return reached, jnp.minimum(4 * stride, 1.0), going, count + 1
+
+    x, radius, _, _ = jax.lax.while_loop(
+        lambda carry: carry[2], march, (start, jnp.ones_like(start), needed, jnp.zeros_like(start, jnp.int32))
+    )
+    hits = [length <= 32 * eps * x for length in clear(x, radius)]
+    return Landing(x, jet(coefficients, x, highest), hits)

@@ -1,0 +1,77 @@
+"""Roots of increasing or decreasing functions inside brackets, elementwise, with derivatives."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+Real = Inexact[Array, "..."]
+
+
+_MOST_STEPS = 100
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Real) -> Real:
+    """Where `function(x, *parameters)`, elementwise, changes its sign between `lower` and `upper`.
+
+    Where it does not, the end with the smaller value is returned. Derivatives of every order with respect to the
+    parameters (none to the bracket) come from the implicit function; `function` must not close over traced values.
+    """
+    shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in (lower, upper, *parameters)))
+    return search_root(lambda x: function(x, *parameters), *(jnp.broadcast_to(end, shape) for end in (lower, upper)))
+
+
+@bracketed_root.defjvp
+def _bracketed_root_jvp(function, primals, tangents):
+    (lower, upper, *parameters), (_, _, *changes) = primals, tangents
+    root = bracketed_root(function, lower, upper, *parameters)
+    _, slope = jax.jvp(lambda x: function(x, *parameters), (root,), (jnp.ones_like(root),))
+    _, change = jax.jvp(lambda *p: function(root, *p), tuple(parameters), tuple(changes))
+    flat = slope == 0  # no root, or a double one
+    return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
+
+
+def search_root(function: Callable, a: Real, b: Real) -> Real:
+    """The root of `function(x)`, elementwise, between arrays `a` and `b` of one shape, to rounding; no derivatives.
+
+    **Source:** Chandrupatla (1997), inverse quadratic interpolation where it is safe, else bisection.
+    """
+    fa, fb = function(a), function(b)
+    tight = 4 * jnp.finfo(a.dtype).eps
+
+    def unfinished(carry):
+        a, b, _, fa, fb, _, _, count = carry
+        return jnp.any(_open(a, b, fa, fb, tight)) & (count < _MOST_STEPS)
+
+    def step(carry):
+        a, b, c, fa, fb, fc, share, count = carry
+        x = a + share * (b - a)
+        fx = function(x)
+        going = _open(a, b, fa, fb, tight)
+        same = (fx > 0) == (fa > 0)
+        # c: the point before; a: the newest; b: on the other side.
+        new = (x, jnp.where(same, b, a), jnp.where(same, a, b), fx, jnp.where(same, fb, fa), jnp.where(same, fa, fb))
+        a, b, c, fa, fb, fc = (jnp.where(going, n, o) for n, o in zip(new, (a, b, c, fa, fb, fc)))
+        return a, b, c, fa, fb, fc, _next_share(a, b, c, fa, fb, fc, tight), count + 1
+
+    start = (b, a, a, fb, fa, fa, jnp.full_like(a, 0.5), 0)
+    a, b, _, fa, fb, _, _, _ = jax.lax.while_loop(unfinished, step, start)
+    return jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
+
+
+def _open(a, b, fa, fb, tight):
+    """Whether the bracket is wider than rounding and holds a change of sign."""
+    wide = jnp.abs(b - a) > tight * jnp.minimum(jnp.abs(a), jnp.abs(b))
+    return wide & (fa != 0) & (fb != 0) & ((fa > 0) != (fb > 0))
+
+
+def _next_share(a, b, c, fa, fb, fc, tight):
+    """Where between a and b to look next."""
+    xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+    safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
+    guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+    least = jnp.minimum(0.5, tight * jnp.abs(a) / jnp.abs(b - a) / 2)
+    return jnp.clip(jnp.where(safe & jnp.isfinite(guess), guess, 0.5), least, 1 - least)

@@ -1,0 +1,76 @@
+"""Figures of closed forms: safety regions under single lobes and one cycle of a sine."""
+
+import numpy as np
+
+from jaxrock.closed_form import sine_pulse, single_lobe
+from jaxrock.plot.style import GREY, RED
+
+
+def safety_regions(shape: float, axis=None, *, longest: float = 8.0, points: int = 400):
+    """Draw what becomes of a slender block under a single-lobe pulse of one shape, from closed forms.
+
+    **Arguments:**
+
+    - `shape`: of the pulse, from -inf (rectangle) to +inf (spike).
+    - `axis`: matplotlib axis; None makes a figure.
+    - `longest`: largest pulse duration p t_d. `points`: along each curve.
+
+    **Returns:** the axis.
+
+    **Source:** Voyagaki, Psycharis & Mylonakis (2012), figures 3.1 to 3.3.
+    """
+    import matplotlib.pyplot as plt
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
+    duration = np.linspace(longest / points, longest, points)
+    curves = [
+        np.asarray(curve(duration, shape))
+        for curve in (single_lobe.rising_wall, single_lobe.falling_wall, single_lobe.safety_wall)
+    ]
+    border = np.maximum(np.asarray(single_lobe.peak_border(duration, shape)), curves[2])
+    edges = [0 * duration, *curves, border, 1 + 0 * duration]
+    colors = ("#8e1f18", RED, "#e08a80", "#cfe0ea", "#f3efe6")
+    names = ("$O_1$: past α as the pulse rises", "$O_2$: as it falls", "$O_3$: after it",
+             "$S_2$: safe, peak after the pulse", "$S_1$: safe, peak while it falls")  # fmt: skip
+    for lower, upper, color, name in zip(edges, edges[1:], colors, names):
+        axis.fill_between(duration, lower, upper, color=color, linewidth=0, label=name)
+    axis.plot(duration, curves[2], color="black", linewidth=1.2)
+    axis.set(xlim=(0, longest), ylim=(0, 1), xlabel="pulse duration $p\\,t_d$", ylabel="uplift strength $g\\alpha/A_g$")
+    axis.legend(loc="lower right", fontsize=7)
+    return axis
+
+
+def sine_regions(restitution: float, axis=None, *, frequency_ratio=None):
+    """Draw the closed-form curves of overturning under one cycle of a sine over an axis or a map.
+
+    **Arguments:**
+
+    - `restitution`: in [0, 1].
+    - `axis`: matplotlib axis, such as `overturning` returns; None makes a figure.
+    - `frequency_ratio`: (n,) omega/p; None: 0.3 to 8.
+
+    **Returns:** the axis.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), figure 4: equations 3.10, 3.18, 3.20 with 3.21, and 3.31.
+    """
+    import matplotlib.pyplot as plt
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
+    ratio = np.linspace(0.3, 8, 300) if frequency_ratio is None else np.asarray(frequency_ratio, float)
+    after = [np.asarray(x) for x in sine_pulse.after_pulse_limits(ratio, restitution)]
+    limit = np.asarray(sine_pulse.impact_time_limit(ratio))
+    curves = {
+        "case 2: no impact": (sine_pulse.no_impact_limit(ratio), "black", "-"),
+        "case 1.2: impact after the pulse": (after[1], "#0d2f4a", "-"),
+        None: (np.where(after[0] > limit, after[0], np.inf), "#0d2f4a", "-"),
+        "case 1.1: impact during the pulse": (sine_pulse.during_pulse_limit(ratio, restitution), "#7a1a14", "-"),
+        "first impact as the pulse ends": (limit, GREY, "--"),
+    }
+    for name, (curve, color, style) in curves.items():
+        curve = np.where(np.isfinite(curve), curve, np.nan)
+        axis.plot(ratio, curve, color=color, linestyle=style, linewidth=1.2, label=name)
+    axis.set(xlabel=r"frequency ratio $\omega/p$", ylabel="intensity $a_g/g\\alpha$")
+    axis.legend(loc="upper left", fontsize=7)
+    return axis

@@ -1,0 +1,91 @@
+"""Figures of one response: history, and orbit in the phase plane."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrock.plot.style import BLUE, GREY, RED, SAND
+from jaxrock.responses.rigid import Response
+
+
+def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
+    scene = response.stepper.scene
+    time = np.linspace(0, float(response.duration), 20001)
+    rotation, velocity = response(time)
+    alpha, p = float(scene.alpha), float(scene.p)
+    return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
+
+
+def history(response: Response, axes=None):
+    """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
+
+    **Arguments:**
+
+    - `response`: result of `simulate`.
+    - `axes`: three matplotlib axes; None makes a figure.
+
+    **Returns:** the three axes.
+    """
+    import matplotlib.pyplot as plt
+
+    if axes is None:
+        _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    scene = response.stepper.scene
+    time, rotation, velocity = _dense(response)
+    acceleration = np.asarray(scene.motion.acceleration(time))
+    impacts = np.asarray(response.impact_times)
+    speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
+    for axis, curve in zip(axes, (rotation, velocity, acceleration)):
+        axis.plot(time, curve, color=BLUE if axis is not axes[2] else "black", linewidth=0.9)
+        axis.axhline(0, color=GREY, linewidth=0.5)
+    axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
+    axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
+    threshold = float(scene.table.threshold)
+    for sign in (-1, 1):
+        axes[2].axhline(sign * threshold, color=SAND, linewidth=0.9, label="uplift threshold" if sign > 0 else None)
+    axes[0].set_ylabel(r"rotation $\theta/\alpha$")
+    axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
+    axes[2].set_ylabel("ground\nacceleration [g]")
+    axes[2].set_xlabel("time [s]")
+    for axis in (axes[0], axes[2]):
+        axis.legend(loc="upper right", fontsize=8, frameon=False)
+    return axes
+
+
+def phase(response: Response, axis=None):
+    """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
+
+    **Arguments:**
+
+    - `response`: result of `simulate`.
+    - `axis`: matplotlib axis; None makes a figure.
+
+    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns.
+    """
+    import matplotlib.pyplot as plt
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
+    scene = response.stepper.scene
+    alpha = float(scene.alpha)
+    _, rotation, velocity = _dense(response)
+    # The line breaks at impacts: the velocity jumps there.
+    crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
+    axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=BLUE, linewidth=0.8)
+    opening = np.linspace(0, 2, 101)
+    manifold = np.asarray(jax.vmap(scene.table.manifold)(jnp.asarray(opening * alpha))) / alpha
+    for side in (1, -1):
+        label = "stable manifold" if side > 0 else None
+        axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
+        axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
+        axis.plot([side * float(scene.table.saddle) / alpha], [0], "o", color=RED, markersize=4)
+    axis.axvline(0, color=GREY, linewidth=0.5)
+    reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
+    axis.set_xlim(-reach, reach)
+    axis.set_ylim(-max(1.2, 1.1 * np.max(np.abs(velocity[np.abs(rotation) < reach]), initial=0)), None)
+    axis.set_ylim(axis.get_ylim()[0], -axis.get_ylim()[0])
+    axis.set_xlabel(r"rotation $\theta/\alpha$")
+    axis.set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
+    axis.legend(loc="upper right", fontsize=8, frameon=False)
+    return axis

@@ -1,0 +1,164 @@
+"""Whether pure rocking is a fair model: the friction that it needs, and whether the block stays on the ground."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import checked
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.scene import Scene
+from jaxrock.models.coefficients import Angle
+from jaxrock.motions.motion import Shaking
+from jaxrock.responses.rigid import Response
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+_WITHIN = 8  # parts of each step at whose ends the extremes are looked for
+
+
+class Contact(eqx.Module):
+    """Forces of the ground on a block, over its weight, and what they need.
+
+    - `time`: (samples,) those of the response [s].
+    - `horizontal`, `normal`: (samples,) force of the ground, in the direction of positive ground acceleration and
+      upward, over m g [-].
+    - `friction`: (samples,) coefficient of friction needed, |horizontal|/normal [-]; infinite without contact.
+    - `friction_at_impact`: pair of those that the impacts need which end the stay on side 1, and on side 2 [-].
+    - `largest_friction`, `least_normal`: extremes over the rocking below the unstable equilibrium, impacts not
+      included, by parabolas through points of every step (1e-6 off where tests judge it). A toppling block may need
+      any friction in the end.
+    - `keeps_contact`: whether `least_normal` is positive.
+    """
+
+    time: Inexact[Array, " samples"]
+    horizontal: Inexact[Array, " samples"]
+    normal: Inexact[Array, " samples"]
+    friction: Inexact[Array, " samples"]
+    friction_at_impact: tuple[Scalar, Scalar]
+    largest_friction: Scalar
+    least_normal: Scalar
+
+    @property
+    def keeps_contact(self):
+        """Whether the ground never had to pull."""
+        return self.least_normal > 0
+
+    def sticks(self, friction: ArrayLike):
+        """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at impacts."""
+        needed = jnp.maximum(self.largest_friction, jnp.maximum(*self.friction_at_impact))
+        return self.keeps_contact & (jnp.asarray(friction) >= needed)
+
+
+def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_ratio: ArrayLike = 0.75) -> Contact:
+    """Compute the forces between block and ground along a response.
+
+    **Arguments:**
+
+    - `response`: of `simulate`, of one scene.
+    - `block`: that of the response.
+    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; 3/4 for a rectangle. An
+      `AsymmetricBlock` has its own.
+
+    **Returns:** a `Contact`.
+
+    **Raises:** ValueError for a value outside its range.
+
+    **Source:** momentum of the centre of mass, on a circle about the corner (Shenton 1996 for the beginning of
+    rocking); at an impact, of the impulse that angular momentum about the new corner implies.
+    """
+    ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
+    if isinstance(block, Block):
+        ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (1.0, 1.0)
+        restitutions, rates = (block.restitution, block.restitution), (block.p, block.p)
+    else:
+        ratios, alphas = (block.inertia_ratio, block.inertia_ratio2), (block.alpha1, block.alpha2)
+        radii = 1.0, block.radius_ratio
+        restitutions, rates = (block.restitution1, block.restitution2), (block.p1, block.p2)
+    sides = [jnp.stack([jnp.asarray(x) for x in pair]) for pair in (ratios, alphas, rates)]
+    time, rotation, velocity = response.time, response.rotation, response.velocity
+    horizontal, normal = jax.vmap(lambda *at: _forces(response.stepper.scene, sides, *at))(time, rotation, velocity)
+    largest, least = _extremes(response, sides)
+    corners = [(r * jnp.sin(a), r * jnp.cos(a)) for r, a in zip(radii, alphas)]
+    needed = tuple(
+        # The centre's velocity turns from across one corner's radius to across the other's.
+        jnp.abs(corners[i][1] - e * corners[1 - i][1]) / (corners[i][0] + e * corners[1 - i][0])
+        for i, e in enumerate(restitutions)
+    )
+    friction = _friction(horizontal, normal)
+    # Between steps, and where the block rests for good and no step is taken.
+    below = jnp.abs(rotation) < jnp.where(rotation < 0, alphas[1], alphas[0])
+    largest = jnp.maximum(largest, jnp.max(jnp.where(below, friction, 0.0)))
+    least = jnp.minimum(least, jnp.min(jnp.where(below, normal, jnp.inf)))
+    return Contact(time, horizontal, normal, friction, needed, largest, least)
+
+
+def _friction(horizontal, normal):
+    held = normal > 0
+    return jnp.where(held, jnp.abs(horizontal) / jnp.where(held, normal, 1.0), jnp.inf)
+
+
+def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity: Scalar, side: Scalar | None = None):
+    """Horizontal and normal force over m g at an instant; a lying block is borne, too."""
+    acceleration, weight = _ground(scene, time)
+    if side is None:
+        side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    scene = scene.on(side)
+    ratio, alpha, rate = (jnp.where(side < 0, values[1], values[0]) for values in sides)
+    opening = side * rotation
+    speed = side * velocity / rate
+    push, own = side * acceleration, (rate / scene.p) ** 2
+    bend = scene.table.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
+    missing = alpha - opening
+    horizontal = acceleration + side * ratio * (jnp.cos(missing) * bend + jnp.sin(missing) * speed**2)
+    normal = weight + ratio * (jnp.sin(missing) * bend - jnp.cos(missing) * speed**2)
+    still = (side == 0) | (opening >= jnp.pi / 2)
+    return jnp.where(still, acceleration, horizontal), jnp.where(still, weight, normal)
+
+
+def _ground(scene: Scene, time: Scalar) -> tuple[Scalar, Scalar]:
+    """Ground acceleration [g] and weight at a time, after a jump."""
+    piece = jnp.searchsorted(scene.knots, time, side="right") - 1
+    shaking: Shaking = scene.shaking(piece, time - scene.knots[piece], 0)[0]
+    acceleration, weight = shaking.now
+    return acceleration, jnp.ones_like(acceleration) if weight is None else weight
+
+
+def _highest(values: Inexact[Array, " points"]) -> Scalar:
+    """The largest of a smooth function that is known at equal distances: of parabolas through each three points."""
+    left, middle, right = values[:-2], values[1:-1], values[2:]
+    top = (middle >= left) & (middle >= right) & jnp.isfinite(left + middle + right)
+    bend = jnp.where(top & (2 * middle > left + right), 2 * middle - left - right, jnp.inf)
+    rise = jnp.where(top, (right - left) ** 2, 0.0) / (8 * bend)
+    return jnp.maximum(jnp.max(values), jnp.max(jnp.where(top, middle + rise, -jnp.inf)))
+
+
+@jax.jit
+def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
+    """Largest friction needed and least normal force below the saddle, over points in all steps."""
+    stepper, nodes, times = response.stepper, response.nodes, response.node_times
+    shares = jnp.linspace(0.0, 1.0, _WITHIN + 1)
+
+    def step(node, start, end):
+        lasts = jnp.where(jnp.isfinite(end), end - start, 0.0)
+
+        def at(share):
+            opening, speed = stepper.evaluate(node, share * lasts)
+            still = (share == 0) | (node.side == 0) | node.done
+            opening = jnp.where(still, node.opening, opening)
+            speed = jnp.where(still, node.velocity * stepper.scene.p, speed)
+            # Just inside the step: an end may be a jump of the motion.
+            time = start + jnp.clip(share, 1e-9, 1 - 1e-9) * lasts
+            forces = _forces(stepper.scene, sides, time, node.side * opening, node.side * speed, node.side)
+            below = opening < stepper.scene.on(node.side).table.saddle
+            counts = jnp.isfinite(start) & ~node.done & below
+            return jnp.where(counts, _friction(*forces), 0.0), jnp.where(counts, forces[1], jnp.inf)
+
+        friction, normal = jax.vmap(at)(shares)
+        return _highest(friction), -_highest(-normal)
+
+    following = jnp.concatenate([times[1:], jnp.full(1, jnp.inf, times.dtype)])
+    friction, normal = jax.vmap(step)(nodes, times, following)
+    return jnp.max(friction), jnp.min(normal)

@@ -1,0 +1,4 @@
+"""Questions about many responses: spectra, overturning maps, critical amplitudes, sensitivities, similarity.
+
+Imports `responses` and `sweeps`. Start with `spectra`.
+"""

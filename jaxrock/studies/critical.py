@@ -1,0 +1,384 @@
+"""Critical amplitudes and durations: all ends of the intervals in which a block overturns.
+
+Whether a block overturns is not monotonic: below the amplitude that overturns it without impact there are others
+that do so after one, three, five impacts, in ever narrower intervals, and safe gaps between them that may be narrower
+still. A bisection of the verdict finds one end of them by chance. Here the margin, its slope and the number of impacts
+at sampled points tell where something may hide between two of them, and only there the sampling is refined.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxrock._checks import positive
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.scene import peak_bound, uplift_threshold
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.responses.rigid import outcome
+from jaxrock.status import Status
+from jaxrock.studies.parameters import named, rebuilt
+from jaxrock.sweeps.sweep import surface
+
+_FIRST = 256  # intervals of the first sampling
+
+
+_ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
+
+
+_TIGHT = 4e-15  # width of a bracket, relative
+
+
+class Critical(eqx.Module):
+    """Ends of overturning intervals, in rising order; (ends,) for one scene, (scenes, ends) for many, then filled up.
+
+    - `count`: number of ends.
+    - `value`: amplitude [g], or duration (or period) of the motion [s]; infinite where filled up.
+    - `intensity`: the amplitude over the uplift threshold [-].
+    - `rising`: the block overturns above this end, and not below.
+    - `impacts`: before it overturns, just beside this end.
+    - `balanced`: the block comes to balance at this end. If not, the verdict jumps: an impact is grazed, or the shaking
+      throws it flat; such an end has no derivatives here (NaN).
+    - `complete`: whether every point that was looked at could be decided.
+    - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene; the amplitude of
+      a motion stands for its size, and is left out for critical amplitudes.
+    """
+
+    count: Int[Array, "..."]
+    value: Float[Array, "..."]
+    intensity: Float[Array, "..."]
+    rising: Bool[Array, "..."]
+    impacts: Int[Array, "..."]
+    balanced: Bool[Array, "..."]
+    derivative: Float[Array, "..."]
+    complete: Bool[Array, "..."]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def lowest(self) -> Float[Array, "..."]:
+        """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none."""
+        return jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
+
+
+def critical_amplitudes(
+    block: Block | AsymmetricBlock,
+    motion: AbstractMotion,
+    model: Model = Housner(),
+    *,
+    intensity: tuple[float, float] = (1.0, 10.0),
+    derivatives: bool = True,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Critical:
+    """All amplitudes of a motion at which a block begins or ceases to overturn.
+
+    **Arguments:**
+
+    - `block`, `motion`: one scene, or many: parameters of shape (scenes,). The amplitude of the motion plays no part.
+    - `model`, `engine`: as in `outcome`.
+    - `intensity`: where to look: least and largest amplitude over the uplift threshold [-]. Below 1 nothing moves.
+    - `derivatives`: whether to find them; without, they are not numbers (NaN).
+    - `progress`: as in `rocking_spectrum`.
+
+    **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
+    themselves beside them may be missed; a safe gap between different numbers of impacts is not.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
+    """
+    low, high = _rising("intensity", intensity)
+    scenes = _Scenes.of(block, motion, model)
+    # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
+    grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
+    factors = grid * (scenes.threshold / scenes.peak)[:, None]
+    return _critical(scenes, np.log(factors), _Amplitude(model, engine), derivatives, progress)
+
+
+def critical_durations(
+    block: Block | AsymmetricBlock,
+    motion: AbstractMotion,
+    model: Model = Housner(),
+    *,
+    factor: tuple[float, float] = (0.05, 20.0),
+    derivatives: bool = True,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Critical:
+    """All durations of a motion of given amplitude at which a block begins or ceases to overturn.
+
+    **Arguments:**
+
+    - `block`, `motion`, `model`, `derivatives`, `engine`, `progress`: as in `critical_amplitudes`.
+    - `factor`: where to look: least and largest duration over that of `motion` [-], all times stretched alike.
+
+    **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    low, high = _rising("factor", factor)
+    scenes = _Scenes.of(block, motion, model)
+    grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
+    grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
+    return _critical(scenes, grid, _Duration(model, engine), derivatives, progress)
+
+
+def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
+    low, high = (float(positive(name, end)) for end in ends)
+    if low >= high:
+        raise ValueError(f"Argument `{name}` must be rising, but is {ends}.")
+    return low, high
+
+
+class _Scenes(eqx.Module):
+    """Many scenes: parameters of shape (scenes,), samples of a record as they are."""
+
+    block: Block | AsymmetricBlock
+    motion: AbstractMotion
+    threshold: np.ndarray  # [g], (scenes,)
+    peak: np.ndarray  # bound of the acceleration [g]
+    amplitude: np.ndarray  # as the motion names it [g]
+    single: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: Model) -> "_Scenes":
+        """Broadcast all parameters against one another."""
+        both = block, motion
+        numbers = [jnp.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(both) if not _shared(path)]
+        shape = jnp.broadcast_shapes(*numbers)
+        if len(shape) > 1:
+            raise ValueError(
+                f"The parameters of `block` and `motion` must be numbers or lists, but have shape {shape}."
+            )
+        size = shape[0] if shape else 1
+        block, motion = jax.tree_util.tree_map_with_path(
+            lambda path, leaf: leaf if _shared(path) else jnp.broadcast_to(leaf, (size,)), both
+        )
+
+        def facts(index):
+            block_, motion_ = _pick((block, motion), index)
+            return (
+                uplift_threshold(block_, model),
+                peak_bound(motion_),
+                jnp.abs(named(block_, motion_)["amplitude"]),
+            )
+
+        return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
+
+
+def _shared(path) -> bool:
+    return jax.tree_util.keystr(path).endswith(".samples")
+
+
+def _pick(
+    scenes: tuple[Block | AsymmetricBlock, AbstractMotion], index: Int[Array, ""]
+) -> tuple[Block | AsymmetricBlock, AbstractMotion]:
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: leaf if _shared(path) else leaf[index], scenes)
+
+
+# What is varied: z is the logarithm of a factor. Equal settings are one object, so that they compile once.
+
+
+class _Kind:
+    def __init__(self, model: Model, engine: AbstractEngine | None):
+        self.model, self.engine = model, engine
+
+    def margin(self, z, block, motion):
+        """Margin and outcome of the scene with the factor e^z."""
+        found = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
+        return found.margin, found
+
+    def at(self, z, index, scenes):
+        """Margin, its slope, impacts and status of one point."""
+        place = _pick(scenes, index)
+        margin, slope, found = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
+        decided = (found.status == Status.successful) | (found.status == Status.undecided)
+        return jnp.where(decided, margin, jnp.nan), slope, found.impact_count
+
+    def slopes(self, z, index, scenes):
+        """Derivatives of the logarithm of the critical value by the parameters."""
+        block, motion = _pick(scenes, index)
+        values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
+
+        def margin(z, values):
+            place = rebuilt(block, motion, named(block, motion) | values)
+            return self.margin(z, *place)[0]
+
+        def unit(values):
+            return jnp.log(self.unit(*rebuilt(block, motion, named(block, motion) | values)))
+
+        by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
+        own = jax.jacfwd(unit)(values)
+        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
+        return {name: own[name] - slope / by_z for name, slope in by_values.items()}
+
+
+class _Amplitude(_Kind):
+    def scene(self, z, block, motion):
+        """A larger motion."""
+        return block, Scaled(motion, jnp.exp(z))
+
+    def unit(self, block, motion):
+        """What the factor multiplies: the amplitude [g]."""
+        return jnp.abs(named(block, motion)["amplitude"])
+
+    def keeps(self, name: str) -> bool:
+        """Whether the critical value depends on a parameter."""
+        return name != "amplitude"
+
+
+class _Duration(_Kind):
+    def scene(self, z, block, motion):
+        """A longer motion is a larger p: only their product counts."""
+        return eqx.tree_at(lambda b: b.p, block, block.p * jnp.exp(z)), motion
+
+    def unit(self, block, motion):
+        """What the factor multiplies: the duration of the motion [s]."""
+        return motion.end
+
+    def keeps(self, name: str) -> bool:
+        """Whether the critical value depends on a parameter."""
+        return name not in ("duration", "period", "dt")
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(kind: type, model: Model, engine: AbstractEngine | None, slopes: bool) -> Callable:
+    return kind(model, engine).slopes if slopes else kind(model, engine).at
+
+
+def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool, progress: bool | None) -> Critical:
+    """Search, find, differentiate, and sort by scenes."""
+    scene = scenes.block, scenes.motion
+
+    def run(slopes, z, index):
+        function = _compiled(type(kind), kind.model, kind.engine, slopes)
+        return surface(function, (z, index), scene, "critical", progress, outer=False)
+
+    def at(z, index):
+        return tuple(map(np.asarray, run(False, z, index)))
+
+    found, complete = _brackets(at, grid)
+    ends = _roots(at, found)
+    order = np.lexsort((ends["z"], ends["index"]))
+    ends = {name: values[order] for name, values in ends.items()}
+    names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
+    units = np.asarray(jax.vmap(lambda index: kind.unit(*_pick(scene, index)))(jnp.arange(grid.shape[0])))
+    value = np.exp(ends["z"]) * units[ends["index"]]
+    derivative = np.full((order.size, len(names)), np.nan)
+    if derivatives and order.size:
+        slopes = run(True, ends["safe"], ends["index"])
+        derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
+        derivative[~ends["balanced"]] = np.nan
+    amplitude = value if isinstance(kind, _Amplitude) else scenes.amplitude[ends["index"]]
+    rows = {
+        "value": (value, np.inf),
+        "intensity": (amplitude / scenes.threshold[ends["index"]], np.inf),
+        "rising": (ends["rising"], False),
+        "impacts": (ends["impacts"], 0),
+        "balanced": (ends["balanced"], False),
+        "derivative": (derivative, np.nan),
+    }
+    count = np.bincount(ends["index"], minlength=grid.shape[0])
+    place = np.arange(order.size) - np.repeat(np.cumsum(count) - count, count)
+
+    def filled(values, rest):
+        table = np.full((grid.shape[0], int(count.max(initial=0)), *values.shape[1:]), rest, values.dtype)
+        table[ends["index"], place] = values
+        return jnp.asarray(table[0] if scenes.single else table)
+
+    first = 0 if scenes.single else slice(None)
+    counts = jnp.asarray(count[first]), jnp.asarray(complete[first])
+    return Critical(counts[0], *(filled(*row) for row in rows.values()), complete=counts[1], names=names)
+
+
+def _brackets(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Intervals with one end each; and for every scene whether all points could be decided.
+
+    An interval is halved where the verdict changes, until that is all that happens in it; and where an end may hide:
+    the margin's tangents meet beyond zero or near it, or both sides overturn after different numbers of impacts (there
+    may be a gap between them). Where the margin is not smooth it is halved some times for good measure.
+    """
+    scenes, points = grid.shape
+    index = np.repeat(np.arange(scenes), points)
+    margin, slope, impacts = (x.reshape(scenes, points) for x in at(grid.ravel(), index))
+    sides = [np.stack([x[:, :-1].ravel(), x[:, 1:].ravel()]) for x in (grid, margin, slope, impacts)]
+    index, depth = np.repeat(np.arange(scenes), points - 1), np.zeros(scenes * (points - 1), int)
+    complete = ~np.isnan(margin).any(axis=1)
+    kept = []
+    while index.size:
+        middle = sides[0].mean(axis=0)
+        values = (middle, *at(middle, index))
+        complete[index[np.isnan(values[1])]] = False
+        (left, right), (low, high), (rise, fall) = sides[0], sides[1], sides[2]
+        guess = (low + high) / 2 + (rise - fall) * (right - left) / 8  # cubic through both values and slopes
+        size = np.minimum(np.minimum(np.abs(low), np.abs(high)), np.abs(values[1]))
+        rough = np.abs(values[1] - guess) > 0.05 * size
+        halves = [
+            [np.stack([x[0], v]) for x, v in zip(sides, values)],
+            [np.stack([v, x[1]]) for x, v in zip(sides, values)],
+        ]
+        sides = [np.concatenate([first, second], axis=1) for first, second in zip(*halves)]
+        index, depth, rough = np.tile(index, 2), np.tile(depth, 2) + 1, np.tile(rough, 2)
+        width = sides[0][1] - sides[0][0]
+        differ = (sides[1][0] < 0) != (sides[1][1] < 0)
+        hidden = ~differ & _may_hide(*sides) & (width > _TIGHT)
+        single = differ & (depth >= _ROUGH)
+        kept.append((index[single], *(x[:, single] for x in sides)))
+        more = ((differ | rough) & (depth < _ROUGH)) | (hidden & (depth < _DEEP))
+        more &= ~np.isnan(sides[1]).any(axis=0) & ~single
+        sides, index, depth = [x[:, more] for x in sides], index[more], depth[more]
+    names = ("index", "z", "margin", "slope", "impacts")
+    return {name: np.concatenate([part[k] for part in kept], axis=-1) for k, name in enumerate(names)}, complete
+
+
+def _may_hide(z: np.ndarray, margin: np.ndarray, slope: np.ndarray, impacts: np.ndarray) -> np.ndarray:
+    """Whether the margin may pass through zero twice between two points at which it has the same sign."""
+    width, sign = z[1] - z[0], np.where(margin[0] < 0, -1.0, 1.0)
+    low, high, rise, fall = sign * margin[0], sign * margin[1], sign * slope[0], sign * slope[1]
+    dips = (rise < 0) & (fall > 0)
+    where = (high - fall * width - low) / np.where(dips, rise - fall, 1.0)
+    lowest = np.where(dips, low + rise * where, np.inf)
+    plunges = (low + rise * width < 0) | (high - fall * width < 0)
+    gap = (sign < 0) & (impacts[0] != impacts[1])
+    return (lowest < 0.3 * np.minimum(low, high)) | plunges | gap
+
+
+def _roots(at: Callable, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The end in every bracket to rounding, by Newton's method, which bisection keeps within it."""
+    index, z, margin, slope, impacts = (found[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
+    columns = np.arange(index.size)
+    for count in range(120):
+        width = z[1] - z[0]
+        open_ = width > _TIGHT * np.maximum(1.0, np.abs(z).max(axis=0))
+        if not open_.any():
+            break
+        near = np.abs(margin[1]) < np.abs(margin[0])
+        side = near.astype(int)
+        best, value, rate = z[side, columns], margin[side, columns], slope[side, columns]
+        step = -value / np.where(rate == 0, np.inf, rate)
+        # A little too far, so that the bracket closes from both sides.
+        trial = best + 1.05 * step + np.copysign(_TIGHT / 4, step)
+        inside = (trial > z[0]) & (trial < z[1]) & (count % 4 != 3)
+        trial = np.where(inside, trial, z.mean(axis=0))[open_]
+        values = (trial, *at(trial, index[open_]))
+        onto = ((values[1] < 0) == (margin[1, open_] < 0)).astype(int)
+        for array, new in zip((z, margin, slope, impacts), values):
+            array[onto, columns[open_]] = new
+    rising = ~(margin[0] < 0)  # zero is safe
+    lost, safe = rising.astype(int), 1 - rising.astype(int)
+    return {
+        "index": index,
+        "z": z.mean(axis=0),
+        "safe": z[safe, columns],
+        "rising": rising,
+        "impacts": impacts[lost, columns],
+        "balanced": np.abs(margin).max(axis=0, initial=0.0) < 1e-6,
+    }

@@ -1,0 +1,192 @@
+"""How a response depends on the parameters of its scene, and how far that can be trusted."""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
+
+from jaxrock._checks import Values, as_real, not_nan
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.scene import uplift_threshold
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.exponential import ExponentialPulse
+from jaxrock.responses.rigid import Outcome, outcome
+from jaxrock.status import Status
+from jaxrock.studies.parameters import named, rebuilt
+from jaxrock.studies.spectra import axis
+from jaxrock.sweeps.sweep import surface
+
+Scalar = Inexact[Array, "..."]
+
+
+class Slopes(eqx.Module):
+    """How one result depends on the parameters.
+
+    - `value`: the result.
+    - `derivative`: (..., parameters) partial derivatives, in the units of the result over those of the parameters.
+    - `elasticity`: (..., parameters) per cent of the result per cent of the parameter, d ln y/d ln x.
+    """
+
+    value: Scalar
+    derivative: Inexact[Array, "... parameters"]
+    elasticity: Inexact[Array, "... parameters"]
+
+
+class Sensitivity(eqx.Module):
+    """What `sensitivity` finds.
+
+    - `names`, `values`: the parameters; the last, where the motion is a pulse or a record, is `uplift_strength`.
+    - `max_rotation`, `max_velocity`, `margin`: `Slopes` of [rad], [rad/s], [-].
+    - `outcome`: the response itself.
+    - `valid`: whether the derivatives of `max_rotation` describe the response: computed, not overturned, and smooth
+      here (`Outcome.differentiable`). Where it is false they are not numbers (NaN).
+    - `condition`: length of the vector of elasticities of `max_rotation`: relative errors grow by up to that much.
+    - `graze_distance`: relative change of the parameters (of all together, in the worst direction, to first order) that
+      makes a grazing impact appear or vanish before the peak, and with it changes the number of impacts; infinite if
+      the block has been far from any graze.
+    - `boundary_distance`: the same for overturning, or for not overturning: margin over its slope.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Inexact[Array, "... parameters"]
+    max_rotation: Slopes
+    max_velocity: Slopes
+    margin: Slopes
+    outcome: Outcome
+    valid: Bool[Array, "..."]
+    condition: Scalar
+    graze_distance: Scalar
+    boundary_distance: Scalar
+
+
+_RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
+
+
+def sensitivity(
+    block: Block | AsymmetricBlock,
+    motion: AbstractMotion,
+    model: Model = Housner(),
+    *,
+    engine: AbstractEngine | None = None,
+) -> Sensitivity:
+    """Derivatives and elasticities of a response by every parameter of its scene, and where they end.
+
+    **Arguments:**
+
+    - `block`, `motion`, `model`, `engine`: as in `outcome`; under `jax.vmap` for many scenes.
+
+    **Returns:** a `Sensitivity`. Derivatives are partial: `alpha` with the restitution following it if that is
+    Housner's, but at a fixed amplitude [g]; `amplitude` of a record scales all of it; `uplift_strength`, the uplift
+    threshold over the amplitude, is changed by the amplitude.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    parameters = named(block, motion)
+    names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
+
+    def results(values):
+        changed = rebuilt(block, motion, dict(zip(names, values)))
+        found = outcome(*changed, model, engine=engine)
+        return jnp.stack([getattr(found, name) for name in _RESULTS]), found
+
+    rows, found = jax.jacfwd(results, has_aux=True)(values)
+    valid = (found.status == Status.successful) & found.differentiable
+    # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
+    amplitude = values[names.index("amplitude")]
+    strength = uplift_threshold(block, model) / jnp.abs(amplitude)
+    rows = jnp.concatenate([rows, -rows[:, [names.index("amplitude")]] * amplitude / strength], axis=1)
+    independent = len(names)
+    values = jnp.append(values, strength)
+
+    def slopes(name, known):
+        value, row = getattr(found, name), rows[_RESULTS.index(name)]
+        relative = row * values / jnp.where(value == 0, 1.0, value)
+        row, relative = (jnp.where(known, x, jnp.nan) for x in (row, relative))
+        return Slopes(value, row, relative)
+
+    def distance(name, value):
+        """To first order, the relative change of all parameters together that makes a result zero."""
+        steepest = jnp.linalg.norm((rows[_RESULTS.index(name)] * values)[:independent])
+        near = jnp.isfinite(value) & (steepest > 0)
+        return jnp.where(near, jnp.abs(value) / jnp.where(near, steepest, 1.0), jnp.inf)
+
+    successful = found.status == Status.successful
+    rotation = slopes("max_rotation", valid)
+    return Sensitivity(
+        names=(*names, "uplift_strength"),
+        values=values,
+        max_rotation=rotation,
+        max_velocity=slopes("max_velocity", valid),
+        margin=slopes("margin", successful),
+        outcome=found,
+        valid=valid,
+        condition=jnp.linalg.norm(rotation.elasticity[:independent]),
+        graze_distance=distance("clearance", found.clearance),
+        boundary_distance=distance("margin", found.margin),
+    )
+
+
+class SensitivityMap(eqx.Module):
+    """Sensitivities of a block under the exponential pulse; results have the shape (strengths, durations).
+
+    - `uplift_strength`, `pulse_duration`: the axes, threshold/amplitude and p t_d [-]; `shape` of the pulse.
+    - `sensitivity`: a `Sensitivity` whose arrays have these two axes in front.
+    """
+
+    uplift_strength: Float[Array, " rows"]
+    pulse_duration: Float[Array, " columns"]
+    shape: Float[Array, ""]
+    sensitivity: Sensitivity
+
+
+def sensitivity_map(
+    uplift_strength: Values,
+    pulse_duration: Values,
+    shape: ArrayLike = 0.0,
+    *,
+    alpha: ArrayLike = 0.2,
+    restitution: ArrayLike | None = None,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> SensitivityMap:
+    """Sensitivities over uplift strength and pulse duration, for one shape of the exponential pulse.
+
+    **Arguments:**
+
+    - `uplift_strength`: (rows,) uplift threshold over amplitude [-], positive; below 1 the block uplifts.
+    - `pulse_duration`: (columns,) p t_d [-], positive.
+    - `shape`: of the pulse, as in `ExponentialPulse`.
+    - `alpha`, `restitution`, `model`, `engine`, `progress`: as in `self_similar_spectrum`.
+
+    **Returns:** a `SensitivityMap`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Voyagaki, Psycharis & Mylonakis (2012), 2.1 (the pulse) and 2.2 (its dimensionless parameters).
+    """
+    strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
+    shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
+    Block(alpha, 1.0, restitution)  # raises here, where values are known
+    scene = shape, alpha, None if restitution is None else as_real("restitution", restitution)
+    found = surface(_under_lobe(model, engine), (strength, duration), scene, "sensitivity", progress)
+    return SensitivityMap(strength, duration, shape, found)
+
+
+@functools.lru_cache(maxsize=32)
+def _under_lobe(model: Model, engine: AbstractEngine | None) -> Callable:
+    def one(strength, duration, scene):
+        shape, alpha, restitution = scene
+        block = Block(alpha, jnp.ones_like(alpha), restitution)
+        # Positive acceleration drives negative rotation; the size of the response is the same.
+        pulse = ExponentialPulse(model.table(block).threshold / strength, duration, shape)
+        return sensitivity(block, pulse, model, engine=engine)
+
+    return one

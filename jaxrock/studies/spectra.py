@@ -1,0 +1,211 @@
+"""Whole surfaces: rocking spectra and overturning maps."""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxrock._checks import Values, as_real, positive
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.rigid import Housner
+from jaxrock.models.user_equation import Model
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.sinusoidal import SinePulse
+from jaxrock.responses.rigid import Outcome, outcome
+from jaxrock.status import Status
+from jaxrock.sweeps.sweep import surface
+
+
+class Spectrum(eqx.Module):
+    """A rocking spectrum; every result has the shape (..., len(abscissa)).
+
+    - `abscissa`: 2 pi/p [s], or the frequency ratio omega/p [-] of a self-similar spectrum.
+    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
+    - `max_velocity`: peak |angular velocity| over p alpha [-]; infinite where the block overturned.
+    - `impact_count`, `overturned`, `margin`, `status`: as in `Outcome`.
+    - `intensity`: peak acceleration over the uplift threshold [-], one per row (self-similar spectrum), or None.
+    """
+
+    abscissa: Float[Array, " n"]
+    max_rotation: Float[Array, "*rows n"]
+    max_velocity: Float[Array, "*rows n"]
+    impact_count: Int[Array, "*rows n"]
+    overturned: Bool[Array, "*rows n"]
+    margin: Float[Array, "*rows n"]
+    status: Status
+    intensity: Float[Array, " rows"] | None = None
+
+
+class OverturningMap(eqx.Module):
+    """An overturning map; every result has the shape (len(intensity), len(frequency_ratio)).
+
+    - `frequency_ratio`: omega/p [-]; `intensity`: peak acceleration over the uplift threshold [-].
+    - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
+    - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
+    - `impact_count`, `margin`, `status`: as in `Outcome`.
+    """
+
+    frequency_ratio: Float[Array, " columns"]
+    intensity: Float[Array, " rows"]
+    state: Int[Array, "rows columns"]
+    max_rotation: Float[Array, "rows columns"]
+    impact_count: Int[Array, "rows columns"]
+    margin: Float[Array, "rows columns"]
+    status: Status
+
+
+def rocking_spectrum(
+    alpha: ArrayLike,
+    motion: AbstractMotion,
+    period: Values,
+    restitution: ArrayLike | None = None,
+    model: Model = Housner(),
+    *,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Spectrum:
+    """Peak response of blocks of one slenderness and every size under one motion.
+
+    **Arguments:**
+
+    - `alpha`: slenderness angle [rad], in (0, pi/2).
+    - `motion`: any motion.
+    - `period`: (n,) values of 2 pi/p [s], positive.
+    - `restitution`, `model`, `engine`: as in `Block` and `outcome`.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** a `Spectrum` over the periods.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
+    """
+    period = axis("period", period)
+    Block(alpha, 1.0, restitution)  # raises here, where values are known
+
+    scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
+    return Spectrum(period, **surface(_under_motion(model, engine), (period,), scene, "spectrum", progress))
+
+
+def self_similar_spectrum(
+    frequency_ratio: Values,
+    intensity: Values,
+    *,
+    alpha: ArrayLike = 0.2,
+    restitution: ArrayLike | None = None,
+    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> Spectrum:
+    """Peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
+
+    **Arguments:**
+
+    - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
+    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
+    - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
+    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that).
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+
+    **Returns:** a `Spectrum` with results of shape (rows, n).
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), section 4.
+    """
+    found, ratio, intensity = _over_pulses(
+        _peaks, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
+    )
+    return Spectrum(abscissa=ratio, intensity=intensity, **found)
+
+
+def overturning_map(
+    frequency_ratio: Values,
+    intensity: Values,
+    *,
+    alpha: ArrayLike = 0.2,
+    restitution: ArrayLike | None = None,
+    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    model: Model = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> OverturningMap:
+    """Who overturns under a pulse, over its frequency and intensity.
+
+    **Arguments:** as in `self_similar_spectrum`.
+
+    **Returns:** an `OverturningMap`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
+    """
+    found, ratio, intensity = _over_pulses(
+        _states, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
+    )
+    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **found)
+
+
+def _over_pulses(quantities, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
+    """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
+    ratio, intensity = axis("frequency_ratio", frequency_ratio), axis("intensity", intensity)
+    Block(alpha, 1.0, restitution)
+
+    scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
+    # Neighbours in intensity share a chunk: they move alike.
+    function = _under_pulse(quantities, pulse, model, engine)
+    found = surface(function, (intensity, ratio), scene, label, progress, columns=True)
+    return found, ratio, intensity
+
+
+def axis(name: str, values: Values) -> Float[Array, " n"]:
+    array = jnp.atleast_1d(positive(name, values))
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")
+    return array
+
+
+# What a surface keeps of an outcome: computed with it, point by point.
+
+
+def _peaks(found: Outcome, block: Block) -> dict:
+    """Of a spectrum."""
+    rest = {name: getattr(found, name) for name in ("impact_count", "overturned", "margin", "status")}
+    velocity = found.max_velocity / (block.p * block.alpha)
+    return {"max_rotation": found.max_rotation / block.alpha, "max_velocity": velocity, **rest}
+
+
+def _states(found: Outcome, block: Block) -> dict:
+    """Of a map."""
+    rest = {name: getattr(found, name) for name in ("impact_count", "margin", "status")}
+    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
+    state = jnp.where(found.status == Status.successful, state, -1)
+    return {"state": state, "max_rotation": found.max_rotation / block.alpha, **rest}
+
+
+# One function for each kind of surface, so that a second surface of a kind is not compiled again.
+
+
+@functools.lru_cache(maxsize=32)
+def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
+    def one(period, scene):
+        alpha, motion, restitution = scene
+        block = Block(alpha, 2 * jnp.pi / period, restitution)
+        return _peaks(outcome(block, motion, model, engine=engine), block)
+
+    return one
+
+
+@functools.lru_cache(maxsize=32)
+def _under_pulse(quantities: Callable, pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
+    def one(intensity, ratio, scene):
+        alpha, restitution = scene
+        block = Block(alpha, jnp.ones_like(alpha), restitution)
+        motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
+        return quantities(outcome(block, motion, model, engine=engine), block)
+
+    return one

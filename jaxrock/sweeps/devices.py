@@ -1,0 +1,109 @@
+"""The devices a surface is spread over: CPU cores or GPUs of this process, and the other processes of a job."""
+
+import functools
+import itertools
+import os
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import UInt8
+
+# Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
+_CPU_OPTIONS = {
+    "xla_cpu_prefer_vector_width": 512,
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+    "xla_cpu_fast_math_honor_division": True,
+    "xla_cpu_fast_math_honor_functions": True,
+}
+
+
+_PATIENCE = 7 * 24 * 3600  # seconds a process waits for the others: shares of a sweep may take long
+
+
+def use_cpu_devices(count: int | None = None) -> int:
+    """Make every CPU core a device of JAX, so that surfaces are computed on all of them.
+
+    Call it before the first computation. It changes nothing on GPUs.
+
+    **Arguments:**
+
+    - `count`: number of devices, at least 1; None: the cores this process may run on (its CPU affinity).
+
+    **Returns:** the number of devices.
+
+    **Raises:** ValueError for a count below 1; RuntimeError if JAX has begun to compute with another number of devices.
+    """
+    if count is None:
+        count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if count < 1:
+        raise ValueError(f"Argument `count` must be at least 1, but is {count}.")
+    try:
+        jax.config.update("jax_num_cpu_devices", count)
+    except RuntimeError as error:  # JAX has chosen its devices
+        there = len(jax.local_devices(backend="cpu"))
+        if there != count:
+            raise RuntimeError(
+                f"JAX already computes with {there} CPU device{'s' * (there > 1)}: call `use_cpu_devices` before the "
+                f"first computation to have {count}."
+            ) from error
+    return count
+
+
+def local_devices() -> tuple[jax.Device, ...]:
+    """Devices of this process that share the work: all of the default backend, or the one chosen as default."""
+    chosen = jax.config.jax_default_device
+    return (chosen,) if isinstance(chosen, jax.Device) else tuple(jax.local_devices(backend=chosen))
+
+
+@functools.cache
+def compiler_options(platform: str) -> dict | None:
+    """Options of a compiled call, where this platform and this jaxlib know them."""
+    if platform != "cpu":
+        return None
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=_CPU_OPTIONS)(1.0)
+    except Exception:  # reported by an internal error type
+        return None
+    return _CPU_OPTIONS
+
+
+# Many processes: they run the same program, and meet where it says so.
+
+
+def process() -> tuple[int, int]:
+    """Number of this process, and how many there are."""
+    return jax.process_index(), jax.process_count()
+
+
+_meetings = itertools.count()
+
+
+def meet() -> None:
+    """Wait until all processes are here."""
+    if jax.process_count() == 1:
+        return
+    # A collective of devices would give up after some seconds; the service that started the processes waits.
+    from jax._src.distributed import global_state
+
+    global_state.client.wait_at_barrier(f"jaxrock-{next(_meetings)}", _PATIENCE * 1000)
+
+
+def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes bytes"]:
+    """What every process brought along, to all of them; the same length everywhere."""
+    mesh, copy = _one_device_each()
+    dealt = NamedSharding(mesh, PartitionSpec("processes"))
+    here = jax.device_put(own[None], mesh.local_devices[0])
+    together = jax.make_array_from_single_device_arrays((jax.process_count(), own.size), dealt, [here])
+    return np.asarray(copy(together).addressable_data(0))
+
+
+@functools.cache
+def _one_device_each() -> tuple[Mesh, Callable]:
+    """One device of every process (their numbers may differ), and what copies an array across them to all."""
+    first = {device.process_index: device for device in reversed(jax.devices())}
+    mesh = Mesh(np.array([first[number] for number in sorted(first)]), ("processes",))
+    return mesh, jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, PartitionSpec()))

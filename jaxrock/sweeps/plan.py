@@ -1,0 +1,108 @@
+"""A grid of points, its blocks, and the order in which points are computed."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrock.sweeps.grid import shape_of
+
+_CHUNK = 64  # neighbours that are dealt to a device together
+
+
+_TILE = 8  # and their extent along each of the last two axes of a grid
+
+
+_ROWS = 4  # vmapped functions of up to 16,384 lanes (65,536 on a GPU) in one compiled call
+
+
+_SMALLEST_BLOCK = 65536
+
+
+_LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
+
+
+_BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
+
+
+class Plan(NamedTuple):
+    """A grid of points and its blocks: tiles of `block` points along every axis, the last of an axis may be smaller."""
+
+    axes: tuple[np.ndarray, ...]
+    outer: bool
+    block: tuple[int, ...]
+
+    @classmethod
+    def of(cls, axes: tuple[np.ndarray, ...], outer: bool, points: int | None = None) -> "Plan":
+        """Blocks of about so many points: whole rows of the last axes, where they fit."""
+        shape = shape_of(axes, outer)
+        room = points or min(max(_SMALLEST_BLOCK, math.prod(shape) // _BLOCKS), _LARGEST_BLOCK)
+        block = []
+        for size in reversed(shape):
+            parts = -(-size // max(room, 1))
+            block.insert(0, -(-size // parts))  # parts of like size
+            room //= block[0]
+        return cls(axes, outer, tuple(block))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the grid."""
+        return shape_of(self.axes, self.outer)
+
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Number of blocks along every axis."""
+        return tuple(-(-size // part) for size, part in zip(self.shape, self.block))
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Number of points of every block."""
+        along = [np.minimum(part, n - part * np.arange(-(-n // part))) for n, part in zip(self.shape, self.block)]
+        return functools.reduce(np.multiply.outer, along).ravel()
+
+    def place(self, number: int) -> tuple[slice, ...]:
+        """Where a block lies in the grid."""
+        index = np.unravel_index(number, self.blocks)
+        return tuple(slice(int(i) * p, min((int(i) + 1) * p, n)) for i, p, n in zip(index, self.block, self.shape))
+
+    def points(self, number: int) -> list[np.ndarray]:
+        """The flat points of a block."""
+        place = self.place(number)
+        if not self.outer:
+            return [values[place[0]] for values in self.axes]
+        parts = [values[part] for values, part in zip(self.axes, place)]
+        return [x.ravel() for x in np.meshgrid(*parts, indexing="ij")]
+
+
+def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
+    """Shape of a batch: rows, devices, lanes. As many lanes at once as there are points, in few different numbers,
+    each of which is compiled."""
+    share = -(-points // devices)
+    least, most = (64, 16384) if platform == "cpu" else (1024, 65536)
+    lanes = 2 ** (min(max(share, least), most) - 1).bit_length()
+    rows = min(_ROWS, 2 ** (max(-(-share // lanes), 1) - 1).bit_length())
+    return rows, devices, lanes
+
+
+def deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Flat points in the shape of a batch. Chunks are dealt in turn: neighbours cost alike, so shares do, too."""
+    rows, devices, lanes = shape
+    return points.reshape(rows, lanes // _CHUNK, devices, _CHUNK).swapaxes(1, 2).reshape(shape)
+
+
+@functools.lru_cache(maxsize=16)
+def dealt_to(shape: tuple[int, int, int]) -> list[np.ndarray]:
+    """Which of a batch's points every device has, in its order."""
+    return [own.ravel() for own in np.moveaxis(deal(np.arange(math.prod(shape)), shape), 1, 0)]
+
+
+@functools.lru_cache(maxsize=16)
+def tiles(shape: tuple[int, ...], columns: bool) -> np.ndarray:
+    """The order of a block's flat points in which neighbours along both of its last axes are near each other, those
+    along the last (`columns`: the last but one) nearest."""
+    if len(shape) < 2:
+        return np.arange(math.prod(shape))
+    *rest, i, j = (x.ravel() for x in np.indices(shape))
+    within = (i, j) if columns else (j, i)
+    return np.lexsort((*within, j // _TILE, i // _TILE, *reversed(rest)))

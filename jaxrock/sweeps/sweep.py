@@ -1,0 +1,187 @@
+"""Many scenes: points of labelled axes, in blocks of few compiled shapes, over devices, processes and interruptions.
+
+Three sizes: a *chunk* of neighbours steps together on one core (see `lanes`); a *batch* of chunks, dealt to the devices
+in turn, is one compiled call; a *block* of batches is a tile of the grid that is computed, written to a store, and
+dealt to the processes as a whole. A point's result depends on nobody else's, so it is the same however they are dealt.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxrock._progress import Progress
+from jaxrock.sweeps.devices import exchange, meet, process
+from jaxrock.sweeps.grid import Grid, names_of
+from jaxrock.sweeps.plan import Plan, tiles
+from jaxrock.sweeps.runner import Runner
+from jaxrock.sweeps.store import Store, create, fingerprint
+from jaxrock.transforms.fingerprint import Traced
+
+
+def sweep(
+    function: Callable,
+    /,
+    *,
+    outer: bool = True,
+    store: str | Path | None = None,
+    load: bool = True,
+    block: int | None = None,
+    progress: bool | None = None,
+    **axes: ArrayLike | Sequence,
+) -> Grid | None:
+    """Evaluate a function at every point of labelled axes, on all devices, and on all machines of a job.
+
+    **Arguments:**
+
+    - `function`: called with one number for every axis, by name; returns an `Outcome` or any pytree of arrays. It is
+      traced, as under `jax.vmap`.
+    - `axes`: (n,) values of each axis, at least one. Neighbours along the last axis are computed together.
+    - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
+    - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
+      it is called again. All processes of a job use the same path. Needs `pip install "jaxrock[store]"`.
+    - `load`: whether to return the results. They can stay in the store, if they are too many for the memory.
+    - `block`: points that are computed, written and dealt to a process at a time; None: as many as fit well, between
+      65,536 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** a `Grid`, the same in every process; None if the results stay in the store.
+
+    **Raises:** ValueError for axes that are not lists of numbers, for values that the function refuses, or for a store
+    of another sweep; ImportError for a store without zarr.
+    """
+    if not axes:
+        raise ValueError("A sweep needs at least one axis, such as `p=[1.0, 2.0]`.")
+    if store is None and not load:
+        raise ValueError("Argument `load` must be True where there is no `store`.")
+    lists = {name: _axis(name, values) for name, values in axes.items()}
+    if not outer and len({values.size for values in lists.values()}) > 1:
+        sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
+        raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
+    if block is not None and block < 1:
+        raise ValueError(f"Argument `block` must be at least 1, but is {block}.")
+
+    traced = Traced(function, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
+    names = names_of(traced.shapes)
+    if not names or set(names) & set(axes):
+        raise ValueError(f"The function must return arrays with other names than the axes, but returns {names}.")
+    plan = Plan.of(tuple(lists.values()), outer, block)
+    keeper = None
+    if store is not None:
+        keeper = _keeper(store, plan, lists, traced)
+        plan = plan._replace(block=keeper.block)
+    values, resumed = compute(traced, plan, traced.constants, "sweep", progress, store=keeper, load=load)
+    return Grid(lists, values, outer, resumed) if load else None
+
+
+def _keeper(path: str | Path, plan: "Plan", axes: dict[str, np.ndarray], traced: Traced) -> Store:
+    """The store at a path: made by the first process, if there is none; a sweep's own, in every process."""
+    made_by = fingerprint(axes, plan.outer, traced.fingerprint)
+    names, leaves = names_of(traced.shapes), jax.tree.leaves(traced.shapes)
+    try:
+        if process()[0] == 0 and not Path(path).exists():
+            create(path, axes, plan.outer, names, leaves, plan.block, made_by)
+    finally:
+        meet()  # whatever became of it
+    return Store(path, names, made_by)
+
+
+def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
+    array = np.asarray(values)
+    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
+        raise ValueError(
+            f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
+            f"{array.dtype}."
+        )
+    return np.asarray(jnp.asarray(array))  # in the precision of the session
+
+
+def surface(
+    function: Callable,
+    axes: tuple,
+    scene,
+    label: str,
+    progress: bool | None,
+    outer: bool = True,
+    columns: bool = False,
+):
+    """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
+    `columns`: neighbours along the last axis but one are computed together."""
+    plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
+    found = compute(function, plan, scene, label, progress, columns=columns)[0]
+    return jax.tree.map(jnp.asarray, found)
+
+
+def compute(
+    function: Callable,
+    plan: Plan,
+    scene,
+    label: str,
+    progress: bool | None,
+    *,
+    store: Store | None = None,
+    load: bool = True,
+    columns: bool = False,
+) -> tuple[Any, int]:
+    """`function(*point, scene)` on a grid: results as NumPy arrays, and how many points a store had already.
+
+    With many processes each takes its turn of the blocks; every process returns all.
+    """
+    run = Runner(function, plan.axes, scene, math.prod(plan.block))
+    own, count = process()
+    done = store.finished() if store else np.zeros(math.prod(plan.blocks), bool)
+    if store:
+        meet()  # all have seen the same blocks before one of them writes more
+    left = np.flatnonzero(~done).tolist()
+    mine = left[own::count]
+    resumed = int(plan.sizes[done].sum())
+    if resumed and own == 0 and progress is not False:
+        print(f"{label}: {resumed:,} of {math.prod(plan.shape):,} points come from {store.path}", file=sys.stderr)
+    bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
+    whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
+    results = None if store or whole else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
+
+    for number in mine:
+        place = plan.place(number)
+        shape = tuple(p.stop - p.start for p in place)
+        found = run(plan.points(number), bar.add, tiles(shape, columns))
+        found = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in found]
+        if store:
+            store.write(place, found)
+        elif whole:
+            results = found
+        else:
+            for leaf, part in zip(results, found):
+                leaf[place] = part
+    if count > 1:
+        meet()
+        if not store:
+            _gather(results, plan, left)
+    if store:
+        results = store.read() if load else None
+    return None if results is None else jax.tree.unflatten(run.tree, results), resumed
+
+
+def _gather(results: list[np.ndarray], plan: Plan, numbers: list[int]) -> None:
+    """Give every process the blocks of all, a round of one block each at a time."""
+    own, count = process()
+    largest = sum(math.prod(plan.block) * leaf.itemsize * math.prod(leaf.shape[len(plan.shape) :]) for leaf in results)
+    for begin in range(0, len(numbers), count):
+        dealt = numbers[begin : begin + count]
+        message = np.zeros(largest, np.uint8)
+        if own < len(dealt):
+            parts = [np.ravel(leaf[plan.place(dealt[own])]).view(np.uint8) for leaf in results]
+            told = np.concatenate(parts)
+            message[: told.size] = told
+        for number, told in zip(dealt, exchange(message)):
+            place, at = plan.place(number), 0
+            for leaf in results:
+                part = leaf[place]
+                leaf[place] = told[at : at + part.nbytes].copy().view(leaf.dtype).reshape(part.shape)
+                at += part.nbytes
