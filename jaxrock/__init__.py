@@ -74,6 +74,8 @@ from jaxrock.inverse.posterior import (
     sample_motion as sample_motion,
 )
 from jaxrock.inverse.unknowns import Unknown as Unknown
+from jaxrock.models.coefficients import Coefficients as Coefficients, Terms as Terms
+from jaxrock.models.equation import AbstractEquation as AbstractEquation
 from jaxrock.models.rigid import Housner as Housner, Linear as Linear
 from jaxrock.models.spring import Spring as Spring
 from jaxrock.models.user_equation import Equation as Equation

@@ -95,7 +95,7 @@ def test_equation_of_the_built_in_model():
         rk.Equation(sine, cosine),
         rk.Equation(acceleration=lambda x, v, push, block: -sine(x, block) - push * cosine(x, block)),
     ):
-        table = model.table(BLOCK)
+        table = model.moments(BLOCK)
         assert float(table.saddle) == pytest.approx(0.2, rel=1e-15)
         assert float(table.threshold) == pytest.approx(np.tan(0.2), rel=1e-15)
         found = rk.outcome(BLOCK, PULSE, model)

@@ -168,7 +168,7 @@ def test_a_step_against_its_own_series(model, vertical):
     order = 12
 
     def start(q):
-        table = model.table(rk.Block(q[0], 2.0))
+        table = model.moments(rk.Block(q[0], 2.0))
         forcing = [q[4 + k] for k in range(5)] + [0.0 * q[0]] * (order - 4)
         shaking = Shaking(forcing, [0.5 * q[4] - 0.1, q[5] * q[6], -q[7]] if vertical else None)
         return Start(table, q[1], jnp.ones(()), jnp.array(False), q[2], q[3], shaking, jnp.ones(()))

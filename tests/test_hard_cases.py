@@ -51,7 +51,7 @@ def test_energy(model):
     """Between impacts the energy of a free block is constant; at an impact its kinetic part drops by e^2."""
     block = rk.Block(0.3, 2.0, 0.85)
     response = rk.simulate(block, STILL, model, initial=(-0.25, 0.1), duration=12.0, samples=4001)
-    table, alpha = model.table(block), float(block.alpha)
+    table, alpha = model.moments(block), float(block.alpha)
     opening, speed = jnp.abs(response.rotation), response.velocity / block.p
     if isinstance(model, rk.Housner):
         potential = jnp.cos(alpha - opening) - jnp.cos(alpha)
@@ -71,7 +71,7 @@ def test_energy(model):
 def test_uplift_at_the_peak(model, excess):
     """The threshold equals the peak, or is passed for an instant: nothing, or next to nothing, happens."""
     block = rk.Block(0.2, 1.0, 0.9)
-    threshold = float(model.table(block).threshold)
+    threshold = float(model.moments(block).threshold)
     result = outcome(block, rk.SinePulse(threshold * (1 + excess), 2.0), model)
     assert result.status == rk.Status.successful
     # Excess x, above the threshold for ~sqrt(x): the rotation is of order x^2.
@@ -188,7 +188,7 @@ def test_beyond_alpha_and_rescued():
 def test_margin_is_smooth_through_the_boundary(model):
     """At every change of verdict along the intensity the margin goes through zero with the same slope."""
     block = rk.Block(0.2, 1.0, 0.9)
-    threshold = float(model.table(block).threshold)
+    threshold = float(model.moments(block).threshold)
     margin = jax.jit(jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a * threshold, 2 * jnp.pi / 2.2), model).margin))
     count = 1200  # always as many, so that all is one compilation
     grid = np.linspace(1.02, 7.0, count)

@@ -44,7 +44,7 @@ def scenes(count, seed=1):
 def under(pulse, model):
     def one(alpha, p, restitution, intensity, ratio):
         block = rk.Block(alpha, p, restitution)
-        return rk.outcome(block, pulse(intensity * model.table(block).threshold, 2 * jnp.pi / (ratio * p)), model)
+        return rk.outcome(block, pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p)), model)
 
     return one
 
@@ -89,7 +89,7 @@ def test_few_scenes_are_postponed(model):
 
     def one(alpha, p, restitution, intensity, ratio):
         block = rk.Block(alpha, p, restitution)
-        pulse = rk.SinePulse(intensity * model.table(block).threshold, 2 * jnp.pi / (ratio * p))
+        pulse = rk.SinePulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p))
         scene = block, pulse, model, tuple(jnp.asarray(x) for x in _start((0.0, 0.0)))
         stepper, state = passes.begin(scene)
         return passes.conclude(stepper, passes.quickly(stepper, state, 10_000))[1]

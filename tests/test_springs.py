@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import jaxrock as rk
 from jaxrock.engines.free_stage import Visit, free_stage
-from jaxrock.models.coefficients import Angle
+from jaxrock.models.equation import Angle
 
 SCENES = json.loads((Path(__file__).parent / "springs.json").read_text())["scenes"]
 MOTIONS = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "ricker symmetric": rk.RickerPulse}
@@ -40,7 +40,7 @@ def test_equation(kind, law):
     """Moment and arm are the printed ones; the block uplifts at tan(alpha), and at the saddle nothing pulls."""
     moment = MOMENTS["SM3" if law == "plastic" and kind != "SM1" else "SM1", law]
     for alpha in (0.05, 0.3, 0.7):
-        table, angle = rk.Spring(kind, law).table(rk.Block(alpha, 2.0)), np.linspace(0, 1.5, 7)
+        table, angle = rk.Spring(kind, law).moments(rk.Block(alpha, 2.0)), np.linspace(0, 1.5, 7)
         parts = [(table.restoring(Angle.of(x)), table.arm(Angle.of(x))) for x in angle]
         np.testing.assert_allclose(
             parts, [(moment(x, alpha, np), np.cos(alpha) * np.cos(x)) for x in angle], atol=4e-16
@@ -87,10 +87,10 @@ def test_a_stout_block_has_no_balance():
     """At pi/4 and above the moment of SM3's plastic spring is positive up to pi/2: refused, not answered."""
     spring = rk.Spring("SM3", "plastic")
     with pytest.raises(ValueError, match="Argument `block.alpha` must be below pi/4"):
-        spring.table(rk.Block(0.8, 1.0))
+        spring.moments(rk.Block(0.8, 1.0))
     with pytest.raises(Exception, match="must be below pi/4"):
-        jax.block_until_ready(jax.jit(lambda alpha: spring.table(rk.Block(alpha, 1.0)).saddle)(0.8))
-    assert rk.Spring("SM1", "plastic").table(rk.Block(0.8, 1.0)).saddle == pytest.approx(0.8, rel=1e-15)
+        jax.block_until_ready(jax.jit(lambda alpha: spring.moments(rk.Block(alpha, 1.0)).saddle)(0.8))
+    assert rk.Spring("SM1", "plastic").moments(rk.Block(0.8, 1.0)).saddle == pytest.approx(0.8, rel=1e-15)
 
 
 # ---- References ----
@@ -169,7 +169,7 @@ def test_free_stage(spring):
     """A constant and a sinusoid: peak and its time by quadrature, from below the saddle and from beyond it."""
 
     def stage(alpha, e, x, v):
-        visit = Visit(rk.Spring(*spring).table(rk.Block(alpha, 1.0, e)), e)
+        visit = Visit(rk.Spring(*spring).moments(rk.Block(alpha, 1.0, e)), e)
         return free_stage((visit, visit), x, v, jnp.array(True), jnp.array(0.0))
 
     follow = jax.jit(stage)
@@ -180,7 +180,7 @@ def test_free_stage(spring):
         (0.7, 1.2, -1.3),
         (0.7, 0.8, -2),
     ]:
-        table = rk.Spring(*spring).table(rk.Block(alpha, 1.0, 0.6))
+        table = rk.Spring(*spring).moments(rk.Block(alpha, 1.0, 0.6))
         x = share * float(table.saddle)
         v = speed * abs(float(table.manifold(jnp.array(x))))
         found = follow(alpha, 0.6, x, v)
@@ -201,7 +201,7 @@ def test_energy_between_impacts(spring):
         lambda speed: rk.simulate(block, rk.Record([0.0], 0.1), model, initial=(0.0, speed), duration=8.0)
     )
     over = float(
-        mpmath.sqrt(2 * mpmath.quad(lambda x: moment(x, alpha, mpmath), [0, float(model.table(block).saddle)]))
+        mpmath.sqrt(2 * mpmath.quad(lambda x: moment(x, alpha, mpmath), [0, float(model.moments(block).saddle)]))
     )
     response = release(0.98 * over * p)
     nodes, weights = np.polynomial.legendre.leggauss(30)

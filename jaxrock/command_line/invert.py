@@ -12,7 +12,7 @@ from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observation_files import read_observations
 from jaxrock.inverse.observations import SEEN, TOPPLED, Observations
 from jaxrock.inverse.unknowns import Unknown
-from jaxrock.models.user_equation import Model
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.pulses.exponential import ExponentialPulse, RectangularPulse
 from jaxrock.motions.pulses.ricker import RickerPulse
 from jaxrock.motions.pulses.sinusoidal import CosinePulse, HalfSinePulse, SinePulse
@@ -68,7 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", type=int, default=48, help="points along each axis of the map (default 48)")
 
 
-def invert(arguments: argparse.Namespace, model: Model) -> tuple[str, list[Path], str | None]:
+def invert(arguments: argparse.Namespace, model: AbstractEquation) -> tuple[str, list[Path], str | None]:
     """Fit, draw and write; return the text to print, the files, and what is wrong where there is no result."""
     observations = read_observations(arguments.rocks)
     if arguments.points < 2:

@@ -147,7 +147,7 @@ def _run(arguments) -> int:
         ("slenderness alpha", f"{alpha:.4f}", "rad"),
         ("frequency parameter p", f"{p:.4f}", "rad/s"),
         ("restitution", f"{float(block.restitution):.4f}", ""),
-        ("uplift threshold", f"{float(model.table(block).threshold):.4f}", "g"),
+        ("uplift threshold", f"{float(model.moments(block).threshold):.4f}", "g"),
         ("impacts", f"{int(result.impact_count)}", ""),
         ("peak rotation", "overturned" if lost else f"{float(result.max_rotation):.6f}", "" if lost else "rad"),
         ("peak rotation / alpha", "overturned" if lost else f"{float(result.max_rotation) / alpha:.6f}", ""),

@@ -17,7 +17,8 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.state import surpasses
 from jaxrock.models import free_swing as skewed
-from jaxrock.models.coefficients import Angle, Table
+from jaxrock.models.coefficients import Coefficients
+from jaxrock.models.equation import Angle
 
 Scalar = Inexact[ArrayLike, ""]
 
@@ -70,38 +71,38 @@ def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     return (1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)
 
 
-def _time_to_peak(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
+def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
     """Time from opening angle saddle - gap, moving outward below the manifold, to the turning point."""
-    if not table.sinusoidal:
+    if not moments.sinusoidal:
         return jnp.arctanh(speed / manifold)
-    if table.skew is not None:
-        turn = skewed.turning_gap((manifold - speed) * (manifold + speed), table.skew, table.saddle)
-        return skewed.time_to_turning(gap, speed, turn, table.skew)
+    if moments.skew is not None:
+        turn = skewed.turning_gap((manifold - speed) * (manifold + speed), moments.skew, moments.saddle)
+        return skewed.time_to_turning(gap, speed, turn, moments.skew)
     k = jnp.sqrt(jnp.maximum((manifold - speed) * (manifold + speed), 1e-280)) / 2
     tangent = speed / (2 * jnp.cos(gap / 2))
     ratio = tangent / k
     return ratio * carlson_rf(jnp.ones_like(k), 1 + tangent**2, 1 + ratio**2)
 
 
-def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, base: Scalar, arrival: Scalar):
+def _time_to_impact(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar, base: Scalar, arrival: Scalar):
     """Time from opening angle saddle - gap, moving inward, to the impact at speed `arrival`."""
-    if not table.sinusoidal:
+    if not moments.sinusoidal:
         return jnp.log((base + arrival) / (manifold + speed))
 
     def below():
-        return _time_to_peak(table, table.saddle, base, arrival) - _time_to_peak(table, gap, manifold, speed)
+        return _time_to_peak(moments, moments.saddle, base, arrival) - _time_to_peak(moments, gap, manifold, speed)
 
     def above():
         kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
 
         def from_saddle(angle):
-            if table.skew is not None:
-                return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), table.skew)
+            if moments.skew is not None:
+                return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), moments.skew)
             tangent = jnp.tan(angle / 2)
             ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
             return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)
 
-        return from_saddle(table.saddle) - from_saddle(gap)
+        return from_saddle(moments.saddle) - from_saddle(gap)
 
     return jax.lax.cond(speed > jnp.abs(manifold), above, below)
 
@@ -109,7 +110,7 @@ def _time_to_impact(table: Table, gap: Scalar, manifold: Scalar, speed: Scalar, 
 class Visit(NamedTuple):
     """A stay on one side, until the impact that ends it."""
 
-    table: Table
+    moments: Coefficients
     restitution: Scalar  # of that impact
 
 
@@ -130,7 +131,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
 
     **Source:** the energy argument of Housner (1963); D&D (2012), 4.12 corrected.
     """
-    present = _present(visits[0].table, opening, velocity, moving, comes_back=len(visits) > 2)
+    present = _present(visits[0].moments, opening, velocity, moving, comes_back=len(visits) > 2)
     outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
     arrival, found = present.arrival, [present]
     shares = [share]
@@ -138,7 +139,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
         happens = moving & ~lost & ~outward if i == len(visits) - 1 else moving & ~lost
         rebound = visits[i - 1].restitution * arrival
         share = share * visits[i - 1].restitution ** 2
-        stay = _after_impact(visit.table, rebound, happens)
+        stay = _after_impact(visit.moments, rebound, happens)
         lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
         arrival = rebound
         found.append(stay)
@@ -201,37 +202,37 @@ class _Stay(NamedTuple):
     times: Callable  # of the time at which it begins: those of its peak, and of the impact that ends it
 
 
-def _peak_of(table: Table, deficit: Scalar) -> Scalar:
+def _peak_of(moments: Coefficients, deficit: Scalar) -> Scalar:
     """Opening angle at which a block turns back; deficit: 4 sin^2(half the angle to the saddle), or its square."""
-    if table.skew is not None:
-        return table.saddle - skewed.turning_gap(deficit, table.skew, table.saddle)
+    if moments.skew is not None:
+        return moments.saddle - skewed.turning_gap(deficit, moments.skew, moments.saddle)
     missing = jnp.sqrt(jnp.maximum(deficit, 0.0))
-    return table.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if table.sinusoidal else missing)
+    return moments.saddle - (2 * jnp.arcsin(jnp.minimum(missing / 2, 1.0)) if moments.sinusoidal else missing)
 
 
-def _weight(table: Table) -> Scalar:
+def _weight(moments: Coefficients) -> Scalar:
     """What makes squared velocities and accelerations, in units of the stiffness, a closeness."""
-    return (table.stiffness / table.restoring_at_rest) ** 2
+    return (moments.stiffness / moments.restoring_at_rest) ** 2
 
 
-def _turning_closeness(table: Table, gap2: Scalar, beyond: bool = False) -> Scalar:
+def _turning_closeness(moments: Coefficients, gap2: Scalar, beyond: bool = False) -> Scalar:
     """Squared acceleration at a turning point over that at rest; gap2: 4 sin^2(half the angle to the saddle)."""
-    if table.skew is not None:
-        skew, reach = (-table.skew, jnp.pi / 2 - table.saddle) if beyond else (table.skew, table.saddle)
-        return _weight(table) * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
-    shape = gap2 * (1 - gap2 / 4) if table.sinusoidal else gap2
-    return _weight(table) * shape
+    if moments.skew is not None:
+        skew, reach = (-moments.skew, jnp.pi / 2 - moments.saddle) if beyond else (moments.skew, moments.saddle)
+        return _weight(moments) * skewed.moment(skewed.turning_gap(gap2, skew, reach), skew) ** 2
+    shape = gap2 * (1 - gap2 / 4) if moments.sinusoidal else gap2
+    return _weight(moments) * shape
 
 
-def _steepness(table: Table, peak: Scalar) -> Scalar:
-    return 2 * jnp.abs(table.restoring(Angle.of(peak)))
+def _steepness(moments: Coefficients, peak: Scalar) -> Scalar:
+    return 2 * jnp.abs(moments.restoring(Angle.of(peak)))
 
 
-def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, comes_back: bool) -> _Stay:
+def _present(moments: Coefficients, opening: Scalar, velocity: Scalar, moving: Flag, comes_back: bool) -> _Stay:
     """The stay on the side where the block is when the motion ends; `comes_back`: whether it matters when it does."""
-    rate = jnp.sqrt(table.stiffness)
-    gap, speed = table.saddle - opening, velocity / rate
-    manifold, base = table.manifold(opening) / rate, table.manifold(jnp.zeros_like(opening)) / rate
+    rate = jnp.sqrt(moments.stiffness)
+    gap, speed = moments.saddle - opening, velocity / rate
+    manifold, base = moments.manifold(opening) / rate, moments.manifold(jnp.zeros_like(opening)) / rate
     deficit = (manifold - speed) * (manifold + speed)
     lost, outward = moving & (speed > manifold), speed > 0
     safe = moving & ~lost
@@ -239,11 +240,11 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, come
     rises, falls = safe & outward, safe & ~outward
 
     def times(_):
-        out = _time_to_peak(table, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
-        back = _time_to_peak(table, table.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
+        out = _time_to_peak(moments, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
+        back = _time_to_peak(moments, moments.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
         falling = _time_to_impact(
-            table,
-            jnp.where(falls, gap, table.saddle),
+            moments,
+            jnp.where(falls, gap, moments.saddle),
             jnp.where(falls, manifold, base),
             jnp.where(falls, -speed, 0.0),
             base,
@@ -252,47 +253,47 @@ def _present(table: Table, opening: Scalar, velocity: Scalar, moving: Flag, come
         return out / rate, jnp.where(outward, out + back, falling) / rate
 
     # Closeness: crossing the saddle at a speed, or turning at an acceleration.
-    crossing, turning = -deficit * _weight(table), _turning_closeness(table, jnp.abs(deficit))
+    crossing, turning = -deficit * _weight(moments), _turning_closeness(moments, jnp.abs(deficit))
     past_inward = (gap < 0) & (speed < 0)
-    beyond = jnp.where(past_inward, _turning_closeness(table, jnp.abs(deficit), beyond=True), jnp.inf)
+    beyond = jnp.where(past_inward, _turning_closeness(moments, jnp.abs(deficit), beyond=True), jnp.inf)
     lost_closeness = jnp.where(gap > 0, crossing, beyond)
     safe_closeness = jnp.where(outward, turning, jnp.where(past_inward, crossing, jnp.inf))
-    peak = _peak_of(table, jnp.where(rises, deficit, base**2))
+    peak = _peak_of(moments, jnp.where(rises, deficit, base**2))
     return _Stay(
         lost=lost,
         safe=safe,
         decides=moving & (outward | past_inward),
-        deficit=deficit * table.stiffness,
+        deficit=deficit * moments.stiffness,
         peak=jnp.where(rises, peak, 0.0),
-        steepness=_steepness(table, peak),
+        steepness=_steepness(moments, peak),
         closeness=jnp.where(lost, lost_closeness, jnp.where(safe, safe_closeness, jnp.inf)),
         arrival=arrival * rate,
         times=times,
     )
 
 
-def _after_impact(table: Table, rebound: Scalar, happens: Flag) -> _Stay:
+def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag) -> _Stay:
     """The stay on a side on which the block comes to stand with a velocity; if it happens at all."""
-    rate = jnp.sqrt(table.stiffness)
-    base, speed = table.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
+    rate = jnp.sqrt(moments.stiffness)
+    base, speed = moments.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
     deficit = (base - speed) * (base + speed)
     lost = happens & (speed > base)
     safe = happens & ~lost
 
     def times(since):
-        out = _time_to_peak(table, table.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+        out = _time_to_peak(moments, moments.saddle, base, jnp.where(safe, speed, 0.0)) / rate
         return since + out, since + 2 * out
 
-    peak = _peak_of(table, jnp.where(safe, deficit, base**2))
-    turning = _turning_closeness(table, jnp.abs(deficit))
-    crossing = -deficit * _weight(table)
+    peak = _peak_of(moments, jnp.where(safe, deficit, base**2))
+    turning = _turning_closeness(moments, jnp.abs(deficit))
+    crossing = -deficit * _weight(moments)
     return _Stay(
         lost=lost,
         safe=safe,
         decides=happens,
-        deficit=deficit * table.stiffness,
+        deficit=deficit * moments.stiffness,
         peak=peak,
-        steepness=_steepness(table, peak),
+        steepness=_steepness(moments, peak),
         closeness=jnp.where(lost, crossing, jnp.where(safe, turning, jnp.inf)),
         arrival=rebound,
         times=times,

@@ -9,9 +9,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
-from jaxrock.models.coefficients import Table
-from jaxrock.models.spring import Spring
-from jaxrock.models.user_equation import EquationTable, Model
+from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
 from jaxrock.numerics.lookup import pick
 
@@ -52,31 +50,31 @@ def check_single(block: Block | AsymmetricBlock, motion: AbstractMotion) -> None
                 )
 
 
-def _tables(block: Block | AsymmetricBlock, model: Model) -> tuple:
-    """Table of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
+def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
+    """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
     if isinstance(block, Block):
-        return model.table(block), None
-    return tuple(model.table(side).times((side.p / block.p1) ** 2) for side in block.sides)
+        return model.moments(block), None
+    return tuple(model.moments(side).times((side.p / block.p1) ** 2) for side in block.sides)
 
 
-def _least_threshold(table: Table | EquationTable, far: Table | EquationTable | None) -> Scalar:
-    return table.threshold if far is None else jnp.minimum(table.threshold, far.threshold)
+def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> Scalar:
+    return moments.threshold if far is None else jnp.minimum(moments.threshold, far.threshold)
 
 
-def uplift_threshold(block: Block | AsymmetricBlock, model: Model) -> Scalar:
+def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
     """Ground acceleration at which a block uplifts, to its weaker side [g]."""
-    return _least_threshold(*_tables(block, model))
+    return _least_threshold(*_moments(block, model))
 
 
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
-    A symmetric block has one `table` for both sides. That of an asymmetric one is for the side on which it stands
+    A symmetric block has one `moments` for both sides. That of an asymmetric one is for the side on which it stands
     (rotation > 0 unless `on` tells otherwise), and `far` for the other.
     """
 
-    table: Table | EquationTable
-    far: Table | EquationTable | None
+    moments: AbstractMoments
+    far: AbstractMoments | None
     p: Scalar  # unit of time and velocity on either side
     alpha: Scalar  # size of an angle that matters
     restitution: Scalar  # of an impact that ends the stay on this side
@@ -93,7 +91,7 @@ class Scene(eqx.Module):
     falls_flat: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: Model) -> "Scene":
+    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "Scene":
         """Build the scene; raise ValueError where a parameter is an array outside of `jax.vmap`."""
         check_single(block, motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
@@ -101,21 +99,21 @@ class Scene(eqx.Module):
         knots, bounds, scales = motion.knots, motion.bounds, motion.scales
         infinity = jnp.full(1, jnp.inf, dtype)
         bounds, vertical = jnp.pad(bounds, (0, 1)), motion.vertical_bounds
-        if vertical is not None and isinstance(model, Spring):
+        if vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
             )
         skips = bounds.size > _NEAR
-        table, far = _tables(block, model)
+        moments, far = _moments(block, model)
         if isinstance(block, Block):
             near, other, p, alpha = block, block, block.p, block.alpha
         else:
             (near, other), p, alpha = block.sides, block.p1, jnp.minimum(block.alpha1, block.alpha2)
         # At rest while |u| < threshold (1 + v), so at least while |u| + threshold |v| < threshold.
-        threshold = _least_threshold(table, far)
+        threshold = _least_threshold(moments, far)
         drive = bounds if vertical is None else bounds + threshold * jnp.pad(vertical, (0, 1))
         return cls(
-            table=table,
+            moments=moments,
             far=far,
             p=p,
             alpha=alpha,
@@ -148,26 +146,26 @@ class Scene(eqx.Module):
 
         return replace(
             self,
-            table=of(self.table, self.far),
-            far=of(self.far, self.table),
+            moments=of(self.moments, self.far),
+            far=of(self.far, self.moments),
             restitution=of(self.restitution, self.far_restitution),
             far_restitution=of(self.far_restitution, self.restitution),
         )
 
     @property
-    def tables(self) -> tuple[Table | EquationTable, Table | EquationTable]:
-        """Tables of this side and of the other."""
-        return self.table, self.table if self.far is None else self.far
+    def both_moments(self) -> tuple[AbstractMoments, AbstractMoments]:
+        """Moments of this side and of the other."""
+        return self.moments, self.moments if self.far is None else self.far
 
     @property
-    def own_tables(self) -> tuple[Table | EquationTable, ...]:
-        """The one table, or both."""
-        return (self.table,) if self.far is None else (self.table, self.far)
+    def different_moments(self) -> tuple[AbstractMoments, ...]:
+        """The one moments, or both."""
+        return (self.moments,) if self.far is None else (self.moments, self.far)
 
     @property
     def threshold(self) -> Scalar:
         """Ground acceleration below which the block stays at rest, to whichever side it goes [g]."""
-        return _least_threshold(self.table, self.far)
+        return _least_threshold(self.moments, self.far)
 
     def drives_of(self, shaking: Shaking) -> list[tuple[list[Scalar], Scalar]]:
         """What lifts a block at rest to side 1 and to side -1, as a series, and the level above which it does.
@@ -175,11 +173,11 @@ class Scene(eqx.Module):
         To side s where -s u > threshold (1 + v).
         """
         found = []
-        for side, table in zip((1, -1), self.tables):
+        for side, moments in zip((1, -1), self.both_moments):
             drive = [-side * u for u in shaking.horizontal]
             if shaking.vertical is not None:
-                drive = sum_of_series(drive, [-table.threshold * v for v in shaking.vertical])
-            found.append((drive, table.threshold))
+                drive = sum_of_series(drive, [-moments.threshold * v for v in shaking.vertical])
+            found.append((drive, moments.threshold))
         return found
 
     def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:

@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.uncertainty import Spread
-from jaxrock.models.coefficients import Angle
+from jaxrock.models.equation import Angle
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, ""]
@@ -53,11 +53,11 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     opening, outward = jnp.abs(rotation), side * velocity
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
-    table = scene.on(side).table
-    beyond = opening >= table.saddle
+    moments = scene.on(side).moments
+    beyond = opening >= moments.saddle
     # Squared distance from standing still in balance, for a block that starts beyond it.
-    pull = table.restoring(Angle.of(opening))
-    stillness = (table.stiffness * outward**2 + pull**2) / table.restoring_at_rest**2
+    pull = moments.restoring(Angle.of(opening))
+    stillness = (moments.stiffness * outward**2 + pull**2) / moments.restoring_at_rest**2
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
     unlifted = jnp.maximum(2 - scene.drives[0] / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps

@@ -19,7 +19,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.taylor.expansion import meet
 from jaxrock.engines.uncertainty import GRAZING, Spread
-from jaxrock.models.coefficients import Angle
+from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
 from jaxrock.numerics.elementary import logarithm
 from jaxrock.numerics.lookup import pick
@@ -122,7 +122,7 @@ class AbstractStepper(eqx.Module):
     def checked(self, before: State, after: State) -> State:
         """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
         good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-        lost = (after.side != 0) & ~(after.spread.size <= _LOST * self.scene.table.saddle)
+        lost = (after.side != 0) & ~(after.spread.size <= _LOST * self.scene.moments.saddle)
         if not self.history:
             # In the free stage only the next peak or passage counts, which `note` judges.
             lost = lost & (before.piece < self.scene.pieces)
@@ -201,10 +201,10 @@ class AbstractStepper(eqx.Module):
         The most helpful forcing is the bound of all that is to come, for good: the block is lost if it is past the
         stable manifold even then.
         """
-        table = self.scene.table
+        moments = self.scene.moments
         ceiling, weight = self.scene.most_helpful(state.piece)
-        hold = -table.acceleration(angle, state.velocity, ceiling, weight)
-        needed = jnp.where(hold > 0, table.held_manifold(angle, hold, ceiling, weight), 0.0)
+        hold = -moments.acceleration(angle, state.velocity, ceiling, weight)
+        needed = jnp.where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
         certain = state.velocity - needed > self.doubt * state.spread.along(1.0, 1.0)
         return state.beyond & (state.velocity >= 0) & certain
 
@@ -214,11 +214,11 @@ class AbstractStepper(eqx.Module):
         given = self, state, angle, ground, elapsed, step
         stepper, state, angle, (acceleration, weight), elapsed, step = jax.lax.stop_gradient(given)
         push = state.side * acceleration
-        table, p = stepper.scene.table, stepper.scene.p  # an error has no derivative
+        moments, p = stepper.scene.moments, stepper.scene.p  # an error has no derivative
         eps, time, speed = 2 * jnp.finfo(p.dtype).eps, p * elapsed, jnp.abs(state.velocity)
         clock = eps * p * state.local  # the time of a state is rounded, too
-        pull = eps * (table.restoring_at_rest + jnp.abs(push) * table.arm_at_rest)  # of what acceleration is left
-        spread = state.spread.after_flow(table.repulsion(angle, push, weight), time)
+        pull = eps * (moments.restoring_at_rest + jnp.abs(push) * moments.arm_at_rest)  # of what acceleration is left
+        spread = state.spread.after_flow(moments.repulsion(angle, push, weight), time)
         return spread.plus(
             step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
             step[1] + eps * speed + pull * (time + p * state.local),
@@ -226,11 +226,11 @@ class AbstractStepper(eqx.Module):
 
     def note(self, state: State, outward, turning, crossing, opening, speed, bend) -> State:
         """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
-        table = self.scene.table
+        moments = self.scene.moments
         # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
         # instant, far from its saddle, is not in balance.
-        pull = jnp.maximum(jnp.abs(bend), jnp.abs(table.restoring(Angle.of(opening))))
-        stillness = keep((table.stiffness * speed**2 + pull**2) / table.restoring_at_rest**2, state.local)
+        pull = jnp.maximum(jnp.abs(bend), jnp.abs(moments.restoring(Angle.of(opening))))
+        stillness = keep((moments.stiffness * speed**2 + pull**2) / moments.restoring_at_rest**2, state.local)
         turn = turning & (outward | state.beyond)
         closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
         closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
@@ -276,12 +276,12 @@ class AbstractStepper(eqx.Module):
         faster or closer to overturning than what has been. Each is slower by e, so those above the rounding of alpha
         can be counted.
         """
-        scene, (table, ahead), side = self.scene, self.scene.tables, -state.side
+        scene, (moments, ahead), side = self.scene, self.scene.both_moments, -state.side
         e, back = scene.restitution, scene.far_restitution
         rebound, rest = e * jnp.abs(speed), Angle(jnp.zeros_like(speed), 0.0, 1.0)
         # Decelerations on the side to come, and on the one before.
         here = -ahead.acceleration(rest, rebound, side * ground[0], ground[1])
-        there = -table.acceleration(rest, speed, state.side * ground[0], ground[1])
+        there = -moments.acceleration(rest, speed, state.side * ground[0], ground[1])
         spread = jax.lax.stop_gradient(state.spread.after_impact(speed, -there, -here, e))
         slowed = hit & (there < 0)  # by the forcing, before it hit the ground: without that it would have turned back
         depth = speed**2 / (2 * jnp.where(slowed, -there, 1.0))
@@ -290,7 +290,7 @@ class AbstractStepper(eqx.Module):
         here, there = jnp.where(held, here, 1.0), jnp.where(held, there, 1.0)
         remaining = 2 * rebound * (1 / here + back / there) / jnp.where(held, 1 - e * back, 1.0)
         window = 4 * remaining / scene.p
-        change = functools.reduce(jnp.maximum, [t.change_at_rest(*steepest) for t in scene.own_tables])
+        change = functools.reduce(jnp.maximum, [t.change_at_rest(*steepest) for t in scene.different_moments])
         dies = held & (change * window <= weaker / 2) & (window <= reach)
         # Speed of a hop of rounding height; a history shows the hops down to there.
         low = jnp.sqrt(100 * jnp.finfo(scene.p.dtype).eps * scene.alpha * jnp.minimum(here, there))
@@ -300,7 +300,7 @@ class AbstractStepper(eqx.Module):
             highest = 3 * rebound**2 * jnp.maximum(1 / here, back * back / there)
             fastest = 2 * rebound if scene.far is None else 2 * rebound * jnp.maximum(back, 1)
             dies = dies & (highest <= state.peak) & (fastest <= state.fastest)
-            for t in scene.own_tables:
+            for t in scene.different_moments:
                 least = (t.restoring(Angle.of(jnp.minimum(highest, t.saddle))) / t.restoring_at_rest) ** 2
                 dies = dies & (least >= state.closeness)
         rests = keep_flag(hit & (dies | (rebound == 0)), state.local)

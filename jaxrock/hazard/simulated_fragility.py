@@ -18,8 +18,8 @@ from jaxrock._checks import Values, one_of
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.motions.suite import Suite, pick, size_of
 from jaxrock.responses.rigid import outcome
@@ -166,7 +166,7 @@ def simulated_fragility(
     block: Block,
     motions: Suite | Sequence[AbstractMotion],
     levels: Values,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     measure: str = "PGA",
     engine: AbstractEngine | None = None,
@@ -233,7 +233,7 @@ def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, e
 
 
 @functools.lru_cache(maxsize=32)
-def _verdict(model: Model, engine: AbstractEngine | None) -> Callable:
+def _verdict(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
     def one(index, draw, factor, scene):
         blocks, group = scene
         found = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)

@@ -26,8 +26,8 @@ from jaxrock.hazard.fragility import (
     rising,
 )
 from jaxrock.hazard.simulated_fragility import STOOD, TOPPLED, UNDECIDED, SimulatedFragility, counts, stacked, verdicts
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
 
@@ -228,7 +228,7 @@ def simulated_surface(
     pulses: Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]],
     acceleration: Values,
     ratio: Values,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,

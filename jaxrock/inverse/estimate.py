@@ -20,8 +20,8 @@ from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
 from jaxrock.inverse.scatter import NODES
 from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.numerics.climb import Summits, climb
 
 Real = Inexact[Array, "..."]
@@ -134,7 +134,7 @@ def estimate_motion(
     *,
     lapse: ArrayLike = 0.02,
     starts: int = 64,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Estimate:

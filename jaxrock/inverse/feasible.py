@@ -13,8 +13,8 @@ from jaxrock._progress import Progress
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import TOPPLED, Observations
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.spectra import axis
 
@@ -104,7 +104,7 @@ def unexceeded_motion(
     durations: Values,
     *,
     intensity: tuple[float, float] = (1.0, 20.0),
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Unexceeded:

@@ -20,8 +20,8 @@ from jaxrock.engines.diffrax.arcs import Diffrax
 from jaxrock.engines.scene import check_single, peak_bound
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Equation, Model
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
@@ -137,7 +137,7 @@ def fit_history(
     rotation: Values,
     block: Block | AsymmetricBlock,
     motion: AbstractMotion | None = None,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     parameters: Sequence[str] | None = None,
     initial: tuple[float, float] | None = None,
@@ -205,7 +205,7 @@ class _Scene(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     block: Block | AsymmetricBlock
     motion: AbstractMotion
-    model: Model
+    model: AbstractEquation
     initial: tuple[Array, Array]
     engine: AbstractEngine
 
@@ -228,7 +228,7 @@ class _Scene(eqx.Module):
             initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
         block = _given(block, names)
         if engine is None:
-            engine = Diffrax() if isinstance(model, Equation) else Series(order=8, tolerance=1e-10)
+            engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
         return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
 
     @property

@@ -33,8 +33,8 @@ from jaxrock._checks import as_real, checked, positive, put_down
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import Possible, levels_around
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.rigid import outcome
@@ -70,7 +70,7 @@ class Likelihood(eqx.Module):
     scatter: Real
     lapse: Real
     motion: Callable = eqx.field(static=True)
-    model: Model
+    model: AbstractEquation
     engine: AbstractEngine | None
 
     def __init__(
@@ -78,7 +78,7 @@ class Likelihood(eqx.Module):
         observations: Observations,
         motion: Callable,
         scatter: ArrayLike = 0.3,
-        model: Model = Housner(),
+        model: AbstractEquation = Housner(),
         engine: AbstractEngine | None = None,
         lapse: ArrayLike = 0.02,
     ):

@@ -20,8 +20,8 @@ from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.scatter import NODES
 from jaxrock.inverse.unknowns import Problem, Unknown, in_batches
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.numerics.proposals import ROUNDS, around, begin, learn
 
 Real = Inexact[Array, "..."]
@@ -119,7 +119,7 @@ def sample_motion(
     effective_size: int = 1000,
     steps: int = 4000,
     seed: int = 0,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Posterior:

@@ -1,10 +1,9 @@
 """The equation of motion as a small table of numbers, one row per model.
 
 With the opening angle x = |rotation| (rad), side s = +1 or -1, dimensionless time p t and ground
-acceleration u (g), every model of a rigid symmetric block reads
+acceleration u (g), every model of a rigid block reads
 
-    x'' = -[restoring(x) + s u arm(x)],
-    restoring(x) = r0 + r1 x + rs sin x + rc cos x,      arm(x) = m0 + ms sin x + mc cos x.
+    x'' = -[restoring(x) + s u arm(x)],      both restoring and arm a sum  c0 + c1 x + cs sin x + cc cos x.
 
 A coefficient that a model does not have is None, so that nothing is computed for it.
 """
@@ -17,72 +16,144 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
-from jaxrock.models import free_swing as skewed
+from jaxrock.models import free_swing
+from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.numerics.elementary import sine_cosine
 
 Scalar = Inexact[ArrayLike, ""]
 
+_ONE = 1.0
 
-def _sum_of(*products: tuple[Scalar | None, Scalar | float]) -> Scalar | float:
-    """Add coefficient times function for the coefficients that exist."""
-    return sum((c * f for c, f in products if c is not None), start=0.0)
+
+def _or_zero(coefficient: Scalar | None) -> Scalar | float:
+    return 0.0 if coefficient is None else coefficient
 
 
 def _weighed(weight: Scalar | None, moment: Scalar) -> Scalar:
     return moment if weight is None else weight * moment
 
 
-class Angle(NamedTuple):
-    """An angle [rad] with its sine and cosine, which are computed once."""
+class Basis(NamedTuple):
+    """What the coefficients of `Terms` multiply: 1, x, sin x and cos x at an angle, or term k of their series.
 
-    value: Scalar
-    sine: Scalar
-    cosine: Scalar
+    None: zero, or not needed.
+    """
+
+    constant: Scalar | None
+    line: Scalar | None
+    sine: Scalar | None
+    cosine: Scalar | None
 
     @classmethod
-    def of(cls, value: Scalar) -> "Angle":
-        """An angle from its value, between 0 and pi/2 or a little beyond."""
-        return cls(value, *sine_cosine(jnp.asarray(value)))
+    def at(cls, angle: Angle) -> "Basis":
+        """At an angle."""
+        return cls(_ONE, angle.value, angle.sine, angle.cosine)
 
+    @classmethod
+    def of_term(cls, k: int, line: list, sine: list, cosine: list) -> "Basis":
+        """Term k of their series; sine and cosine may be shorter, where no moment has them."""
+        of_sine, of_cosine = (series[k] if k < len(series) else None for series in (sine, cosine))
+        return cls(_ONE if k == 0 else None, line[k], of_sine, of_cosine)
 
-class Table(eqx.Module):
-    """Coefficients of restoring moment and overturning arm, both over m g R (module docstring)."""
-
-    r0: Scalar | None = None
-    r1: Scalar | None = None
-    rs: Scalar | None = None
-    rc: Scalar | None = None
-    m0: Scalar | None = None
-    ms: Scalar | None = None
-    mc: Scalar | None = None
-    known_saddle: Scalar | None = None  # where it is known beforehand, because the coefficients change on the way
+    def term(self, k: int) -> "Basis":
+        """Term k, of series; of those that are shorter, none."""
+        return Basis(*(None if series is None or k >= len(series) else series[k] for series in self))
 
     @property
-    def bare(self) -> "Table":
+    def derivative(self) -> "Basis":
+        """The derivatives of these functions by the angle."""
+        return Basis(None, self.constant, self.cosine, None if self.sine is None else -self.sine)
+
+
+class Terms(eqx.Module):
+    """A moment, or an arm: coefficients of 1, x, sin x and cos x; None where there is no such term."""
+
+    constant: Scalar | None = None
+    line: Scalar | None = None
+    sine: Scalar | None = None
+    cosine: Scalar | None = None
+
+    @property
+    def coefficients(self) -> tuple[Scalar | None, ...]:
+        """In the order of `Basis`."""
+        return self.constant, self.line, self.sine, self.cosine
+
+    @property
+    def trigonometric(self) -> bool:
+        """Whether sin x or cos x appear at all."""
+        return self.sine is not None or self.cosine is not None
+
+    def along(self, basis: Basis, empty=0.0):
+        """The sum of coefficients times functions; `empty` where there is none."""
+        products = self.products(basis)
+        return sum(products, start=0.0) if products else empty
+
+    def products(self, basis: Basis, sign: Scalar | None = None) -> list:
+        """Coefficients times functions, where there are both; `sign`: of all of them."""
+        pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
+        pairs = pairs if sign is None else [(sign * c, f) for c, f in pairs]
+        return [c if f is _ONE else c * f for c, f in pairs]
+
+    def each(self, function, *others) -> "Terms":
+        """Terms that a function makes of every coefficient there is, and of what stands in its place in `others`."""
+        pairs = zip(self.coefficients, *others)
+        return Terms(*(None if c is None else function(c, *more) for c, *more in pairs))
+
+
+_AT_REST = Basis(_ONE, None, None, _ONE)  # sin 0 is zero
+
+
+class Coefficients(AbstractMoments):
+    """Restoring moment and overturning arm, both over m g R, as sums of terms (module docstring).
+
+    **Arguments:**
+
+    - `restoring_terms`: a constant and a line; or a sine, with a cosine or a constant or both. What follows from the
+      moment in closed form (balance, free swings) is known for these. It is positive at x = 0.
+    - `arm_terms`: any terms; positive at x = 0.
+
+    **Raises:** ValueError for other terms of the restoring moment.
+    """
+
+    restoring_terms: Terms
+    arm_terms: Terms
+    known_saddle: Scalar | None = None  # where it is known beforehand, because the coefficients change on the way
+
+    def __check_init__(self):
+        moment = self.restoring_terms
+        straight = moment.constant is not None and moment.line is not None and not moment.trigonometric
+        if not straight and (moment.sine is None or moment.line is not None):
+            raise ValueError(
+                "Argument `restoring_terms` must be a constant and a line, or a sine, a cosine and a constant, but is "
+                f"{moment}. Use an `Equation` for any other moment."
+            )
+
+    @property
+    def bare(self) -> "Coefficients":
         """The coefficients alone."""
         return self if self.known_saddle is None else replace(self, known_saddle=None)
 
-    def times(self, factor: Scalar) -> "Table":
+    def times(self, factor: Scalar) -> "Coefficients":
         """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
         return replace(jax.tree.map(lambda c: factor * c, self.bare), known_saddle=self.saddle)
 
     @property
     def trigonometric(self) -> bool:
         """Whether sin x or cos x appear at all."""
-        return any(c is not None for c in (self.rs, self.rc, self.ms, self.mc))
+        return self.restoring_terms.trigonometric or self.arm_terms.trigonometric
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
-        return _sum_of((self.r0, 1.0), (self.r1, angle.value), (self.rs, angle.sine), (self.rc, angle.cosine))
+        return self.restoring_terms.along(Basis.at(angle))
 
     def arm(self, angle: Angle) -> Scalar:
         """Overturning moment over m R u g at an opening angle."""
-        return _sum_of((self.m0, 1.0), (self.ms, angle.sine), (self.mc, angle.cosine))
+        return self.arm_terms.along(Basis.at(angle))
 
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """How fast nearby angles part, per angle: minus the derivative of weight restoring + push arm."""
-        restoring = _weighed(weight, _sum_of((self.r1, 1.0), (self.rs, angle.cosine), (self.rc, -angle.sine)))
-        return -restoring - push * _sum_of((self.ms, angle.cosine), (self.mc, -angle.sine))
+        slopes = Basis.at(angle).derivative
+        return -_weighed(weight, self.restoring_terms.along(slopes)) - push * self.arm_terms.along(slopes)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
@@ -91,84 +162,74 @@ class Table(eqx.Module):
     @property
     def restoring_at_rest(self) -> Scalar:
         """Restoring moment over m g R just after uplift: sin(alpha), or alpha in the linear model."""
-        return _sum_of((self.r0, 1.0), (self.rc, 1.0))
+        return self.restoring_terms.along(_AT_REST)
 
     @property
     def arm_at_rest(self) -> Scalar:
         """Overturning arm over R just after uplift: cos(alpha), or 1 in the linear model."""
-        return _sum_of((self.m0, 1.0), (self.mc, 1.0))
-
-    @property
-    def threshold(self) -> Scalar:
-        """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
-        return self.restoring_at_rest / self.arm_at_rest
-
-    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
-        """By how much the acceleration just after uplift changes with that of the ground, at most."""
-        change = horizontal * self.arm_at_rest
-        return change if vertical is None else change + vertical * self.restoring_at_rest
+        return self.arm_terms.along(_AT_REST)
 
     @property
     def sinusoidal(self) -> bool:
         """Whether the restoring moment is a sinusoid, perhaps with a constant (else it is one straight line)."""
-        return self.rs is not None
-
-    @property
-    def _wave(self) -> tuple[Scalar, Scalar]:
-        """Factors of sin x and cos x, of a restoring moment that is a sinusoid."""
-        return self.rs, 0.0 if self.rc is None else self.rc
+        return self.restoring_terms.sine is not None
 
     @property
     def stiffness(self) -> Scalar:
         """How fast the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
+        moment = self.restoring_terms
         if not self.sinusoidal:
-            return -self.r1
-        height = jnp.hypot(*self._wave)
-        return height if self.r0 is None else jnp.sqrt((height - self.r0) * (height + self.r0))
+            return -moment.line
+        height = jnp.hypot(moment.sine, _or_zero(moment.cosine))
+        return height if moment.constant is None else jnp.sqrt((height - moment.constant) * (height + moment.constant))
 
     @property
     def skew(self) -> Scalar | None:
         """c in restoring(x) = k [sin(saddle - x) + c (1 - cos(saddle - x))]; None where there is no such part."""
-        return self.r0 / self.stiffness if self.sinusoidal and self.r0 is not None else None
+        constant = self.restoring_terms.constant
+        return constant / self.stiffness if self.sinusoidal and constant is not None else None
 
     @property
     def saddle(self) -> Scalar:
         """Opening angle of the unstable equilibrium: the block balances on its corner [rad]."""
+        moment = self.restoring_terms
         if self.known_saddle is not None:
             return self.known_saddle
         if not self.sinusoidal:
-            return -self.r0 / self.r1
-        of_sine, of_cosine = self._wave
-        middle = jnp.arctan2(of_cosine, -of_sine)
-        return middle if self.r0 is None else middle + jnp.arctan2(self.r0, self.stiffness)
+            return -moment.constant / moment.line
+        middle = jnp.arctan2(_or_zero(moment.cosine), -moment.sine)
+        return middle if moment.constant is None else middle + jnp.arctan2(moment.constant, self.stiffness)
 
     def manifold(self, x: Scalar) -> Scalar:
         """Outward velocity over p that just reaches the saddle without forcing [rad]; negative beyond it."""
         gap = self.saddle - x
         if self.skew is not None:
-            return jnp.sqrt(self.stiffness) * skewed.distance(gap, self.skew)
+            return jnp.sqrt(self.stiffness) * free_swing.distance(gap, self.skew)
         # In half the angle: no cancellation near the saddle.
         distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """Outward velocity over p that reaches the unstable equilibrium under a constant forcing.
-
-        `push`: the forcing against it [g]; `weight`: 1 + vertical acceleration (None: 1); `hold`: restoring moment and
-        forcing at the angle, positive. For a spring with a line or a constant it is more than enough: what holds stays
-        below a line from `hold` to zero.
-        """
-        factor = 1.0 if weight is None else weight
-        if self.sinusoidal and self.skew is None:
-            across, along = _sum_of((self.rs, factor), (self.ms, push)), _sum_of((self.rc, factor), (self.mc, push))
+        """As for any moments. For a spring with a line or a constant it is more than enough: what holds stays below a
+        line from `hold` to zero. Infinite for an arm of which that is not known."""
+        moment, arm, factor = self.restoring_terms, self.arm_terms, 1.0 if weight is None else weight
+        if arm.line is not None:
+            return jnp.full_like(hold, jnp.inf)
+        if self.sinusoidal and self.skew is None and arm.constant is None:
+            across, along = (
+                Terms(*pair).along(Basis(factor, push, None, None))
+                for pair in ((moment.sine, arm.sine), (moment.cosine, arm.cosine))
+            )
             return jnp.sqrt(2 * jnp.maximum(jnp.hypot(across, along) - self.repulsion(angle, push, weight), 0.0))
+        if arm.sine is not None:
+            return jnp.full_like(hold, jnp.inf)
         if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent
             slope = self.repulsion(angle, push, weight)
-        else:  # convex up to pi/2: the chord; the arm, a cosine, is concave
+        else:  # convex up to pi/2 with a constant, concave without: the chord; the arm, a cosine, is concave
             flat = Angle(jnp.pi / 2, 1.0, 0.0)
             fall = factor * (self.restoring(angle) - self.restoring(flat))
             slope = fall / jnp.maximum(jnp.pi / 2 - angle.value, jnp.finfo(hold.dtype).eps)
-            slope = slope + push * self.mc * angle.sine
+            slope = slope + push * _or_zero(arm.cosine) * angle.sine
         # Without weight the forcing alone brings it back.
         light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
         return jnp.where(light, jnp.inf, hold / jnp.sqrt(jnp.where(light, 1.0, slope)))

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 
 from jaxrock._checks import checked, one_of
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.coefficients import Table
+from jaxrock.models.coefficients import Coefficients, Terms
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.numerics.elementary import sine_cosine
 
 
-class Spring(eqx.Module):
+class Spring(AbstractEquation):
     """A rigid column on a rotational spring without play: the spring models of a rigid block.
 
     **Arguments:**
@@ -43,21 +44,22 @@ class Spring(eqx.Module):
         self.kind = one_of("kind", kind, ("SM1", "SM2", "SM3"))
         self.law = one_of("law", law, ("sine", "linear", "plastic"))
 
-    def table(self, block: Block | Side) -> Table:
+    def moments(self, block: Block | Side) -> Coefficients:
         """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""
         alpha = block.alpha
         if self.law == "plastic" and self.kind != "SM1":
             message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
             alpha = checked("block.alpha", alpha, message, lambda angle: angle < jnp.pi / 4)
         sine, cosine = sine_cosine(alpha)
+        arm = Terms(cosine=cosine)
         if self.law == "sine":
-            return Table(rs=-cosine, rc=sine, mc=cosine)  # D&F 2017, 4, 7, 10
+            return Coefficients(Terms(sine=-cosine, cosine=sine), arm)  # D&F 2017, 4, 7, 10
         if self.law == "linear":
-            return Table(r0=sine, r1=-sine / alpha, mc=cosine)  # D&F 2017, 5, 8, 11
+            return Coefficients(Terms(constant=sine, line=-sine / alpha), arm)  # D&F 2017, 5, 8, 11
         weight = jnp.ones_like(alpha) if self.kind == "SM1" else cosine
-        return Table(r0=sine, rs=-weight, mc=cosine)  # D&F 2017, 6; 9, 12
+        return Coefficients(Terms(constant=sine, sine=-weight), arm)  # D&F 2017, 6; 9, 12
 
     @property
-    def falls_flat(self) -> bool:
-        """Whether a rotation of pi/2 means that the column lies on the ground."""
-        return True
+    def feels_weight(self) -> bool:
+        """The moment of a spring does not."""
+        return False

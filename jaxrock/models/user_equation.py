@@ -7,12 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.coefficients import Angle, Scalar, Table
-from jaxrock.models.rigid import Housner, Linear
-from jaxrock.models.spring import Spring
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar
 
 
-class Equation(eqx.Module):
+class Equation(AbstractEquation):
     """A model of your own, written as functions; the diffrax engine solves it.
 
     With the opening angle x = |rotation| [rad], velocity v = dx/d(p t), side s and ground acceleration u [g]:
@@ -37,7 +35,7 @@ class Equation(eqx.Module):
     """
 
     _acceleration: "_Function"
-    falls_flat: bool = eqx.field(static=True)
+    _falls_flat: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -52,11 +50,21 @@ class Equation(eqx.Module):
             raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
         parts = (restoring, arm, dissipation) if acceleration is None else (acceleration,)
         self._acceleration = _Function(parts)
-        self.falls_flat = falls_flat
+        self._falls_flat = falls_flat
 
-    def table(self, block: Block | Side) -> "EquationTable":
+    def moments(self, block: Block | Side) -> "FunctionMoments":
         """What the engine asks of the equation, for one block."""
-        return EquationTable(self._acceleration, block)
+        return FunctionMoments(self._acceleration, block)
+
+    @property
+    def falls_flat(self) -> bool:
+        """As it was given."""
+        return self._falls_flat
+
+    @property
+    def is_series(self) -> bool:
+        """Nothing is known of the functions but their values."""
+        return False
 
 
 class _Function(eqx.Module):
@@ -78,12 +86,12 @@ class _Function(eqx.Module):
         return -moment if dissipation is None else -moment - dissipation(x, v, block)
 
 
-class EquationTable(eqx.Module):
-    """What a `Table` tells, for a model that is given as functions."""
+class FunctionMoments(AbstractMoments):
+    """The moments of a model that is given as functions."""
 
     function: _Function
     block: Block | Side
-    factor: Scalar | None  # of all accelerations (see `Table.times`)
+    factor: Scalar | None  # of all accelerations (see `times`)
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
@@ -108,9 +116,9 @@ class EquationTable(eqx.Module):
         value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
         return value if self.factor is None else self.factor * value
 
-    def times(self, factor: Scalar) -> "EquationTable":
-        """As in `Table`."""
-        return EquationTable(self.function, self.block, factor)
+    def times(self, factor: Scalar) -> "FunctionMoments":
+        """As for any moments."""
+        return FunctionMoments(self.function, self.block, factor)
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
@@ -132,17 +140,8 @@ class EquationTable(eqx.Module):
         """One, or the factor: nothing else is known of the shape of the function."""
         return jnp.ones_like(self.saddle) if self.factor is None else self.factor
 
-    @property
-    def threshold(self) -> Scalar:
-        """Ground acceleration at which the block uplifts [g]."""
-        return self.restoring_at_rest / self.arm_at_rest
-
-    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
-        """As in `Table`."""
-        return Table.change_at_rest(self, horizontal, vertical)
-
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
-        """As in `Table`; infinite, because nothing is known of the function beyond this angle."""
+        """As for any moments; infinite, because nothing is known of the function beyond this angle."""
         return jnp.full_like(hold, jnp.inf)
 
     def _first_zero(self) -> Scalar:
@@ -165,6 +164,3 @@ class EquationTable(eqx.Module):
         low = jax.lax.stop_gradient(low)
         root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
         return jnp.where(jnp.any(falls), root, jnp.pi / 2)
-
-
-Model = Housner | Linear | Spring | Equation

@@ -41,7 +41,7 @@ def history(response: Response, axes=None):
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
-    threshold = float(scene.table.threshold)
+    threshold = float(scene.moments.threshold)
     for sign in (-1, 1):
         axes[2].axhline(sign * threshold, color=SAND, linewidth=0.9, label="uplift threshold" if sign > 0 else None)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
@@ -74,12 +74,12 @@ def phase(response: Response, axis=None):
     crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
     axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=BLUE, linewidth=0.8)
     opening = np.linspace(0, 2, 101)
-    manifold = np.asarray(jax.vmap(scene.table.manifold)(jnp.asarray(opening * alpha))) / alpha
+    manifold = np.asarray(jax.vmap(scene.moments.manifold)(jnp.asarray(opening * alpha))) / alpha
     for side in (1, -1):
         label = "stable manifold" if side > 0 else None
         axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
         axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
-        axis.plot([side * float(scene.table.saddle) / alpha], [0], "o", color=RED, markersize=4)
+        axis.plot([side * float(scene.moments.saddle) / alpha], [0], "o", color=RED, markersize=4)
     axis.axvline(0, color=GREY, linewidth=0.5)
     reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
     axis.set_xlim(-reach, reach)

@@ -9,7 +9,7 @@ from jaxrock._checks import checked
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
-from jaxrock.models.coefficients import Angle
+from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
 from jaxrock.responses.rigid import Response
 
@@ -110,7 +110,7 @@ def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity:
     opening = side * rotation
     speed = side * velocity / rate
     push, own = side * acceleration, (rate / scene.p) ** 2
-    bend = scene.table.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
+    bend = scene.moments.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
     missing = alpha - opening
     horizontal = acceleration + side * ratio * (jnp.cos(missing) * bend + jnp.sin(missing) * speed**2)
     normal = weight + ratio * (jnp.sin(missing) * bend - jnp.cos(missing) * speed**2)
@@ -152,7 +152,7 @@ def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
             # Just inside the step: an end may be a jump of the motion.
             time = start + jnp.clip(share, 1e-9, 1 - 1e-9) * lasts
             forces = _forces(stepper.scene, sides, time, node.side * opening, node.side * speed, node.side)
-            below = opening < stepper.scene.on(node.side).table.saddle
+            below = opening < stepper.scene.on(node.side).moments.saddle
             counts = jnp.isfinite(start) & ~node.done & below
             return jnp.where(counts, _friction(*forces), 0.0), jnp.where(counts, forces[1], jnp.inf)
 

@@ -17,8 +17,8 @@ from jaxrock.engines.state import State, initial_state, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.engines.taylor.fast import glance, has_many_pieces, most_steps
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Equation, Model
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
 from jaxrock.transforms.batching import Passes
@@ -175,7 +175,7 @@ def _traced(value) -> bool:
 def outcome(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     engine: AbstractEngine | None = None,
@@ -187,7 +187,7 @@ def outcome(
 def simulate(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     duration: ArrayLike | None = None,
@@ -206,10 +206,10 @@ def simulate(
     return eqx.tree_at(lambda r: (r.time, r.rotation, r.velocity), response, (time, rotation, velocity))
 
 
-def _engine(engine: AbstractEngine | None, model: Model) -> AbstractEngine:
+def _engine(engine: AbstractEngine | None, model: AbstractEquation) -> AbstractEngine:
     if engine is not None:
         return engine
-    return Diffrax() if isinstance(model, Equation) else Series()
+    return Diffrax() if not model.is_series else Series()
 
 
 _warned = False

@@ -20,8 +20,8 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound, uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.responses.rigid import outcome
 from jaxrock.status import Status
@@ -71,7 +71,7 @@ class Critical(eqx.Module):
 def critical_amplitudes(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     intensity: tuple[float, float] = (1.0, 10.0),
     derivatives: bool = True,
@@ -106,7 +106,7 @@ def critical_amplitudes(
 def critical_durations(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     factor: tuple[float, float] = (0.05, 20.0),
     derivatives: bool = True,
@@ -149,7 +149,7 @@ class _Scenes(eqx.Module):
     single: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: Model) -> "_Scenes":
+    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "_Scenes":
         """Broadcast all parameters against one another."""
         both = block, motion
         numbers = [jnp.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(both) if not _shared(path)]
@@ -188,7 +188,7 @@ def _pick(
 
 
 class _Kind:
-    def __init__(self, model: Model, engine: AbstractEngine | None):
+    def __init__(self, model: AbstractEquation, engine: AbstractEngine | None):
         self.model, self.engine = model, engine
 
     def margin(self, z, block, motion):
@@ -250,7 +250,7 @@ class _Duration(_Kind):
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(kind: type, model: Model, engine: AbstractEngine | None, slopes: bool) -> Callable:
+def _compiled(kind: type, model: AbstractEquation, engine: AbstractEngine | None, slopes: bool) -> Callable:
     return kind(model, engine).slopes if slopes else kind(model, engine).at
 
 

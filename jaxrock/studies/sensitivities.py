@@ -13,8 +13,8 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
 from jaxrock.responses.rigid import Outcome, outcome
@@ -72,7 +72,7 @@ _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 def sensitivity(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     engine: AbstractEngine | None = None,
 ) -> Sensitivity:
@@ -153,7 +153,7 @@ def sensitivity_map(
     *,
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SensitivityMap:
@@ -181,12 +181,12 @@ def sensitivity_map(
 
 
 @functools.lru_cache(maxsize=32)
-def _under_lobe(model: Model, engine: AbstractEngine | None) -> Callable:
+def _under_lobe(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
     def one(strength, duration, scene):
         shape, alpha, restitution = scene
         block = Block(alpha, jnp.ones_like(alpha), restitution)
         # Positive acceleration drives negative rotation; the size of the response is the same.
-        pulse = ExponentialPulse(model.table(block).threshold / strength, duration, shape)
+        pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
         return sensitivity(block, pulse, model, engine=engine)
 
     return one

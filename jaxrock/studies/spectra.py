@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxrock._checks import Values, as_real, positive
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.models.user_equation import Model
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.sinusoidal import SinePulse
 from jaxrock.responses.rigid import Outcome, outcome
@@ -62,7 +62,7 @@ def rocking_spectrum(
     motion: AbstractMotion,
     period: Values,
     restitution: ArrayLike | None = None,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     *,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -97,7 +97,7 @@ def self_similar_spectrum(
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Spectrum:
@@ -130,7 +130,7 @@ def overturning_map(
     alpha: ArrayLike = 0.2,
     restitution: ArrayLike | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
-    model: Model = Housner(),
+    model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> OverturningMap:
@@ -191,7 +191,7 @@ def _states(found: Outcome, block: Block) -> dict:
 
 
 @functools.lru_cache(maxsize=32)
-def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
+def _under_motion(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
     def one(period, scene):
         alpha, motion, restitution = scene
         block = Block(alpha, 2 * jnp.pi / period, restitution)
@@ -201,11 +201,13 @@ def _under_motion(model: Model, engine: AbstractEngine | None) -> Callable:
 
 
 @functools.lru_cache(maxsize=32)
-def _under_pulse(quantities: Callable, pulse: Callable, model: Model, engine: AbstractEngine | None) -> Callable:
+def _under_pulse(
+    quantities: Callable, pulse: Callable, model: AbstractEquation, engine: AbstractEngine | None
+) -> Callable:
     def one(intensity, ratio, scene):
         alpha, restitution = scene
         block = Block(alpha, jnp.ones_like(alpha), restitution)
-        motion = pulse(intensity * model.table(block).threshold, 2 * jnp.pi / ratio)
+        motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio)
         return quantities(outcome(block, motion, model, engine=engine), block)
 
     return one

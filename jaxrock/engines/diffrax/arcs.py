@@ -32,7 +32,7 @@ from jaxrock.engines.diffrax.guards import (
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either
-from jaxrock.models.coefficients import Angle
+from jaxrock.models.equation import Angle
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import differentiable
 
@@ -182,10 +182,10 @@ class ArcStepper(AbstractStepper):
         scene = self.scene.on(state.side)
         nodes, weights = (jnp.asarray(values, state.opening.dtype) for values in _GAUSS)
 
-        def energy(table, opening):
-            return opening * jnp.sum(weights * jax.vmap(lambda x: table.restoring(Angle.of(x)))(opening * nodes))
+        def energy(moments, opening):
+            return opening * jnp.sum(weights * jax.vmap(lambda x: moments.restoring(Angle.of(x)))(opening * nodes))
 
-        left = scene.restitution**2 * energy(scene.table, state.opening)
+        left = scene.restitution**2 * energy(scene.moments, state.opening)
         outdone = jnp.zeros_like(state.done)
         for share in (0.999, 0.7, 0.4, 0.1):
             opening = share * jnp.minimum(state.peak, scene.far.saddle)
@@ -222,14 +222,14 @@ class ArcStepper(AbstractStepper):
         than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
         faster than 2 v.
         """
-        table, v = self.scene.table, state.velocity
+        moments, v = self.scene.moments, state.velocity
         back = jnp.where(bend < 0, -bend, 1.0)
         flight, height = 4 * v / (back * self.scene.p), v * v / back
         weight = forcing.shaking.now[1]
-        pull = table.stiffness * (1.0 if weight is None else weight) + table.restoring_at_rest + back
-        change = table.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
+        pull = moments.stiffness * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
+        change = moments.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
         certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
-        least = (table.restoring(Angle.of(jnp.minimum(height, table.saddle))) / table.restoring_at_rest) ** 2
+        least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
         small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
         starts = (state.opening == 0) & (v > 0) & (bend < 0)
         return starts & certain & small & (not self.history)
@@ -271,7 +271,7 @@ class ArcStepper(AbstractStepper):
             state,
             piece=piece,
             local=local,
-            opening=jnp.where(flat, jnp.pi / 2, jnp.where(crossing, scene.table.saddle, y[0])),
+            opening=jnp.where(flat, jnp.pi / 2, jnp.where(crossing, scene.moments.saddle, y[0])),
             velocity=jnp.where(turning, 0.0, y[1]),
             uplifting=state.uplifting & ~moved,
             beyond=state.beyond ^ crossing,

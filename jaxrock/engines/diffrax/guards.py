@@ -10,8 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
-from jaxrock.models.coefficients import Angle, Table
-from jaxrock.models.user_equation import EquationTable
+from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion, Shaking
 
 Scalar = Inexact[ArrayLike, ""]
@@ -72,7 +71,7 @@ class Forcing(eqx.Module):
 class Arc(eqx.Module):
     """The smooth problem of one arc, and its guards; time is p t since its start."""
 
-    table: Table | EquationTable
+    moments: AbstractMoments
     forcing: Forcing
     side: Scalar
     opening: Scalar
@@ -90,11 +89,11 @@ class Arc(eqx.Module):
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
         state = start.side, start.opening, start.velocity
-        arc = cls(scene.table, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
+        arc = cls(scene.moments, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
         y = jnp.stack([start.opening, start.velocity])
         bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
-        pull = scene.table.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.table.arm_at_rest
+        pull = scene.moments.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.moments.arm_at_rest
         noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
         leaving = (start.opening == 0) & (start.velocity == 0)
         bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
@@ -104,7 +103,7 @@ class Arc(eqx.Module):
     def acceleration(self, time: Scalar, y: Pair) -> Scalar:
         """Acceleration of the opening angle per (p t)^2."""
         acceleration, weight = self.forcing(time)
-        return self.table.acceleration(Angle.of(y[0]), y[1], self.side * acceleration, weight)
+        return self.moments.acceleration(Angle.of(y[0]), y[1], self.side * acceleration, weight)
 
     def flow(self, time: Scalar, y: Pair) -> Pair:
         """The right-hand side."""
@@ -112,8 +111,8 @@ class Arc(eqx.Module):
 
     def gap(self, opening: Scalar) -> Scalar:
         """Opening angle beyond the saddle; zero where that is only rounding."""
-        gap = opening - self.table.saddle
-        return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.table.saddle, 0.0, gap)
+        gap = opening - self.moments.saddle
+        return jnp.where(jnp.abs(gap) <= 64 * jnp.finfo(gap.dtype).eps * self.moments.saddle, 0.0, gap)
 
     @property
     def leaving(self) -> Flag:
@@ -139,7 +138,7 @@ class Arc(eqx.Module):
         rises = jnp.where(self.bend == 0, self.jerk >= 0, self.bend > 0)
         along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
         extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
-        saddle = _guard(time, y[0] - self.table.saddle, [self.gap(self.opening), self.velocity], True)
+        saddle = _guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), self.velocity], True)
         held = self._hold(self.opening)
         forced = self.helpful[0] > 0
         if self.helpful[1] is not None:
@@ -150,7 +149,7 @@ class Arc(eqx.Module):
 
     def _hold(self, opening: Scalar) -> Scalar:
         """What the restoring moment and the most helpful forcing do against overturning."""
-        return -self.table.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
+        return -self.moments.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag) -> Scalar:

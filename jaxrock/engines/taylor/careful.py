@@ -22,7 +22,8 @@ from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either, when
 from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
-from jaxrock.models.coefficients import Angle, Table
+from jaxrock.models.coefficients import Coefficients
+from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
 from jaxrock.numerics.polynomial import (
     Watch,
@@ -75,7 +76,7 @@ class Series(AbstractEngine):
 
     def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
         """This engine at work on a scene; short pieces of a record need few terms."""
-        if not isinstance(scene.table, Table):
+        if not isinstance(scene.moments, Coefficients):
             raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
         return TaylorStepper(
             scene=scene,
@@ -129,9 +130,9 @@ class TaylorStepper(AbstractStepper):
     def finish(self, state: State) -> State:
         """The free stage by energy."""
         scene = self.scene.on(state.side)
-        table = scene.table
+        moments = scene.moments
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        here, there = Visit(table, scene.restitution), Visit(scene.tables[1], scene.far_restitution)
+        here, there = Visit(moments, scene.restitution), Visit(scene.both_moments[1], scene.far_restitution)
         visits = (here, there) if scene.far is None else (here, there, here)
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
@@ -144,7 +145,7 @@ class TaylorStepper(AbstractStepper):
         beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
         # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
-        slope = -2 * table.restoring(Angle.of(state.opening))
+        slope = -2 * moments.restoring(Angle.of(state.opening))
         off = state.spread.along(slope, -2 * state.velocity)
         toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
         toss_up = toss_up & (state.status == Status.successful)
@@ -176,7 +177,7 @@ class TaylorStepper(AbstractStepper):
         """Where a step starts, with time in `unit`."""
         stretch = keep(self.scene.p * unit, state.local)
         return Start(
-            self.scene.table.bare,
+            self.scene.moments.bare,
             stretch,
             state.side,
             state.uplifting,
@@ -197,7 +198,7 @@ class TaylorStepper(AbstractStepper):
         impact, turning, extremum, crossing, ground = cut.hits
         early = cut.length < step.length
         full = step.full & ~early
-        saddle = self.scene.table.saddle
+        saddle = self.scene.moments.saddle
         end = End(
             length=cut.length,
             opening=cut.opening,
@@ -241,7 +242,7 @@ class TaylorStepper(AbstractStepper):
 
     def _cut(self, state: State, step: "_Step", needed: Flag, inside) -> "_Cut":
         """The first event of a step."""
-        length, saddle = inside(step.length), self.scene.table.saddle
+        length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
         watches = [
@@ -265,7 +266,7 @@ class TaylorStepper(AbstractStepper):
         shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
         acceleration, weight = shaking.at(length)
         # The value of the series, with the derivatives of the equation.
-        law = self.scene.table.acceleration(Angle.of(opening), velocity, state.side * acceleration, weight)
+        law = self.scene.moments.acceleration(Angle.of(opening), velocity, state.side * acceleration, weight)
         bend = with_derivatives_of(cut.bend / start.stretch**2, law)
         impact, turning, _, crossing, _ = cut.hits
         noted = self.note(passed, step.signs[0] > 0, turning, crossing, opening, velocity, bend)
@@ -281,11 +282,11 @@ class TaylorStepper(AbstractStepper):
         if self.history:
             return always
         # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
-        table = self.scene.table
+        moments = self.scene.moments
         fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
         rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
-        top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, table.saddle), table.saddle)
-        least = (table.restoring(Angle.of(top)) / table.restoring_at_rest) ** 2
+        top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
+        least = (moments.restoring(Angle.of(top)) / moments.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
         return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # also a near tie
 
@@ -328,7 +329,7 @@ class _Step(NamedTuple):
 
         signs = _signs(state, coefficients)
         turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
-        crossing = (opening >= scene.table.saddle) != state.beyond
+        crossing = (opening >= scene.moments.saddle) != state.beyond
         top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
         monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top > state.fastest * start.stretch) & ~monotone

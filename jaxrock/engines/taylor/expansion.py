@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import ArrayLike, Bool, Inexact
 
-from jaxrock.models.coefficients import Angle, Table
+from jaxrock.models.coefficients import Basis, Coefficients
+from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
 from jaxrock.numerics.polynomial import derivative, horner
 from jaxrock.numerics.xla_cpu import keep, keep_by
@@ -27,7 +28,7 @@ Flag = Bool[ArrayLike, ""]
 class Start(NamedTuple):
     """Where a step starts. Time is in a unit of choice."""
 
-    table: Table
+    moments: Coefficients
     stretch: Scalar  # p times the unit of time
     side: Scalar
     uplifting: Flag  # leaves rest with zero acceleration
@@ -83,27 +84,20 @@ def expand(start: Start, order: int) -> Expansion:
 
     The sine and cosine of the angle follow their own recurrences (Jorba & Zou 2005).
     """
-    table, angle, one = start.table, start.angle, start.one
+    moments, angle, one = start.moments, start.angle, start.one
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
     sine, cosine, arms, restorings = [angle.sine], [angle.cosine], [], []
     scale = keep_by(-(start.stretch**2), one)
     pushes = [start.side * u for u in start.shaking.horizontal]
     for k in range(order - 1):
-        if table.trigonometric and k > 0:
+        if moments.trigonometric and k > 0:
             sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
             cosine.append(keep_by(_product(slopes, sine, k - 1) * (-1 / k), one))
-
-        def combine(constant, line, of_sine, of_cosine, k):
-            terms = [] if constant is None or k > 0 else [constant]
-            terms += [] if line is None else [line * x[k]]
-            terms += [] if of_sine is None else [of_sine * sine[k]]
-            terms += [] if of_cosine is None else [of_cosine * cosine[k]]
-            return sum(terms) if terms else None
-
-        arm = combine(table.m0, None, table.ms, table.mc, k)
+        basis = Basis.of_term(k, x, sine, cosine)
+        arm = moments.arm_terms.along(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
         moment = _product(pushes, arms, k)
-        restoring = combine(table.r0, table.r1, table.rs, table.rc, k)
+        restoring = moments.restoring_terms.along(basis, empty=None)
         restorings.append(restoring)
         moment = moment if restoring is None else moment + restoring
         if start.shaking.vertical is not None:
@@ -131,11 +125,48 @@ def _is_zero(tangent) -> bool:
     return isinstance(tangent, SymbolicZero)
 
 
-def _weighed(terms: list, vertical: list[Scalar] | None, order: int, like: Scalar) -> list:
+def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like: Scalar) -> list | None:
     """A series times 1 + v, where the model has it."""
-    if vertical is None or len(terms) < order - 1:
+    if vertical is None or terms is None or len(terms) < order - 1:
         return terms
     return [terms[k] + keep(_product(vertical, terms, k), like) for k in range(order - 1)]
+
+
+class _Sources(NamedTuple):
+    """The series that coefficients of moments multiply: of the restoring moment times 1 + v, of the arm times u."""
+
+    restoring: Basis
+    arm: Basis
+
+    @classmethod
+    def of(cls, start: Start, series: Expansion, order: int, like: Scalar) -> "_Sources":
+        """From the series of a step."""
+        horizontal, vertical = start.shaking
+        arm = start.moments.arm_terms
+        needed = arm.line is not None, arm.trigonometric, arm.trigonometric
+        pushed = [
+            [keep(_product(horizontal, terms, k), start.stretch) for k in range(order - 1)] if wanted else None
+            for wanted, terms in zip(needed, (series.opening, series.sine, series.cosine))
+        ]
+        constant = [jnp.ones_like(like)] + [None if vertical is None else jnp.zeros_like(like)] * (order - 2)
+        weighed = (
+            _weighed(terms, vertical, order, start.stretch)
+            for terms in (constant, series.opening, series.sine, series.cosine)
+        )
+        return cls(Basis(*weighed), Basis(horizontal, *pushed))
+
+    def pulls(self, start: Start, order: int) -> list[Scalar]:
+        """Coefficients of how fast the moment grows with the angle."""
+        moments, side = start.moments, start.side
+        constant_pull = not moments.trigonometric and start.shaking.vertical is None
+
+        def of(k):
+            restoring, arm = (basis.term(k).derivative for basis in (self.restoring, self.arm))
+            terms = moments.restoring_terms.products(restoring)
+            terms += moments.arm_terms.products(arm, side)
+            return keep(sum(terms), start.stretch)
+
+        return [of(k) for k in (range(1) if constant_pull else range(order - 1))]
 
 
 def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weights]:
@@ -145,34 +176,16 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     with the coefficients `pull` of the derivative of the moment. Backwards: `of_term[m]` is what the end gains from
     a change of coefficient m, `of_source[k]` from one of source k.
     """
-    table, side, stretch = start.table, start.side, start.stretch
+    side, stretch = start.side, start.stretch
     series = expand(start, order)
-    moments = range(order - 1)
-    trigonometric = table.ms is not None or table.mc is not None
-    horizontal, vertical = start.shaking
-    pushed_sine = [keep(_product(horizontal, series.sine, k), stretch) for k in moments if trigonometric]
-    pushed_cosine = [keep(_product(horizontal, series.cosine, k), stretch) for k in moments if trigonometric]
-    constant = [jnp.ones_like(length)] + [None if vertical is None else jnp.zeros_like(length)] * (order - 2)
-    # What multiplies r0, r1, rs and rc.
-    unity, line, sine, cosine = (
-        _weighed(terms, vertical, order, stretch) for terms in (constant, series.opening, series.sine, series.cosine)
-    )
-
-    def pull(k):
-        terms = [] if table.r1 is None or unity[k] is None else [table.r1 * unity[k]]
-        terms += [] if table.rs is None else [table.rs * cosine[k]]
-        terms += [] if table.rc is None else [-table.rc * sine[k]]
-        terms += [] if table.ms is None else [side * table.ms * pushed_cosine[k]]
-        terms += [] if table.mc is None else [-side * table.mc * pushed_sine[k]]
-        return keep(sum(terms), stretch)
-
-    pulls = [pull(k) for k in (moments if table.trigonometric or vertical is not None else range(1))]
+    sources = _Sources.of(start, series, order, length)
+    pulls = sources.pulls(start, order)
     powers = [jnp.ones_like(length)]
     for _ in range(order):
         powers.append(keep(powers[-1] * length, stretch))
     scale = -(stretch**2)
 
-    def of(own):
+    def backwards(own):
         of_term, of_source = [None] * (order + 1), [None] * (order - 1)
         for m in range(order, -1, -1):
             later = [of_source[k] * pulls[k - m] for k in range(m, min(order - 1, m + len(pulls)))]
@@ -180,37 +193,32 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
             if m >= 2:
                 source = of_term[m] * scale * (1 / (m * (m - 1)))
                 of_source[m - 2] = keep(jnp.where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
+        return of_term, of_source
 
-        def along(terms):
-            return sum(w * c for w, c in zip(of_source, terms))
+    def of(own):
+        of_term, of_source = backwards(own)
 
-        def of_push(j):
-            pairs = [(of_source[k], series.arm[k - j]) for k in range(j, order - 1)]
-            return side * sum((w * arm for w, arm in pairs if arm is not None), start=jnp.zeros_like(length))
+        def along(_, terms, sign=None):
+            terms = [term for term in terms if term is not None]
+            return sum(w * (term if sign is None else sign * term) for w, term in zip(of_source, terms))
 
-        def of_weight(j):
-            pairs = [(of_source[k], series.restoring[k - j]) for k in range(j, order - 1)]
-            return sum((w * moment for w, moment in pairs if moment is not None), start=jnp.zeros_like(length))
+        def of_shaking(length_of_series, factors):
+            """What the end gains per change of coefficient j of the ground's acceleration."""
+            pairs = ([(of_source[k], factors[k - j]) for k in range(j, order - 1)] for j in range(length_of_series))
+            return [sum((w * f for w, f in each if f is not None), start=jnp.zeros_like(length)) for each in pairs]
 
-        def coefficient(present, terms):
-            return None if present is None else along(terms)
-
-        weights = Table(
-            r0=coefficient(table.r0, [term for term in unity if term is not None]),
-            r1=coefficient(table.r1, line),
-            rs=coefficient(table.rs, sine),
-            rc=coefficient(table.rc, cosine),
-            m0=coefficient(table.m0, [side * u for u in horizontal]),
-            ms=coefficient(table.ms, [side * u for u in pushed_sine]),
-            mc=coefficient(table.mc, [side * u for u in pushed_cosine]),
-        )
+        horizontal, vertical = start.shaking
         zero = jnp.zeros_like(length)
-        of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
-        of_shaking = Shaking(
-            [of_push(j) for j in range(len(horizontal))],
-            None if vertical is None else [of_weight(j) for j in range(len(vertical))],
+        moments = Coefficients(
+            start.moments.restoring_terms.each(along, sources.restoring),
+            start.moments.arm_terms.each(functools.partial(along, sign=side), sources.arm),
         )
-        return _Weights(Start(weights, of_stretch, zero, zero, of_term[0], of_term[1], of_shaking, zero))
+        of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
+        shaking = Shaking(
+            [side * gain for gain in of_shaking(len(horizontal), series.arm)],
+            None if vertical is None else of_shaking(len(vertical), series.restoring),
+        )
+        return _Weights(Start(moments, of_stretch, zero, zero, of_term[0], of_term[1], shaking, zero))
 
     return of(powers), of([jnp.zeros_like(length)] + [k * power for k, power in enumerate(powers[:-1], 1)])
 
@@ -230,7 +238,7 @@ def _(order, primals, tangents):
     length, opening, speed = arrive(order, start, end)  # with derivatives of their own, for those of higher order
     d_opening, d_speed = (weights.times(d_start) for weights in _weights(order, start, length))
     acceleration, weight = start.shaking.at(length)
-    law = start.table.acceleration(Angle.of(opening), speed, start.side * acceleration, weight)
+    law = start.moments.acceleration(Angle.of(opening), speed, start.side * acceleration, weight)
     bend = start.stretch**2 * law
     d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinite, for the status to tell.

@@ -164,7 +164,7 @@ class _Meeting(NamedTuple):
 
 def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
     """The turning point within a part, and the first level that it meets, before it turns or after."""
-    one, saddle, zero = start.one, start.table.saddle, jnp.zeros_like(part.length)
+    one, saddle, zero = start.one, start.moments.saddle, jnp.zeros_like(part.length)
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
@@ -230,7 +230,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
     certain = keep_flag(meeting.certain & sure, state.local)
 
-    opening = jnp.where(crossing, scene.table.saddle, jnp.where(impact, 0.0, meeting.opening))
+    opening = jnp.where(crossing, scene.moments.saddle, jnp.where(impact, 0.0, meeting.opening))
     velocity = keep_by(meeting.speed / stretch, one)
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(crossing | impact | meeting.stops)
@@ -256,7 +256,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
             part.outward > 0,
             meeting.turned & ~crossing,
             crossing,
-            jnp.where(crossing, scene.table.saddle, meeting.top),
+            jnp.where(crossing, scene.moments.saddle, meeting.top),
             jnp.where(crossing, velocity, 0.0),
             keep_by(jnp.where(crossing, meeting.bend, meeting.top_bend) / stretch**2, one),
         )

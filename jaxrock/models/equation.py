@@ -1,0 +1,114 @@
+"""What every model must tell: for a block on one of its corners, the moments that act on it.
+
+With the opening angle x = |rotation| (rad), velocity v = dx/d(p t), side s and ground acceleration u (g), x'' is minus
+the restoring moment and s u times the overturning arm, both over m g R, and whatever else a model adds.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Inexact
+
+from jaxrock.blocks.rigid import Block, Side
+from jaxrock.numerics.elementary import sine_cosine
+
+Scalar = Inexact[ArrayLike, ""]
+
+
+class Angle(NamedTuple):
+    """An angle [rad] with its sine and cosine, which are computed once."""
+
+    value: Scalar
+    sine: Scalar
+    cosine: Scalar
+
+    @classmethod
+    def of(cls, value: Scalar) -> "Angle":
+        """An angle from its value, between 0 and pi/2 or a little beyond."""
+        return cls(value, *sine_cosine(jnp.asarray(value)))
+
+
+class AbstractMoments(eqx.Module):
+    """The moments that act on one block on one of its corners, and what follows from them."""
+
+    saddle: eqx.AbstractVar[Scalar]  # opening angle of the unstable equilibrium: it balances on its corner [rad]
+    stiffness: eqx.AbstractVar[Scalar]  # how fast the restoring moment falls there; 1 where that is not known
+    restoring_at_rest: eqx.AbstractVar[Scalar]  # restoring moment just after uplift, positive
+    arm_at_rest: eqx.AbstractVar[Scalar]  # overturning arm just after uplift, positive
+
+    @abc.abstractmethod
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+
+    @abc.abstractmethod
+    def restoring(self, angle: Angle) -> Scalar:
+        """Restoring moment over m g R at an opening angle."""
+
+    @abc.abstractmethod
+    def arm(self, angle: Angle) -> Scalar:
+        """Overturning moment over m R u g at an opening angle."""
+
+    @abc.abstractmethod
+    def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """How fast nearby angles part, per angle: the derivative of the acceleration by the angle."""
+
+    @abc.abstractmethod
+    def times(self, factor: Scalar) -> "AbstractMoments":
+        """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
+
+    @abc.abstractmethod
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Outward velocity over p that is enough to reach the unstable equilibrium under a constant forcing.
+
+        `push`: the forcing against it [g]; `weight`: 1 + vertical acceleration (None: 1); `hold`: restoring moment and
+        forcing at the angle, positive.
+        """
+
+    @property
+    def threshold(self) -> Scalar:
+        """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
+        return self.restoring_at_rest / self.arm_at_rest
+
+    def change_at_rest(self, horizontal: Scalar, vertical: Scalar | None) -> Scalar:
+        """By how much the acceleration just after uplift changes with that of the ground, at most."""
+        change = horizontal * self.arm_at_rest
+        return change if vertical is None else change + vertical * self.restoring_at_rest
+
+
+class AbstractEquation(eqx.Module):
+    """An equation of motion of rigid blocks. Models of the package are such, and a model of your own may be.
+
+    A subclass says in `moments` what acts on a block: `Coefficients`, where restoring moment and arm are sums of a
+    constant, a line, a sine and a cosine of the opening angle (then the series engine solves it, exact to rounding, and
+    in machine code), or the moments of an `Equation` made of functions (then the diffrax engine does, and `is_series`
+    is false). Its fields are parameters: what is an array there may be differentiated by, and may differ from lane to
+    lane under `jax.vmap`.
+    """
+
+    @abc.abstractmethod
+    def moments(self, block: Block | Side) -> AbstractMoments:
+        """The moments that act on a block, or on one side of an asymmetric one.
+
+        **Arguments:**
+
+        - `block`: tells `alpha` [rad] and `p` [rad/s], scalars.
+
+        **Returns:** moments over m g R, in time p t.
+        """
+
+    @property
+    def falls_flat(self) -> bool:
+        """Whether a rotation of pi/2 means that the block lies on its side."""
+        return True
+
+    @property
+    def is_series(self) -> bool:
+        """Whether its moments are `Coefficients`, so that the series engine can solve it."""
+        return True
+
+    @property
+    def feels_weight(self) -> bool:
+        """Whether a vertical acceleration changes the restoring moment; if not, vertical motions are refused."""
+        return True
