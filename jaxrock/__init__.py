@@ -9,6 +9,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 from jaxrock import closed_form as closed_form
+from jaxrock._parameters import parameter as parameter
+from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
 from jaxrock.blocks.random import draw_blocks as draw_blocks
@@ -98,8 +100,8 @@ from jaxrock.motions.pulses.sinusoidal import (
 from jaxrock.motions.record import Record as Record
 from jaxrock.motions.suite import Suite as Suite
 from jaxrock.responses.contact import Contact as Contact, contact_forces as contact_forces
-from jaxrock.responses.dispatch import outcome as outcome, simulate as simulate
-from jaxrock.responses.rigid import Outcome as Outcome, Response as Response
+from jaxrock.responses.history import Response as Response, simulate as simulate
+from jaxrock.responses.outcome import Outcome as Outcome, outcome as outcome
 from jaxrock.status import Status as Status
 from jaxrock.studies import similarity as similarity
 from jaxrock.studies.critical import (

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import inspect
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -68,29 +69,29 @@ def put_down():
         _put_down = before
 
 
-def positive(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as an array of positive finite numbers."""
-    return checked(name, value, "be positive and finite", lambda x: (x > 0) & (x < np.inf))
+class Range(NamedTuple):
+    """The numbers that are allowed somewhere; called with a name and a value it returns the value as such an array."""
+
+    allowed: str  # in words, after "must"
+    low: float  # ends of the interval in which a number may be moved
+    high: float
+    holds: Callable
+
+    def __call__(self, name: str, value: Values) -> Inexact[Array, "..."]:
+        """Return `value` as an array of these numbers, or raise ValueError."""
+        return checked(name, value, self.allowed, self.holds)
 
 
-def finite(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as an array of finite numbers."""
-    return checked(name, value, "be finite", lambda x: (x > -np.inf) & (x < np.inf))
-
-
-def not_nan(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as an array of numbers, of which some may be infinite."""
-    return checked(name, value, "be a number", lambda x: x == x)
-
-
-def acute(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as an array of angles between 0 and a right one."""
-    return checked(name, value, "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
-
-
-def share(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as an array of numbers from 0 to 1."""
-    return checked(name, value, "be in [0, 1]", lambda x: (x >= 0) & (x <= 1))
+positive = Range("be positive and finite", 0.0, np.inf, lambda x: (x > 0) & (x < np.inf))
+not_negative = Range("be 0 or more and finite", 0.0, np.inf, lambda x: (x >= 0) & (x < np.inf))
+finite = Range("be finite", -np.inf, np.inf, lambda x: (x > -np.inf) & (x < np.inf))
+not_nan = Range("be a number", -np.inf, np.inf, lambda x: x == x)  # some may be infinite
+acute = Range("be in (0, pi/2)", 0.0, np.pi / 2, lambda x: (x > 0) & (x < np.pi / 2))  # an angle below a right one
+share = Range("be in [0, 1]", 0.0, 1.0, lambda x: (x >= 0) & (x <= 1))
+RANGES = {
+    "positive": positive, "not_negative": not_negative, "finite": finite, "not_nan": not_nan, "acute": acute,
+    "share": share,
+}  # fmt: skip
 
 
 def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:

@@ -206,7 +206,7 @@ def test_the_work_of_the_ground_is_the_gain_of_energy():
     edges = np.linspace(0, 1.6, 9)
     numbers, scene = response.scene.numbers, response.scene
     total = 0.0
-    unlock = float(response.node_times[np.argmax(np.asarray(response.nodes.side) != 0)])
+    unlock = float(response.trajectory.times[np.argmax(np.asarray(response.trajectory.nodes.side) != 0)])
     edges = np.unique(np.append(edges, unlock))
     for a, b in zip(edges, edges[1:]):
         times = (a + b) / 2 + (b - a) / 2 * nodes
@@ -220,10 +220,10 @@ def test_the_work_of_the_ground_is_the_gain_of_energy():
 
 def _momentum(response, t):
     """Sum of load times modal velocity, from the node before."""
-    index = jnp.searchsorted(response.node_times, t, side="right") - 1
-    node = jax.tree.map(lambda x: x[index], response.nodes)
+    index = jnp.searchsorted(response.trajectory.times, t, side="right") - 1
+    node = jax.tree.map(lambda x: x[index], response.trajectory.nodes)
     path, length, _, _ = response.scene.arc(node)
-    state = path.state((t - response.node_times[index]) / length)
+    state = path.state((t - response.trajectory.times[index]) / length)
     n = response.scene.numbers.rotation.size
     return jnp.sum(response.scene.numbers.load * state[n:-1])
 
@@ -371,7 +371,7 @@ def test_stiff_columns(damping):
     response = rk.simulate_flexible(block, rk.SinePulse(0.15, 0.8), duration=1.6, samples=2)
     assert float(block.frequencies[-1]) > 1e5
     assert response.status == rk.Status.successful
-    assert int(response.nodes.steps.max()) < 200
+    assert int(response.trajectory.nodes.steps.max()) < 200
     stiffer = rk.FlexibleBlock(0.5, 5.0, 3000e9, 2500.0, damping, 20)
     rigid = rigid_peak(block, 0.15, 0.8)
     off = float(response.max_rotation) / rigid - 1

@@ -11,7 +11,8 @@ import jaxrock as rk
 from jaxrock.numerics.elementary import logarithm
 from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import root_of
-from jaxrock.responses.rigid import _passes, _start
+from jaxrock.responses.arguments import start_of
+from jaxrock.responses.outcome import _passes
 
 PULSES = {
     "sine": rk.SinePulse,
@@ -90,7 +91,7 @@ def test_few_scenes_are_postponed(model):
     def one(alpha, p, restitution, intensity, ratio):
         block = rk.Block(alpha, p, restitution)
         pulse = rk.SinePulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p))
-        scene = block, pulse, model, tuple(jnp.asarray(x) for x in _start((0.0, 0.0)))
+        scene = block, pulse, model, tuple(jnp.asarray(x) for x in start_of((0.0, 0.0)))
         stepper, state = passes.begin(scene)
         return passes.conclude(stepper, passes.quickly(stepper, state, 10_000))[1]
 

@@ -4,12 +4,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Values, acute, checked, finite, positive
+from jaxrock._checks import Range, Values, acute, checked, finite, not_negative, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
+from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of
 from jaxrock.blocks.rigid import GRAVITY, Side
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
+
+_ratio_of_inertia = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
 
 
 class AsymmetricBlock(eqx.Module):
@@ -26,25 +30,23 @@ class AsymmetricBlock(eqx.Module):
     - `inertia_ratio`: m R1^2/I1, with I1 the moment of inertia about corner 1 [-], in (0, 1]; 3/4 for a rectangle.
     - `radius_ratio`: R2/R1, distances from the corners to the centre of mass [-], positive. None: that of a flat base,
       cos(alpha1)/cos(alpha2), which follows the angles under differentiation.
-    - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2. None: by angular
-      momentum about the new corner, zero at least.
+    - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2; or a law of
+      restitution for both. None: by angular momentum about the new corner, zero at least.
 
     All may be arrays of one shape, for use under `jax.vmap`.
 
     **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the
     energy that two impacts keep, exceeds 1. (One of them may: about corners of unequal height it often does.)
 
-    **Source:** Housner (1963) for each side; the impact by angular momentum, e_st = 1 - kappa_t [1 - (R_s/R_t)
-    cos(alpha1 + alpha2)] with kappa_t = m R_t^2/I_t, which is Housner's for a rectangle.
+    **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
 
-    alpha1: Real
-    alpha2: Real
-    p1: Real
-    inertia_ratio: Real
-    given_radius_ratio: Real | None
-    given_restitution1: Real | None
-    given_restitution2: Real | None
+    alpha1: Real = parameter("rad", acute)
+    alpha2: Real = parameter("rad", acute)
+    p1: Real = parameter("rad/s", positive)
+    inertia_ratio: Real = parameter("-", _ratio_of_inertia)
+    given_radius_ratio: Real | None = parameter("-", positive, follows="radius_ratio")
+    law: AbstractRestitution
 
     def __init__(
         self,
@@ -53,20 +55,12 @@ class AsymmetricBlock(eqx.Module):
         p1: ArrayLike,
         inertia_ratio: ArrayLike = 0.75,
         radius_ratio: ArrayLike | None = None,
-        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
     ):
-        self.alpha1, self.alpha2, self.p1 = acute("alpha1", alpha1), acute("alpha2", alpha2), positive("p1", p1)
-        self.inertia_ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
+        set_parameters(self, alpha1=alpha1, alpha2=alpha2, p1=p1, inertia_ratio=inertia_ratio)
         self.given_radius_ratio = None if radius_ratio is None else positive("radius_ratio", radius_ratio)
-        self.given_restitution1 = self.given_restitution2 = None
-        if restitution is not None:
-            first, second = (
-                checked(f"restitution[{i}]", e, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
-                for i, e in enumerate(restitution)
-            )
-            keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
-            checked("restitution", first * second, keeps, lambda x: x <= 1 + 1e-12)
-            self.given_restitution1, self.given_restitution2 = first, second
+        pair = isinstance(restitution, (tuple, list))
+        self.law = PerSide(*restitution) if pair else law_of(restitution, AngularMomentum())
 
     @classmethod
     def from_radii(
@@ -76,7 +70,7 @@ class AsymmetricBlock(eqx.Module):
         R1: ArrayLike,
         R2: ArrayLike,
         gyration_radius: ArrayLike,
-        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> "AsymmetricBlock":
         """Build a block from the distances of its corners to the centre of mass, and its inertia.
@@ -93,9 +87,7 @@ class AsymmetricBlock(eqx.Module):
         **Raises:** ValueError for a value outside its range.
         """
         first, second, gravity = positive("R1", R1), positive("R2", R2), positive("gravity", gravity)
-        gyration = checked(
-            "gyration_radius", gyration_radius, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf)
-        )
+        gyration = not_negative("gyration_radius", gyration_radius)
         ratio = first**2 / (first**2 + gyration**2)
         return cls(alpha1, alpha2, jnp.sqrt(gravity * ratio / first), ratio, second / first, restitution)
 
@@ -107,7 +99,7 @@ class AsymmetricBlock(eqx.Module):
         p1: ArrayLike,
         p2: ArrayLike,
         inertia_ratio: ArrayLike = 0.75,
-        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
     ) -> "AsymmetricBlock":
         """Build a block from the frequency parameters about both corners.
 
@@ -135,7 +127,7 @@ class AsymmetricBlock(eqx.Module):
         corner2: Values,
         centre: Values,
         gyration_radius: ArrayLike,
-        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> "AsymmetricBlock":
         """Build a block from the places of its corners and of its centre of mass, at rest.
@@ -171,7 +163,7 @@ class AsymmetricBlock(eqx.Module):
         supports: tuple[int, int] | None = None,
         centre: Values | None = None,
         gyration_radius: ArrayLike | None = None,
-        restitution: tuple[ArrayLike, ArrayLike] | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> "AsymmetricBlock":
         """Build a homogeneous block from the polygon of its outline, in the plane of rocking.
@@ -221,22 +213,20 @@ class AsymmetricBlock(eqx.Module):
     @property
     def restitution1(self) -> Real:
         """Angular velocity after an impact that ends the stay on side 1 over that before it."""
-        if self.given_restitution1 is None:
-            return self._by_momentum(self.inertia_ratio2, 1 / self.radius_ratio)
-        return self.given_restitution1
+        return self.law.ratio(self.corners[0], jnp.zeros_like(self.p1))
 
     @property
     def restitution2(self) -> Real:
         """The same for an impact that ends the stay on side 2."""
-        if self.given_restitution2 is None:
-            return self._by_momentum(self.inertia_ratio, self.radius_ratio)
-        return self.given_restitution2
+        return self.law.ratio(self.corners[1], jnp.zeros_like(self.p1))
 
-    def _by_momentum(self, inertia_ratio: Real, radii: Real) -> Real:
-        """Angular momentum about the new corner is kept; radii: that before over that after."""
-        cosine = sine_cosine(self.alpha1)[1] * sine_cosine(self.alpha2)[1]
-        sine = sine_cosine(self.alpha1)[0] * sine_cosine(self.alpha2)[0]
-        return jnp.maximum(1 - inertia_ratio * (1 - radii * (cosine - sine)), 0)
+    @property
+    def corners(self) -> tuple[Corners, Corners]:
+        """What the law of restitution sees of impacts that end a stay on side 1, and on side 2."""
+        return (
+            Corners(self.alpha1, self.alpha2, self.p1, self.inertia_ratio2, 1 / self.radius_ratio, 1),
+            Corners(self.alpha2, self.alpha1, self.p2, self.inertia_ratio, self.radius_ratio, -1),
+        )
 
     @property
     def sides(self) -> tuple[Side, Side]:
@@ -246,6 +236,6 @@ class AsymmetricBlock(eqx.Module):
     @property
     def mirrored(self) -> "AsymmetricBlock":
         """The block seen from behind: its sides exchanged."""
-        pair = None if self.given_restitution1 is None else (self.given_restitution2, self.given_restitution1)
+        law = PerSide(self.law.second, self.law.first) if isinstance(self.law, PerSide) else self.law
         radii = None if self.given_radius_ratio is None else 1 / self.given_radius_ratio
-        return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, pair)
+        return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, law)

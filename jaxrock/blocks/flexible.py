@@ -6,11 +6,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, one_of, positive, share
+from jaxrock._checks import Range, checked, one_of, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
+from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
 from jaxrock.blocks.rigid import GRAVITY
 
 Real = Inexact[Array, "..."]
+
+_damping = Range("be in [0, 1)", 0.0, 1.0, lambda x: (x >= 0) & (x < 1))
 
 
 class FlexibleBlock(eqx.Module):
@@ -29,7 +33,8 @@ class FlexibleBlock(eqx.Module):
     - `density`: [kg/m^3], positive.
     - `damping_ratio`: of the column, in [0, 1) [-]; 0 for none.
     - `masses`: number of lumped masses, the one at the base included; 2 to 60. Six are within a few per cent of many.
-    - `restitution`: velocities after an impact over those before it, in [0, 1]; None: Housner's, 1 - 1.5 sin^2(alpha).
+    - `restitution`: velocities after an impact over those before it, in [0, 1], or a law of restitution, which sees the
+      angular velocity of the base; None: Housner's, 1 - 1.5 sin^2(alpha).
     - `damping`: "stiffness": in proportion to the column's stiffness, with `damping_ratio` in its first clamped mode;
       "modal": `damping_ratio` in every clamped mode; "rayleigh": in proportion to stiffness and masses, with
       `damping_ratio` in the first two clamped modes. The masses' part brakes rigid rocking, too.
@@ -46,13 +51,13 @@ class FlexibleBlock(eqx.Module):
     figure 3b; Vassiliou, Mackie & Stojadinovic (2016).
     """
 
-    width: Real
-    height: Real
-    youngs_modulus: Real
-    density: Real
-    damping_ratio: Real
-    given_restitution: Real | None
-    gravity: Real
+    width: Real = parameter("m", positive)
+    height: Real = parameter("m", positive)
+    youngs_modulus: Real = parameter("Pa", positive, symbol="E")
+    density: Real = parameter("kg/m^3", positive)
+    damping_ratio: Real = parameter("-", _damping)
+    law: AbstractRestitution
+    gravity: Real = parameter("m/s^2", positive)
     masses: int = eqx.field(static=True)
     damping: str = eqx.field(static=True)
     impacts: str = eqx.field(static=True)
@@ -66,7 +71,7 @@ class FlexibleBlock(eqx.Module):
         damping_ratio: ArrayLike,
         masses: int = 6,
         *,
-        restitution: ArrayLike | None = None,
+        restitution: Restitution | None = None,
         damping: str = "stiffness",
         impacts: str = "alternate",
         gravity: ArrayLike = GRAVITY,
@@ -77,14 +82,10 @@ class FlexibleBlock(eqx.Module):
         if not isinstance(masses, int) or not least <= masses <= 60:
             raise ValueError(f"Argument `masses` must be a whole number from {least} to 60, but is {masses!r}.")
         self.masses = masses
-        self.width, self.height = positive("width", width), positive("height", height)
-        self.density, self.gravity = positive("density", density), positive("gravity", gravity)
-        self.damping_ratio = checked("damping_ratio", damping_ratio, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
-        self.youngs_modulus = positive("youngs_modulus", youngs_modulus)
-        self.given_restitution = None
-        if restitution is not None:
-            self.given_restitution = share("restitution", restitution)
-        else:
+        set_parameters(self, width=width, height=height, youngs_modulus=youngs_modulus, density=density)
+        set_parameters(self, damping_ratio=damping_ratio, gravity=gravity)
+        self.law = law_of(restitution, Housner())
+        if restitution is None:
             flat = "be at most 1.41 times the height when `restitution` is None: Housner's value is negative above"
             self.width = checked("width", self.width, flat, lambda x: x <= math.sqrt(2) * self.height * (1 + 1e-6))
         self.youngs_modulus = checked(
@@ -112,10 +113,19 @@ class FlexibleBlock(eqx.Module):
 
     @property
     def restitution(self) -> Real:
-        """Velocities after an impact over those before it (given, or Housner's)."""
-        if self.given_restitution is None:
-            return jnp.maximum(1 - 1.5 * jnp.sin(self.alpha) ** 2, 0)  # Diamantopoulos & Fragiadakis 2017, 21
-        return self.given_restitution
+        """Velocities after an impact over those before it (D&F 2017, 21: Housner's); if that depends on the speed, of
+        the gentlest."""
+        return self.law.ratio(self.corners, jnp.zeros_like(self.alpha))
+
+    @property
+    def p(self) -> Real:
+        """Frequency parameter of the rigid block of this size [rad/s]."""
+        return jnp.sqrt(1.5 * self.gravity / self.length)
+
+    @property
+    def corners(self) -> Corners:
+        """What the law of restitution sees of an impact."""
+        return Corners(self.alpha, self.alpha, self.p)
 
     @property
     def first_period(self) -> Real:

@@ -2,10 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, checked, positive, share
+from jaxrock._checks import acute, positive
+from jaxrock._parameters import parameter, set_parameters
+from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fitting_alpha, law_of
 
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
 
@@ -17,8 +18,9 @@ class Block(eqx.Module):
 
     - `alpha`: slenderness angle, tan(alpha) = half width / half height [rad], in (0, pi/2).
     - `p`: frequency parameter, sqrt(m g R / I) [rad/s], positive; sqrt(3 g / 4 R) for a rectangle.
-    - `restitution`: angular velocity after an impact over that before it, in [0, 1]. None means
-      Housner's value 1 - 1.5 sin^2(alpha), which follows alpha under differentiation.
+    - `restitution`: angular velocity after an impact over that before it, in [0, 1]; or a law of restitution, such as
+      `jaxrock.restitution.SpeedDependent(...)`. None means Housner's value 1 - 1.5 sin^2(alpha), which follows alpha
+      under differentiation.
 
     All may be arrays of one shape, for use under `jax.vmap`.
 
@@ -28,30 +30,21 @@ class Block(eqx.Module):
     **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equations 2.3 and 2.4.
     """
 
-    alpha: Inexact[Array, "..."]
-    p: Inexact[Array, "..."]
-    given_restitution: Inexact[Array, "..."] | None
+    alpha: Inexact[Array, "..."] = parameter("rad", acute)
+    p: Inexact[Array, "..."] = parameter("rad/s", positive)
+    law: AbstractRestitution
 
-    def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None = None):
-        self.alpha = acute("alpha", alpha)
-        self.p = positive("p", p)
-        if restitution is None:
-            self.alpha = checked(
-                "alpha",
-                self.alpha,
-                "be at most 0.955 when `restitution` is None, because Housner's value is negative above",
-                lambda x: x <= np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6),
-            )
-            self.given_restitution = None
-        else:
-            self.given_restitution = share("restitution", restitution)
+    def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None):
+        set_parameters(self, alpha=alpha, p=p)
+        self.law = law_of(restitution, Housner())
+        self.alpha = fitting_alpha(self.law, self.alpha)
 
     @classmethod
     def from_dimensions(
         cls,
         width: ArrayLike,
         height: ArrayLike,
-        restitution: ArrayLike | None = None,
+        restitution: Restitution | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> "Block":
         """Build a homogeneous rectangular block from its full sizes.
@@ -74,10 +67,13 @@ class Block(eqx.Module):
 
     @property
     def restitution(self) -> Inexact[Array, "..."]:
-        """Angular velocity after an impact over that before it (given, or Housner's)."""
-        if self.given_restitution is None:
-            return jnp.maximum(1 - 1.5 * jnp.sin(self.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
-        return self.given_restitution
+        """Angular velocity after an impact over that before it; if it depends on the speed, of the gentlest."""
+        return self.law.ratio(self.corners, jnp.zeros_like(self.p))
+
+    @property
+    def corners(self) -> Corners:
+        """What the law of restitution sees of an impact."""
+        return Corners(self.alpha, self.alpha, self.p)
 
     @property
     def half_diagonal(self) -> Inexact[Array, "..."]:

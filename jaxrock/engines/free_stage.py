@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock.blocks.restitution import Reset
 from jaxrock.engines.state import surpasses
 from jaxrock.models import free_swing as skewed
 from jaxrock.models.coefficients import Coefficients
@@ -111,7 +112,7 @@ class Visit(NamedTuple):
     """A stay on one side, until the impact that ends it."""
 
     moments: Coefficients
-    restitution: Scalar  # of that impact
+    reset: Reset  # that impact
 
 
 def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar) -> FreeStage:
@@ -137,8 +138,10 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     shares = [share]
     for i, visit in enumerate(visits[1:], 1):
         happens = moving & ~lost & ~outward if i == len(visits) - 1 else moving & ~lost
-        rebound = visits[i - 1].restitution * arrival
-        share = share * visits[i - 1].restitution ** 2
+        reset = visits[i - 1].reset
+        ratio = reset.ratio(arrival)
+        rebound = ratio * arrival
+        share = share * jnp.abs(ratio * reset.slope(arrival))  # of a change of the energy
         stay = _after_impact(visit.moments, rebound, happens)
         lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
         arrival = rebound

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
+from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
@@ -38,18 +40,6 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
     return jnp.max(motion.bounds)
 
 
-def check_single(block: Block | AsymmetricBlock, motion: AbstractMotion) -> None:
-    """Raise ValueError where a parameter is an array outside of `jax.vmap`."""
-    for name, owner in (("block", block), ("motion", motion)):
-        for path, leaf in jax.tree_util.tree_leaves_with_path(owner):
-            allowed = 1 if jax.tree_util.keystr(path).endswith(".samples") else 0
-            if jnp.ndim(leaf) > allowed:
-                raise ValueError(
-                    f"Argument `{name}` must hold one scene, but `{jax.tree_util.keystr(path).lstrip('.')}` has "
-                    f"shape {jnp.shape(leaf)}. Use jax.vmap for many."
-                )
-
-
 def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
     if isinstance(block, Block):
@@ -77,8 +67,8 @@ class Scene(eqx.Module):
     far: AbstractMoments | None
     p: Scalar  # unit of time and velocity on either side
     alpha: Scalar  # size of an angle that matters
-    restitution: Scalar  # of an impact that ends the stay on this side
-    far_restitution: Scalar  # on the other
+    reset: Reset  # the impact that ends the stay on this side
+    far_reset: Reset  # on the other
     motion: AbstractMotion
     knots: Inexact[Array, " knots"]
     lengths: Inexact[Array, " knots"]
@@ -93,7 +83,7 @@ class Scene(eqx.Module):
     @classmethod
     def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "Scene":
         """Build the scene; raise ValueError where a parameter is an array outside of `jax.vmap`."""
-        check_single(block, motion)
+        check_single(block=block, motion=motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
         block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
         knots, bounds, scales = motion.knots, motion.bounds, motion.scales
@@ -106,9 +96,10 @@ class Scene(eqx.Module):
         skips = bounds.size > _NEAR
         moments, far = _moments(block, model)
         if isinstance(block, Block):
-            near, other, p, alpha = block, block, block.p, block.alpha
+            p, alpha, corners = block.p, block.alpha, (block.corners, block.corners)
         else:
-            (near, other), p, alpha = block.sides, block.p1, jnp.minimum(block.alpha1, block.alpha2)
+            p, alpha, corners = block.p1, jnp.minimum(block.alpha1, block.alpha2), block.corners
+        reset, far_reset = (Reset.of(block.law, each, p) for each in corners)
         # At rest while |u| < threshold (1 + v), so at least while |u| + threshold |v| < threshold.
         threshold = _least_threshold(moments, far)
         drive = bounds if vertical is None else bounds + threshold * jnp.pad(vertical, (0, 1))
@@ -117,8 +108,8 @@ class Scene(eqx.Module):
             far=far,
             p=p,
             alpha=alpha,
-            restitution=near.restitution,
-            far_restitution=other.restitution,
+            reset=reset,
+            far_reset=far_reset,
             motion=motion,
             knots=knots,
             lengths=jnp.concatenate([jnp.diff(knots), infinity]),
@@ -148,8 +139,8 @@ class Scene(eqx.Module):
             self,
             moments=of(self.moments, self.far),
             far=of(self.far, self.moments),
-            restitution=of(self.restitution, self.far_restitution),
-            far_restitution=of(self.far_restitution, self.restitution),
+            reset=of(self.reset, self.far_reset),
+            far_reset=of(self.far_reset, self.reset),
         )
 
     @property

@@ -72,16 +72,17 @@ class Spread(eqx.Module):
         even, odd = (growth + 1 / growth) / 2, jnp.maximum((growth - 1 / growth) / (2 * rate), time)
         return self._through(even, odd, rate**2 * odd, even)
 
-    def after_impact(self, speed: Scalar, before: Scalar, after: Scalar, restitution: Scalar) -> "Spread":
+    def after_impact(self, speed: Scalar, before: Scalar, after: Scalar, ratio: Scalar, slope: Scalar) -> "Spread":
         """Errors after an impact at `speed` < 0, with the opening's accelerations before and after it.
 
-        The saltation matrix [[e, 0], [-(after + e before)/speed, e]]. An impact so gentle that it may not happen
+        `ratio`: of the speeds after and before, e; `slope`: of the one by the other, e'. The saltation matrix
+        [[e, 0], [-(after + e' before)/speed, e']]. An impact so gentle that it may not happen
         at all is as uncertain as a fall through the error of the angle; one that an outward acceleration may have
         prevented is as uncertain as its own change of velocity.
         """
-        kick = -(after + restitution * before)
+        kick = -(after + slope * before)
         gentle = jnp.sqrt(jnp.abs(kick) * self.angle)
         bounded = jnp.minimum(jnp.minimum(speed, -gentle), -1e-18)
         missed = speed**2 <= 2 * GRAZING * jnp.maximum(before, 0.0) * self.angle
-        spread = self._through(restitution, 0.0, kick / bounded, restitution)
-        return spread.plus(0.0, jnp.where(missed, (1 + restitution) * jnp.abs(speed), 0.0))
+        spread = self._through(ratio, 0.0, kick / bounded, slope)
+        return spread.plus(0.0, jnp.where(missed, (1 + ratio) * jnp.abs(speed), 0.0))

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._checks import Values, checked, scalar
+from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene, FlexibleState
+from jaxrock.engines.trajectory import Trajectory, followed, times_of
+from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import differentiable
@@ -30,9 +32,7 @@ class FlexibleResponse(eqx.Module):
     displacement: Inexact[Array, "..."]
     bending: Inexact[Array, "..."]
     outcome: FlexibleOutcome
-    scene: FlexibleScene
-    nodes: FlexibleState  # every step's start
-    node_times: Inexact[Array, "..."]
+    trajectory: Trajectory
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Base rotation [rad], displacement of the top [m], and its bending part [m].
@@ -45,32 +45,24 @@ class FlexibleResponse(eqx.Module):
 
         **Raises:** ValueError for a time outside the history.
         """
-        rotation, displacement, bending, _ = self._rows(time)
-        return rotation, displacement, bending
-
-    def base_moment(self, time: Values) -> Inexact[Array, "..."]:
-        """Moment of the base over m g R sin(alpha), at which it unlocks [-].
-
-        Locked: the column's elastic and damping forces times their heights. Rocking: the spring's own moment,
-        side - rotation/alpha; because the base has no mass, the same forces balance it. (Without their damping part
-        they would not: the elastic ones alone differ from it wherever the column is damped.)
-        """
-        return self._rows(time)[3] / self.scene.numbers.strength
+        return _along(self.trajectory, self.trajectory.checked(time), "outputs")[:3]
 
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
         block = self.scene.block
         scale = block.density * block.width * block.height * block.length**2
-        return tuple(scale * part for part in _along(self, self._checked(time), "energy"))
+        parts = _along(self.trajectory, self.trajectory.checked(time), "energy")
+        return tuple(scale * part for part in parts)
 
-    def _checked(self, time):
-        if self.node_times.ndim > 1:
-            raise ValueError("This response holds many scenes: call it inside jax.vmap.")
-        end = self.scene.stop * (1 + 1e-12)
-        return checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
+    @property
+    def scene(self) -> FlexibleScene:
+        """What was simulated."""
+        return self.trajectory.stepper
 
-    def _rows(self, time):
-        return _along(self, self._checked(time), "outputs")
+    @property
+    def duration(self) -> Inexact[Array, "..."]:
+        """How long the block was followed [s]."""
+        return self.trajectory.duration
 
     @property
     def status(self) -> Status:
@@ -93,28 +85,19 @@ class FlexibleResponse(eqx.Module):
         return self.outcome.overturned
 
     @property
-    def _impacts(self):
-        return self.nodes.impacted & (jnp.arange(self.node_times.shape[-1]) > 0) & jnp.isfinite(self.node_times)
-
-    @property
     def impact_times(self) -> Inexact[Array, " impacts"]:
         """Times of the impacts [s]; under jit filled up with inf."""
-        return self._events(self.node_times, jnp.inf)
+        path = self.trajectory
+        return path.events(path.impacted, path.times, (path.times, jnp.inf))[0]
 
     @property
     def impact_modes(self) -> Inexact[Array, "impacts modes"]:
         """Share of each clamped mode of the column in the energy just after each impact [-]."""
-        q, v = jnp.split(self.nodes.motion[:, :-1], 2, axis=1)
+        path = self.trajectory
+        q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)
         energies = v**2 + self.scene.numbers.squares * q**2
         total = energies.sum(1, keepdims=True)
-        return self._events(energies / jnp.where(total > 0, total, 1.0), 0.0)
-
-    def _events(self, values, filling):
-        found = self._impacts
-        order = jnp.argsort(~found, stable=True)
-        keep = found.reshape(found.shape + (1,) * (values.ndim - 1))
-        values = jnp.where(keep, values, filling)[order]
-        return values if isinstance(found, jax.core.Tracer) else values[: int(found.sum())]
+        return path.events(path.impacted, path.times, (energies / jnp.where(total > 0, total, 1.0), 0.0))[0]
 
 
 def outcome_flexible(
@@ -133,6 +116,7 @@ def outcome_flexible(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
+    say_if_single()
     return _outcome(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
 
 
@@ -158,7 +142,10 @@ def simulate_flexible(
     """
     if samples < 2:
         raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
-    return _simulate(block, motion, _duration(block, motion, duration), samples, _budget(motion, max_steps))
+    say_if_single()
+    result, path = _simulate(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
+    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
+    return FlexibleResponse(time, *_along(path, time, "outputs")[:3], result, path)
 
 
 def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None) -> Scalar:
@@ -167,7 +154,7 @@ def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike 
             "Argument `motion` must not be vertical for a FlexibleBlock, whose base does not weigh anything."
         )
     if duration is None:
-        return motion.end + 10 / jnp.sqrt(1.5 * block.gravity / block.length)  # 10/p
+        return motion.end + 10 / block.p
     return scalar("duration", checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf)))
 
 
@@ -188,39 +175,27 @@ def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
 
 
 @eqx.filter_jit
-def _simulate(block, motion, stop, samples: int, budget: int) -> FlexibleResponse:
+def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajectory]:
     scene = FlexibleScene.of(block, motion, stop)
-    state = scene.start()
-    nodes = jax.tree.map(lambda x: jnp.broadcast_to(x, (budget + 1,) + x.shape), state)
 
-    def step(carry):
-        state, nodes = carry
-        state = scene.advance(state)
-        return state, jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
+    def loop(unfinished, step, carry, budget):
+        return jax.lax.while_loop(unfinished, step, carry)
 
-    state, nodes = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].steps < budget), step, (state, nodes))
-    index = jnp.arange(budget + 1)
-    times = jnp.where(index <= state.steps, jax.vmap(scene.time)(nodes), jnp.inf)
-    time = jnp.linspace(jnp.zeros_like(stop), stop, samples)
-    empty = jnp.zeros(2)
-    response = FlexibleResponse(time, empty, empty, empty, scene.conclude(state), scene, nodes, times)
-    rows = _along(response, time, "outputs")[:3]
-    return eqx.tree_at(lambda r: (r.rotation, r.displacement, r.bending), response, rows)
+    state, nodes = followed(lambda s: scene.advance(s), scene.start(), budget, loop)
+    times = times_of(scene.time, nodes, state)
+    impacted = nodes.impacted & (jnp.arange(times.size) > 0) & jnp.isfinite(times)
+    return scene.conclude(state), Trajectory(scene, nodes, times, impacted, stop)
 
 
 @eqx.filter_jit
-def _along(response: FlexibleResponse, time, what: str):
-    """Follow the block from the node before each time."""
-    scene = response.scene
+def _along(path: Trajectory, time, what: str):
+    """Outputs, or energies, at times."""
+    scene = path.stepper
     scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * jnp.cos(scene.numbers.alpha) * scene.block.length
 
-    def at(t):
-        index = jnp.clip(jnp.searchsorted(response.node_times, t, side="right") - 1, 0, response.node_times.size - 1)
-        node = jax.tree.map(lambda x: x[index], response.nodes)
-        path, length, _, _ = scene.arc(node)
-        # The last node is the end of the history.
-        x = jnp.where(node.done, 0.0, (t - response.node_times[index]) / length)
-        return tuple(path.outputs(x) * scales) if what == "outputs" else scene.energy(path.state(x))
+    def follow(node, elapsed):
+        curve, length, _, _ = scene.arc(node)
+        x = jnp.where(node.done, 0.0, elapsed / length)  # the last node is the end of the history
+        return tuple(curve.outputs(x) * scales) if what == "outputs" else scene.energy(curve.state(x))
 
-    found = jax.vmap(at)(time.ravel())
-    return tuple(part.reshape(time.shape) for part in found)
+    return path.along(time, follow)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.restitution import Reset
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
@@ -72,6 +73,7 @@ class FlexibleScene(eqx.Module):
     locked: Phase
     rocking: Phase
     whole: Bool[Array, ""]
+    reset: Reset  # with speeds in rad/s
     knots: Inexact[Array, " knots"]
 
     @classmethod
@@ -79,7 +81,8 @@ class FlexibleScene(eqx.Module):
         """Build the scene from scalars."""
         numbers = Numbers.of(block)
         rocking, whole = rocking_phase(numbers)
-        return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, ground.knots)
+        reset = Reset.of(block.law, block.corners, jnp.ones_like(block.alpha))
+        return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, reset, ground.knots)
 
     def start(self) -> FlexibleState:
         """At rest at time 0."""
@@ -156,9 +159,9 @@ class FlexibleScene(eqx.Module):
         maxima, certain = _maxima(rows, state.maxima, x)
         status = Status.where(certain, state.status, Status.solver_failed)
         state = eqx.tree_at(lambda s: (s.maxima, s.status), state, (maxima, status))
-        return self._land(state, motion, x * length, below, above, at_end & whole, ~certain)
+        return self._land(state, motion, x * length, slope / length, below, above, at_end & whole, ~certain)
 
-    def _land(self, state, motion, elapsed, below, above, piece_over, failed) -> FlexibleState:
+    def _land(self, state, motion, elapsed, speed, below, above, piece_over, failed) -> FlexibleState:
         """The state after a step, and after the event that ended it."""
         numbers, rocking = self.numbers, state.side != 0
         returned, fallen = rocking & below, rocking & above
@@ -169,7 +172,7 @@ class FlexibleScene(eqx.Module):
         counts = (state.side != state.last_side) | (stay > state.braked_stay) | (self.block.impacts == "every")
         counts &= returned
         n = numbers.rotation.size
-        after = jnp.where(counts, still.at[n:-1].multiply(self.block.restitution), still)
+        after = jnp.where(counts, still.at[n:-1].multiply(self.reset.ratio(jnp.abs(speed))), still)
         # A damped column may push the base over at once.
         pushed = numbers.moment(after)
         over = numbers.damped & (jnp.abs(pushed) > numbers.strength)

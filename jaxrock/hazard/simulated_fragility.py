@@ -15,14 +15,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int8
 
 from jaxrock._checks import Values, one_of
+from jaxrock._parameters import one_of_many
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
-from jaxrock.motions.suite import Suite, pick, size_of
-from jaxrock.responses.rigid import outcome
+from jaxrock.motions.suite import Suite, size_of
+from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
 
@@ -236,7 +237,7 @@ def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, e
 def _verdict(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
     def one(index, draw, factor, scene):
         blocks, group = scene
-        found = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)
+        found = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
         verdict = jnp.where(found.overturned, TOPPLED, STOOD)
         return jnp.where(found.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)
 

@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._checks import Values, checked, finite, positive, put_down
+from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.diffrax.arcs import Diffrax
-from jaxrock.engines.scene import check_single, peak_bound
+from jaxrock.engines.scene import peak_bound
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
@@ -25,7 +26,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
-from jaxrock.responses.rigid import simulate
+from jaxrock.responses.history import simulate
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
 
@@ -213,7 +214,7 @@ class _Scene(eqx.Module):
     def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "_Scene":
         """Check the names, and fill in what was left open."""
         still = RectangularPulse(0.0, 1.0)
-        check_single(block, still if motion is None else motion)
+        check_single(block=block, motion=still if motion is None else motion)
         names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
         motion = still if free else motion
         if not free and not float(peak_bound(motion)) > 0:
@@ -293,10 +294,9 @@ def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | Asym
     if isinstance(block, Block):
         return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
     radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
-    pair = None if block.given_restitution1 is None else (block.given_restitution1, block.given_restitution2)
-    if "restitution1" in names or "restitution2" in names:
-        pair = block.restitution1, block.restitution2
-    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, pair)
+    fitted = "restitution1" in names or "restitution2" in names
+    law = (block.restitution1, block.restitution2) if fitted else block.law
+    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, law)
 
 
 def _last(name: str) -> str:

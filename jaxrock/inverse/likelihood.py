@@ -37,7 +37,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
-from jaxrock.responses.rigid import outcome
+from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 
 Real = Inexact[Array, "..."]

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 from jaxrock._checks import Values, as_real, checked, put_down
 from jaxrock._label import Label
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import Corners, Housner, PerSide
 from jaxrock.blocks.rigid import Block
 
 SEEN = ("survived", "toppled", "rotation")
@@ -156,7 +157,7 @@ class Observations(eqx.Module):
         ways = jnp.stack(ways if np.any(np.asarray(facing) == 0) else ways[:1])
         other = OtherSide(alpha2 / alpha1, radii, inertia, ratio, ways)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
-        if blocks.given_restitution1 is not None:
+        if isinstance(blocks.law, PerSide):
             restitution = jnp.where(jnp.isnan(restitution), jnp.sqrt(first * second), restitution)
         return cls(alpha1, p1, seen, restitution, other=other, **known)
 
@@ -185,7 +186,7 @@ class Observations(eqx.Module):
     def by_momentum(self, alpha: Inexact[Array, "*shape rocks"]) -> Inexact[Array, "*shape rocks"]:
         """Restitution by angular momentum: Housner's, or the root of the product of both."""
         if self.other is None:
-            return jnp.maximum(1 - 1.5 * jnp.sin(alpha) ** 2, 0.0)  # Housner (1963)
+            return Housner().ratio(Corners(alpha, alpha, self.p), jnp.zeros_like(alpha))
         block = self.blocks_at(alpha, self.p, None)
         return jnp.sqrt(block.restitution1 * block.restitution2)
 

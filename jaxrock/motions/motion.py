@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import Values, checked, finite
+from jaxrock._checks import Values, finite, not_negative
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
 
 Scalar = Inexact[ArrayLike, ""]
@@ -144,11 +145,11 @@ class Scaled(AbstractMotion):
     """A motion times a factor (`factor * motion`)."""
 
     motion: AbstractMotion
-    factor: Inexact[Array, "..."]
+    factor: Inexact[Array, "..."] = parameter("-", finite, is_free=False)  # the motion's amplitude says the same
 
     def __init__(self, motion: AbstractMotion, factor: ArrayLike):
         self.motion = motion
-        self.factor = finite("factor", factor)
+        set_parameters(self, factor=factor)
 
     @property
     def knots(self):
@@ -179,11 +180,11 @@ class Shifted(AbstractMotion):
     """A motion after `delay` seconds of quiet (`motion.shifted(delay)`)."""
 
     motion: AbstractMotion
-    delay: Inexact[Array, "..."]
+    delay: Inexact[Array, "..."] = parameter("s", not_negative)
 
     def __init__(self, motion: AbstractMotion, delay: ArrayLike):
         self.motion = motion
-        self.delay = checked("delay", delay, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+        set_parameters(self, delay=delay)
 
     @property
     def knots(self):

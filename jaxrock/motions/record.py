@@ -6,6 +6,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Values, finite, positive
 from jaxrock._label import Label
+from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion
 
 
@@ -23,8 +24,8 @@ class Record(AbstractMotion):
     Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
     """
 
-    samples: Inexact[Array, "*batch n"]
-    dt: Inexact[Array, "..."]
+    samples: Inexact[Array, "*batch n"] = parameter("g", finite, axes=1)
+    dt: Inexact[Array, "..."] = parameter("s", positive)
     label: Label = eqx.field(static=True)
 
     def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):

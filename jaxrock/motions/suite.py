@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record
@@ -60,25 +61,21 @@ def _padded(motion: AbstractMotion, length: int) -> AbstractMotion:
     return Record(jnp.pad(motion.samples, (0, missing)), motion.dt) if missing else motion
 
 
-def _shared(path) -> bool:
-    return jax.tree_util.keystr(path).endswith(".samples")
-
-
 def _ensemble(motion: AbstractMotion) -> AbstractMotion:
     """A motion whose numbers all have the shape (n,); samples stay as they are."""
-    leaves = jax.tree_util.tree_leaves_with_path(motion)
-    for path, leaf in leaves:
-        if jnp.ndim(leaf) > 1:
+    leaves = list(leaves_of(motion))
+    for leaf in leaves:
+        if jnp.ndim(leaf.value) > 1 and leaf.declared.axes is not None:
             raise ValueError(
-                f"Motions of a suite must hold numbers or lists of them, but `{jax.tree_util.keystr(path)}` has shape "
-                f"{jnp.shape(leaf)}."
+                f"Motions of a suite must hold numbers or lists of them, but `{leaf.name}` has shape "
+                f"{jnp.shape(leaf.value)}."
             )
-    shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for path, leaf in leaves if not _shared(path)))
-    return jax.tree_util.tree_map_with_path(lambda p, x: x if _shared(p) else jnp.broadcast_to(x, shape), motion)
+    return broadcast(motion, jnp.broadcast_shapes((1,), *(jnp.shape(x.value) for x in leaves if not x.is_shared)))
 
 
 def size_of(group: AbstractMotion) -> int:
-    return next(x.shape[0] for path, x in jax.tree_util.tree_leaves_with_path(group) if not _shared(path))
+    """Number of motions in a group."""
+    return next(leaf.value.shape[0] for leaf in leaves_of(group) if not leaf.is_shared)
 
 
 def _names(motion: AbstractMotion, size: int) -> list[str]:
@@ -86,10 +83,5 @@ def _names(motion: AbstractMotion, size: int) -> list[str]:
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
 
 
-def pick(group, index):
-    """One motion, or block, out of a stack of them."""
-    return jax.tree_util.tree_map_with_path(lambda path, x: x if _shared(path) else x[index], group)
-
-
 def _each(measure: Callable, group: AbstractMotion):
-    return jax.vmap(lambda index: measure(pick(group, index)))(jnp.arange(size_of(group)))
+    return jax.vmap(lambda index: measure(one_of_many(group, index)))(jnp.arange(size_of(group)))

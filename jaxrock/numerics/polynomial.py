@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import ArrayLike, Bool, Inexact
 
 from jaxrock.numerics.xla_cpu import keep
@@ -203,3 +204,19 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     )
     hits = [length <= 32 * eps * x for length in clear(x, radius)]
     return Landing(x, jet(coefficients, x, highest), hits)
+
+
+@jax.custom_jvp
+def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
+    """x, where the series `forcing` meets `level`, as it is given; its derivatives are those of the root."""
+    return x
+
+
+@functools.partial(meet.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    (_, forcing, _), (_, d_forcing, d_level) = primals, tangents
+    x = meet(*primals)
+    moved = [jnp.zeros_like(x) if isinstance(d, SymbolicZero) else d for d in d_forcing]
+    slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
+    lack = (0.0 if isinstance(d_level, SymbolicZero) else d_level) - horner(moved, x)
+    return x, jnp.where(slope == 0, 0.0, lack / jnp.where(slope == 0, 1.0, slope))

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
-from jaxrock.responses.rigid import Response
+from jaxrock.responses.history import Response
 
 
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
-    scene = response.stepper.scene
+    scene = response.scene
     time = np.linspace(0, float(response.duration), 20001)
     rotation, velocity = response(time)
     alpha, p = float(scene.alpha), float(scene.p)
@@ -31,7 +31,7 @@ def history(response: Response, axes=None):
 
     if axes is None:
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
-    scene = response.stepper.scene
+    scene = response.scene
     time, rotation, velocity = _dense(response)
     acceleration = np.asarray(scene.motion.acceleration(time))
     impacts = np.asarray(response.impact_times)
@@ -67,7 +67,7 @@ def phase(response: Response, axis=None):
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
-    scene = response.stepper.scene
+    scene = response.scene
     alpha = float(scene.alpha)
     _, rotation, velocity = _dense(response)
     # The line breaks at impacts: the velocity jumps there.

@@ -11,7 +11,7 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
-from jaxrock.responses.rigid import Response
+from jaxrock.responses.history import Response
 
 Scalar = Inexact[ArrayLike, ""]
 
@@ -72,27 +72,38 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (1.0, 1.0)
-        restitutions, rates = (block.restitution, block.restitution), (block.p, block.p)
+        rates = block.p, block.p
     else:
         ratios, alphas = (block.inertia_ratio, block.inertia_ratio2), (block.alpha1, block.alpha2)
         radii = 1.0, block.radius_ratio
-        restitutions, rates = (block.restitution1, block.restitution2), (block.p1, block.p2)
+        rates = block.p1, block.p2
     sides = [jnp.stack([jnp.asarray(x) for x in pair]) for pair in (ratios, alphas, rates)]
     time, rotation, velocity = response.time, response.rotation, response.velocity
-    horizontal, normal = jax.vmap(lambda *at: _forces(response.stepper.scene, sides, *at))(time, rotation, velocity)
+    horizontal, normal = jax.vmap(lambda *at: _forces(response.scene, sides, *at))(time, rotation, velocity)
     largest, least = _extremes(response, sides)
     corners = [(r * jnp.sin(a), r * jnp.cos(a)) for r, a in zip(radii, alphas)]
-    needed = tuple(
-        # The centre's velocity turns from across one corner's radius to across the other's.
-        jnp.abs(corners[i][1] - e * corners[1 - i][1]) / (corners[i][0] + e * corners[1 - i][0])
-        for i, e in enumerate(restitutions)
-    )
+    needed = tuple(_at_impacts(response, side, corners[i], corners[1 - i]) for i, side in enumerate((1, -1)))
     friction = _friction(horizontal, normal)
     # Between steps, and where the block rests for good and no step is taken.
     below = jnp.abs(rotation) < jnp.where(rotation < 0, alphas[1], alphas[0])
     largest = jnp.maximum(largest, jnp.max(jnp.where(below, friction, 0.0)))
     least = jnp.minimum(least, jnp.min(jnp.where(below, normal, jnp.inf)))
     return Contact(time, horizontal, normal, friction, needed, largest, least)
+
+
+def _at_impacts(response: Response, side: int, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]) -> Scalar:
+    """The most friction that the impacts need which end a stay on a side, or any impact would, if there is none.
+
+    `here`, `there`: horizontal and vertical distance of the centre from the corner that it leaves, and from the other.
+    """
+    scene, nodes = response.scene.on(side), response.trajectory.nodes
+    # Of a law that does not depend on the speed all impacts need the same.
+    ours = response.trajectory.impacted & (jnp.sign(nodes.impact_velocity) == side)
+    speeds = jnp.where(ours, jnp.abs(nodes.impact_velocity), 0.0)
+    speeds = jnp.where(ours, speeds, speeds.max()) if scene.reset.depends_on_speed else speeds[:1]
+    e = jax.vmap(scene.reset.ratio)(speeds)
+    # The centre's velocity turns from across one corner's radius to across the other's.
+    return jnp.max(jnp.abs(here[1] - e * there[1]) / (here[0] + e * there[0]))
 
 
 def _friction(horizontal, normal):
@@ -110,10 +121,10 @@ def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity:
     opening = side * rotation
     speed = side * velocity / rate
     push, own = side * acceleration, (rate / scene.p) ** 2
-    bend = scene.moments.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
+    angular = scene.moments.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
     missing = alpha - opening
-    horizontal = acceleration + side * ratio * (jnp.cos(missing) * bend + jnp.sin(missing) * speed**2)
-    normal = weight + ratio * (jnp.sin(missing) * bend - jnp.cos(missing) * speed**2)
+    horizontal = acceleration + side * ratio * (jnp.cos(missing) * angular + jnp.sin(missing) * speed**2)
+    normal = weight + ratio * (jnp.sin(missing) * angular - jnp.cos(missing) * speed**2)
     still = (side == 0) | (opening >= jnp.pi / 2)
     return jnp.where(still, acceleration, horizontal), jnp.where(still, weight, normal)
 
@@ -130,15 +141,16 @@ def _highest(values: Inexact[Array, " points"]) -> Scalar:
     """The largest of a smooth function that is known at equal distances: of parabolas through each three points."""
     left, middle, right = values[:-2], values[1:-1], values[2:]
     top = (middle >= left) & (middle >= right) & jnp.isfinite(left + middle + right)
-    bend = jnp.where(top & (2 * middle > left + right), 2 * middle - left - right, jnp.inf)
-    rise = jnp.where(top, (right - left) ** 2, 0.0) / (8 * bend)
+    curvature = jnp.where(top & (2 * middle > left + right), 2 * middle - left - right, jnp.inf)
+    rise = jnp.where(top, (right - left) ** 2, 0.0) / (8 * curvature)
     return jnp.maximum(jnp.max(values), jnp.max(jnp.where(top, middle + rise, -jnp.inf)))
 
 
 @jax.jit
 def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
     """Largest friction needed and least normal force below the saddle, over points in all steps."""
-    stepper, nodes, times = response.stepper, response.nodes, response.node_times
+    path = response.trajectory
+    stepper, nodes, times = path.stepper, path.nodes, path.times
     shares = jnp.linspace(0.0, 1.0, _WITHIN + 1)
 
     def step(node, start, end):

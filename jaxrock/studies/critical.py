@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxrock._checks import positive
+from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound, uplift_threshold
@@ -23,7 +24,7 @@ from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
-from jaxrock.responses.rigid import outcome
+from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.sweeps.sweep import surface
@@ -125,6 +126,8 @@ def critical_durations(
     **Raises:** ValueError for arguments outside their ranges.
     """
     low, high = _rising("factor", factor)
+    if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
+        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
@@ -152,19 +155,16 @@ class _Scenes(eqx.Module):
     def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "_Scenes":
         """Broadcast all parameters against one another."""
         both = block, motion
-        numbers = [jnp.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(both) if not _shared(path)]
-        shape = jnp.broadcast_shapes(*numbers)
+        shape = jnp.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(both) if not leaf.is_shared))
         if len(shape) > 1:
             raise ValueError(
                 f"The parameters of `block` and `motion` must be numbers or lists, but have shape {shape}."
             )
         size = shape[0] if shape else 1
-        block, motion = jax.tree_util.tree_map_with_path(
-            lambda path, leaf: leaf if _shared(path) else jnp.broadcast_to(leaf, (size,)), both
-        )
+        block, motion = broadcast(both, (size,))
 
         def facts(index):
-            block_, motion_ = _pick((block, motion), index)
+            block_, motion_ = one_of_many((block, motion), index)
             return (
                 uplift_threshold(block_, model),
                 peak_bound(motion_),
@@ -172,16 +172,6 @@ class _Scenes(eqx.Module):
             )
 
         return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
-
-
-def _shared(path) -> bool:
-    return jax.tree_util.keystr(path).endswith(".samples")
-
-
-def _pick(
-    scenes: tuple[Block | AsymmetricBlock, AbstractMotion], index: Int[Array, ""]
-) -> tuple[Block | AsymmetricBlock, AbstractMotion]:
-    return jax.tree_util.tree_map_with_path(lambda path, leaf: leaf if _shared(path) else leaf[index], scenes)
 
 
 # What is varied: z is the logarithm of a factor. Equal settings are one object, so that they compile once.
@@ -198,14 +188,14 @@ class _Kind:
 
     def at(self, z, index, scenes):
         """Margin, its slope, impacts and status of one point."""
-        place = _pick(scenes, index)
+        place = one_of_many(scenes, index)
         margin, slope, found = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
         decided = (found.status == Status.successful) | (found.status == Status.undecided)
         return jnp.where(decided, margin, jnp.nan), slope, found.impact_count
 
     def slopes(self, z, index, scenes):
         """Derivatives of the logarithm of the critical value by the parameters."""
-        block, motion = _pick(scenes, index)
+        block, motion = one_of_many(scenes, index)
         values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
 
         def margin(z, values):
@@ -270,7 +260,7 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
     names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
-    units = np.asarray(jax.vmap(lambda index: kind.unit(*_pick(scene, index)))(jnp.arange(grid.shape[0])))
+    units = np.asarray(jax.vmap(lambda index: kind.unit(*one_of_many(scene, index)))(jnp.arange(grid.shape[0])))
     value = np.exp(ends["z"]) * units[ends["index"]]
     derivative = np.full((order.size, len(names)), np.nan)
     if derivatives and order.size:

@@ -1,74 +1,133 @@
-"""The parameters of a scene by name: what derivatives are taken by."""
+"""The parameters of a scene by name: what derivatives are taken by, and what is fitted."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Inexact
 
+from jaxrock._checks import not_negative, share
+from jaxrock._parameters import Leaf, Parameter, declared, leaves_of
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.restitution import Constant, PerSide
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
 from jaxrock.motions.motion import AbstractMotion, Scaled
 
 Real = Inexact[Array, "..."]
+AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+
+_LAW = "law"  # the field of blocks that holds the law of restitution
 
 
-_FREE = {Block: ("alpha", "p"), AsymmetricBlock: ("alpha1", "alpha2", "p1", "inertia_ratio")}
-
-
-# What may follow from the others where it is not given.
-_FOLLOWING = {Block: ("restitution",), AsymmetricBlock: ("radius_ratio", "restitution1", "restitution2")}
-
-
-def named(block: Block | AsymmetricBlock, motion: AbstractMotion) -> dict[str, Real]:
+def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     """Parameters and their values.
 
-    Those of the block (`alpha`, `p`, `restitution`; of an asymmetric one `alpha1`, `alpha2`, `p1`, `inertia_ratio`,
-    `radius_ratio`, `restitution1`, `restitution2`), and those of the motion as it names them; `amplitude` [g] also of a
-    motion that does not (a record): its peak, which scales all of it.
+    Those that the block declares (`alpha`, `p`; of an asymmetric one `alpha1`, `alpha2`, `p1`, `inertia_ratio`,
+    `radius_ratio`), its restitution (`restitution`; `restitution1` and `restitution2` of two sides; of a law with
+    parameters of its own these, as `restitution.gentle`), and those of the motion as it names them; `amplitude` [g]
+    also of a motion that does not (a record): its peak, which scales all of it.
     """
-    found = {name: getattr(block, name) for name in (*_FREE[type(block)], *_FOLLOWING[type(block)])}
-    found |= _numbers(motion)
+    found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
+    found |= {leaf.name: leaf.value for leaf in _numbers(motion)}
     return found if "amplitude" in found else found | {"amplitude": peak_bound(motion)}
 
 
-def rebuilt(
-    block: Block | AsymmetricBlock, motion: AbstractMotion, values: dict[str, Real]
-) -> tuple[Block | AsymmetricBlock, AbstractMotion]:
+def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter]:
+    """What is declared of the parameters that `named` names."""
+    found = dict(_declared(block))
+    own = {leaf.name: leaf.declared for leaf in _of_own(block)}
+    if own:
+        found |= own
+    else:
+        alone = len(_of_law(block)) == 1
+        found |= {name: Parameter("-", share if alone else not_negative) for name in _of_law(block)}
+    found |= {leaf.name: leaf.declared for leaf in _numbers(motion)}
+    return {"amplitude": Parameter("g")} | found
+
+
+def rebuilt(block: AnyBlock, motion: AbstractMotion, values: dict[str, Real]) -> tuple[AnyBlock, AbstractMotion]:
     """The scene with other values of its parameters, and derivatives by them.
 
     What follows from other parameters goes on doing so (a restitution, from alpha): its value then is what is added to
     one of its own.
     """
-    free = _FREE[type(block)]
-    new = eqx.tree_at(lambda b: [getattr(b, name) for name in free], block, [values[name] for name in free])
-    for name in _FOLLOWING[type(block)]:
-        value, given = values[name], f"given_{name}"
-        if getattr(block, given) is None:
-            value = getattr(new, name) + (value - jax.lax.stop_gradient(getattr(block, name)))
-        new = eqx.tree_at(lambda b, given=given: getattr(b, given), new, value, is_leaf=lambda x: x is None)
-    names = list(_numbers(motion))
-    changed = eqx.tree_at(lambda m: [_at(m, name) for name in names], motion, [values[name] for name in names])
-    if "amplitude" not in names:
+    return _rebuilt_block(block, values), _rebuilt_motion(motion, values)
+
+
+def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
+    names = _declared(block)
+    given = [name for name, known in names.items() if not known.follows]
+    new = eqx.tree_at(lambda b: [getattr(b, name) for name in given], block, [values[name] for name in given])
+
+    def following(name):
+        return getattr(new, name) + (values[name] - jax.lax.stop_gradient(getattr(block, name)))
+
+    for field, known in declared(type(block)).items():
+        if known.follows:
+            value = following(known.follows) if getattr(block, field) is None else values[known.follows]
+            new = eqx.tree_at(lambda b, field=field: getattr(b, field), new, value, is_leaf=lambda x: x is None)
+    own = _of_own(block)
+    if own:
+        law = eqx.tree_at(
+            lambda law: [_at(law, leaf.path[1:]) for leaf in own], block.law, [values[x.name] for x in own]
+        )
+    elif len(_of_law(block)) == 1:
+        value = values["restitution"] if isinstance(block.law, Constant) else following("restitution")
+        law = eqx.tree_at(lambda constant: constant.value, Constant(0.0), value)
+    else:
+        pair = ("restitution1", "restitution2")
+        pair = [values[name] if isinstance(block.law, PerSide) else following(name) for name in pair]
+        law = eqx.tree_at(lambda both: (both.first, both.second), PerSide(0.0, 0.0), pair)
+    return eqx.tree_at(lambda b: b.law, new, law, is_leaf=lambda x: x is block.law)
+
+
+def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real]) -> AbstractMotion:
+    numbers = _numbers(motion)
+    new = [values[leaf.name] for leaf in numbers]
+    changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
+    if "amplitude" not in [leaf.name for leaf in numbers]:
         changed = Scaled(changed, values["amplitude"] / jax.lax.stop_gradient(peak_bound(motion)))
-    return new, changed
+    return changed
 
 
-def _numbers(motion: AbstractMotion) -> dict[str, Real]:
-    """The single numbers of a motion by name; parts of a motion made of motions have the part's name in front.
-
-    The factor of a scaled motion is left out: its amplitude says the same.
-    """
-    paths = jax.tree_util.tree_leaves_with_path(motion)
-    return {
-        jax.tree_util.keystr(path).lstrip("."): leaf
-        for path, leaf in paths
-        if not jax.tree_util.keystr(path).endswith((".samples", "factor"))
-        and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
-    }
+def _declared(block: AnyBlock) -> dict[str, Parameter]:
+    """The same by the names of the parameters."""
+    return {known.follows or field: known for field, known in declared(type(block)).items()}
 
 
-def _at(motion: AbstractMotion, name: str):
-    for part in name.split("."):
-        motion = getattr(motion, part)
-    return motion
+def _of_own(block: AnyBlock) -> list[Leaf]:
+    """Parameters of a law of restitution that is more than one number for each side."""
+    if isinstance(block.law, (Constant, PerSide)):
+        return []
+    return [
+        Leaf(("restitution", *leaf.path), leaf.value, leaf.declared)
+        for leaf in leaves_of(block.law)
+        if _is_number(leaf)
+    ]
+
+
+def _of_law(block: AnyBlock) -> dict[str, Real]:
+    """Parameters of the restitution."""
+    own = _of_own(block)
+    if own:
+        return {leaf.name: leaf.value for leaf in own}
+    two_sided = isinstance(block, AsymmetricBlock) and not isinstance(block.law, Constant)
+    names = ("restitution1", "restitution2") if two_sided else ("restitution",)
+    return {name: getattr(block, name) for name in names}
+
+
+def _is_number(leaf: Leaf) -> bool:
+    return leaf.declared.is_free and not leaf.is_shared and np.issubdtype(jnp.result_type(leaf.value), np.inexact)
+
+
+def _numbers(motion: AbstractMotion) -> list[Leaf]:
+    """The single numbers of a motion; the factor of a scaled one is left out, for its amplitude says the same."""
+    return [leaf for leaf in leaves_of(motion) if _is_number(leaf)]
+
+
+def _at(owner, path: tuple[str, ...]):
+    for part in path:
+        owner = getattr(owner, part)
+    return owner

@@ -17,7 +17,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
-from jaxrock.responses.rigid import Outcome, outcome
+from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.studies.spectra import axis

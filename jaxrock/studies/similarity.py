@@ -63,6 +63,8 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.11 (slender) and 5.3 (rigid).
     """
     amplitude, frequency = positive("amplitude", amplitude), positive("frequency", frequency)
+    if block.law.depends_on_speed:
+        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     if one_of("kind", kind, KINDS) == "slender":
         return Groups(frequency / block.p, block.alpha / amplitude, block.restitution)  # 4.11
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3

@@ -14,7 +14,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.sinusoidal import SinePulse
-from jaxrock.responses.rigid import Outcome, outcome
+from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Num
 
-from jaxrock.responses.rigid import Outcome
+from jaxrock.responses.outcome import Outcome
 from jaxrock.status import Status
 
 POINT = "point"  # the one dimension of axes that go side by side

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.diffrax.guards import (
     LONGEST,
     ORDER,
@@ -29,11 +30,15 @@ from jaxrock.engines.diffrax.guards import (
     first_step,
     usual_step,
 )
+from jaxrock.engines.events import WATCHED, Events, landed
+from jaxrock.engines.impact import impact
+from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
-from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
 from jaxrock.status import Status
+from jaxrock.transforms.branches import either
 from jaxrock.transforms.differentiation import differentiable
 
 Scalar = Inexact[ArrayLike, ""]
@@ -162,9 +167,9 @@ class ArcStepper(AbstractStepper):
         forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = self.wait(state, forcing.shaking, forcing.unit, ORDER, eps, either)
+        waited = wait(self, state, forcing.shaking, forcing.unit, ORDER, eps, either)
         rocked = self.on(state.side)._rock(state, forcing, ~resting)
-        after = self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+        after = checked(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
             return after
         # After the motion a block that has fallen back and turned below its saddle is safe: it only loses energy.
@@ -185,7 +190,8 @@ class ArcStepper(AbstractStepper):
         def energy(moments, opening):
             return opening * jnp.sum(weights * jax.vmap(lambda x: moments.restoring(Angle.of(x)))(opening * nodes))
 
-        left = scene.restitution**2 * energy(scene.moments, state.opening)
+        whole = energy(scene.moments, state.opening)
+        left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
         outdone = jnp.zeros_like(state.done)
         for share in (0.999, 0.7, 0.4, 0.1):
             opening = share * jnp.minimum(state.peak, scene.far.saddle)
@@ -215,7 +221,7 @@ class ArcStepper(AbstractStepper):
         opening, velocity = run((arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
         return opening, velocity * self.scene.p
 
-    def _is_hop(self, state: State, bend: Scalar, forcing: Forcing) -> Flag:
+    def _is_hop(self, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:
         """Whether the block comes back to the ground at once, without a peak or a speed that matters.
 
         From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
@@ -223,7 +229,7 @@ class ArcStepper(AbstractStepper):
         faster than 2 v.
         """
         moments, v = self.scene.moments, state.velocity
-        back = jnp.where(bend < 0, -bend, 1.0)
+        back = jnp.where(acceleration < 0, -acceleration, 1.0)
         flight, height = 4 * v / (back * self.scene.p), v * v / back
         weight = forcing.shaking.now[1]
         pull = moments.stiffness * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
@@ -231,19 +237,19 @@ class ArcStepper(AbstractStepper):
         certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
         least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
         small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
-        starts = (state.opening == 0) & (v > 0) & (bend < 0)
+        starts = (state.opening == 0) & (v > 0) & (acceleration < 0)
         return starts & certain & small & (not self.history)
 
     def _rock(self, state: State, forcing: Forcing, rocking: Flag) -> State:
         """Rocking: an arc up to its event, the knot, or the stop."""
         scene, engine = self.scene, self.engine
-        lost = self.escaped(state, Angle.of(state.opening)) & (not self.history)
+        lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
         share = _SHARE * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)
-        arc = replace(arc, hop=self._is_hop(state, arc.bend, forcing))
+        arc = replace(arc, hop=self._is_hop(state, arc.start_acceleration, forcing))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
         solution = engine.solve(arc, engine.limits(scene, state.piece), length, event)
@@ -254,58 +260,58 @@ class ArcStepper(AbstractStepper):
         happened = rocking & solution.event_mask & (time > 0) | void
         guards = arc.guards(time, y)
         fired = happened & (jnp.arange(guards.size) == jnp.argmin(guards))
-        ground, turning, _, crossing, _, flat = fired
-        ground = ground | (happened & (y[0] <= 0) & ~void)
+        hits = Events(*fired[: len(WATCHED)])
+        ground = hits.impact | (happened & (y[0] <= 0) & ~void)
         # The saddle is where a free block has its slowest passage: two events in one.
-        crossing = crossing | (happened & (arc.gap(y[0]) == 0) & (arc.gap(state.opening) != 0))
-        turning, crossing = turning & ~ground, crossing & ~ground
+        crossing = hits.saddle | (happened & (arc.gap(y[0]) == 0) & (arc.gap(state.opening) != 0))
+        hits = hits._replace(impact=ground & ~void, turning=hits.turning & ~ground, saddle=crossing & ~ground)
 
         elapsed = time / scene.p
         full = ~happened & whole
         piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
         steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
         off = 2.5 * engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
-        spread = self.spread_after(state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
+        spread = errors_after(self, state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
         moved = time > 0
+        opening, velocity = landed(scene, hits, y[0], y[1])
         after = replace(
             state,
             piece=piece,
             local=local,
-            opening=jnp.where(flat, jnp.pi / 2, jnp.where(crossing, scene.moments.saddle, y[0])),
-            velocity=jnp.where(turning, 0.0, y[1]),
+            opening=opening,
+            velocity=velocity,
             uplifting=state.uplifting & ~moved,
-            beyond=state.beyond ^ crossing,
+            beyond=state.beyond ^ hits.saddle,
             fastest=jnp.maximum(state.fastest, jnp.abs(y[1])),
             spread=spread,
             done=over & self.history,  # an outcome goes on through the free stage
         )
         after = replace(after, side=jnp.where(void, 0.0, after.side))
-        return self._happen(state, after, arc, (ground & ~void, turning, crossing), y, lost, solution.result)
+        return self._happen(state, after, arc, hits, y, lost, solution.result)
 
-    def _happen(self, before: State, after: State, arc: Arc, events, y: Pair, lost: Flag, result) -> State:
+    def _happen(self, before: State, after: State, arc: Arc, hits: Events, y: Pair, lost: Flag, result) -> State:
         """Let the event of an arc happen: peaks, margin, impact, verdict."""
-        ground, turning, crossing = events
         scene = self.scene
-        outward = (before.velocity > 0) | ((before.velocity == 0) & (arc.bend >= 0))
-        bend = arc.acceleration((after.local - before.local) * scene.p, y)
-        after = self.note(after, outward, turning, crossing, y[0], y[1], bend)
+        outward = (before.velocity > 0) | ((before.velocity == 0) & (arc.start_acceleration >= 0))
+        acceleration = arc.acceleration((after.local - before.local) * scene.p, y)
+        after = note(self, after, outward, hits.turning, hits.saddle, y[0], y[1], acceleration)
         quiet = before.piece >= scene.pieces
         forcing = Forcing.of(scene, after)
         reach = jnp.minimum(self.room(after), forcing.reach)
-        after = self.impact(after, ground, y[1], forcing.shaking.now, forcing.steepest, reach)
+        after = impact(self, after, hits.impact, y[1], forcing.shaking.now, forcing.steepest, reach)
         down = after.opening >= jnp.pi / 2
-        escaped = before.overturned | lost | self.escaped(after, Angle.of(after.opening))
-        overturned = escaped | down if scene.falls_flat else escaped
+        gone = before.overturned | lost | escaped(self, after, Angle.of(after.opening))
+        overturned = gone | down if scene.falls_flat else gone
         if not self.history:
             # The impact after the motion counts if the block is lost after it.
             decisive = (after.impact_time > scene.motion.end) & overturned
             after = replace(after, impacts=jnp.where(quiet, before.impacts + decisive, after.impacts))
         exhausted = result == diffrax.RESULTS.max_steps_reached
         failed = ~exhausted & ~diffrax.is_okay(result)
-        balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.bend) <= arc.noise) & (before.side != 0)
+        balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.start_acceleration) <= arc.noise) & (before.side != 0)
         # Fallen flat at next to no speed: it may have turned back just before.
-        barely = scene.falls_flat & down & ~escaped
-        barely = barely & (y[1] ** 2 <= 2 * self.doubt * jnp.abs(bend) * after.spread.angle)
+        barely = scene.falls_flat & down & ~gone
+        barely = barely & (y[1] ** 2 <= 2 * self.doubt * jnp.abs(acceleration) * after.spread.angle)
         status = Status.where(balanced | barely, Status.undecided, after.status)
         status = Status.where(exhausted, Status.step_budget_exhausted, status)
         status = Status.where(failed, Status.solver_failed, status)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.models.equation import AbstractMoments, Angle
@@ -76,8 +77,8 @@ class Arc(eqx.Module):
     side: Scalar
     opening: Scalar
     velocity: Scalar
-    bend: Scalar  # acceleration at the start
-    jerk: Scalar  # its derivative
+    start_acceleration: Scalar  # at the start
+    start_jerk: Scalar  # its derivative
     noise: Scalar  # what rounding may make of an acceleration that is zero
     helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
     hop: Flag  # too small for its turning point to matter, and certain to come back
@@ -91,14 +92,14 @@ class Arc(eqx.Module):
         state = start.side, start.opening, start.velocity
         arc = cls(scene.moments, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
         y = jnp.stack([start.opening, start.velocity])
-        bend, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
+        acceleration, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
         pull = scene.moments.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.moments.arm_at_rest
-        noise = 64 * jnp.finfo(bend.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
+        noise = 64 * jnp.finfo(acceleration.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
         leaving = (start.opening == 0) & (start.velocity == 0)
-        bend = jnp.where(start.uplifting | (leaving & (jnp.abs(bend) <= noise)), 0.0, bend)
+        acceleration = jnp.where(start.uplifting | (leaving & (jnp.abs(acceleration) <= noise)), 0.0, acceleration)
         noise = jax.lax.stop_gradient(noise)
-        return eqx.tree_at(lambda a: (a.bend, a.jerk, a.noise), arc, (bend, jerk, noise))
+        return eqx.tree_at(lambda a: (a.start_acceleration, a.start_jerk, a.noise), arc, (acceleration, jerk, noise))
 
     def acceleration(self, time: Scalar, y: Pair) -> Scalar:
         """Acceleration of the opening angle per (p t)^2."""
@@ -122,30 +123,32 @@ class Arc(eqx.Module):
     @property
     def horizon(self) -> Scalar:
         """Time (p t) for which the acceleration of a block that leaves rest is only noise."""
-        return self.noise / jnp.maximum(self.jerk, self.noise)
+        return self.noise / jnp.maximum(self.start_jerk, self.noise)
 
     def is_void(self, time: Scalar, y: Pair, event: Flag) -> Flag:
         """Whether the block leaves rest by no more than rounding: the threshold is touched, not passed."""
         nothing = event & (jnp.abs(y[1]) <= self.noise * time)
-        return self.leaving & (self.bend == 0) & ((self.jerk <= 0) | nothing)
+        return self.leaving & (self.start_acceleration == 0) & ((self.start_jerk <= 0) | nothing)
 
     def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
-        """Ground, turning point, velocity extremum, saddle, certain loss, fallen flat: the first to reach zero ends
-        the arc. All start above zero."""
-        ground = _guard(time, y[0], [self.opening, self.velocity, self.bend / 2, self.jerk / 6], True)
-        turn = _guard(time, y[1], [self.velocity, self.bend, self.jerk / 2], ~self.hop)
+        """One for every event, in the order of `Events`, and one for certain loss: the first at zero ends the arc.
+        All start above zero."""
+        jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
         # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
-        rises = jnp.where(self.bend == 0, self.jerk >= 0, self.bend > 0)
+        rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
         along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
-        extremum = jnp.where(self.hop, 1.0, along / (1e14 * self.noise))
-        saddle = _guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), self.velocity], True)
+        guards = Events(
+            impact=_guard(time, y[0], [jets[0], jets[1], jets[2] / 2, jets[3] / 6], True),
+            turning=_guard(time, y[1], [jets[1], jets[2], jets[3] / 2], ~self.hop),
+            extremum=jnp.where(self.hop, 1.0, along / (1e14 * self.noise)),
+            saddle=_guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), jets[1]], True),
+            flat=_guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat),
+        )
         held = self._hold(self.opening)
         forced = self.helpful[0] > 0
         if self.helpful[1] is not None:
             forced = forced | (self.helpful[1] != 1)
-        escape = _guard(time, self._hold(y[0]), [held], forced & (held > 0))
-        flat = _guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat)
-        return jnp.stack([ground, turn, extremum, saddle, escape, flat])
+        return jnp.stack([*guards, _guard(time, self._hold(y[0]), [held], forced & (held > 0))])
 
     def _hold(self, opening: Scalar) -> Scalar:
         """What the restoring moment and the most helpful forcing do against overturning."""
@@ -183,13 +186,13 @@ def usual_step(rtol: float) -> float:
 
 def first_step(arc: Arc, rtol: float) -> Scalar:
     """A step (p t) that does not jump over a small hop: half the way back to the ground; a certain hop at once."""
-    x, v, bend = arc.opening, arc.velocity, arc.bend
+    x, v, acceleration = arc.opening, arc.velocity, arc.start_acceleration
     tiny = jnp.finfo(x.dtype).tiny
-    back = jnp.maximum(-bend, tiny)
+    back = jnp.maximum(-acceleration, tiny)
     root = jnp.sqrt(v * v + 2 * back * x)
     to_ground = jnp.where(v > 0, (v + root) / back, 2 * x / jnp.maximum(root - v, tiny))
     # Where the deceleration is only just beginning, it is its growth that turns the block back.
-    to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.jerk, tiny))
+    to_turn = jnp.sqrt(2 * jnp.maximum(v, 0.0) / jnp.maximum(-arc.start_jerk, tiny))
     usual = jnp.minimum(usual_step(rtol), jnp.where(to_turn > 0, 4 * to_turn, jnp.inf))
     return jnp.where(to_ground > 0, jnp.minimum(jnp.where(arc.hop, 1.1, 0.5) * to_ground, usual), usual)
 

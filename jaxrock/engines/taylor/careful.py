@@ -16,10 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, Inexact, Int
 
+from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
+from jaxrock.engines.events import WATCHED, Events, landed, level_of
 from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
+from jaxrock.engines.impact import impact
+from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, surpasses
-from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either, when
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.models.coefficients import Coefficients
@@ -38,6 +42,7 @@ from jaxrock.numerics.polynomial import (
 )
 from jaxrock.numerics.xla_cpu import keep, unseen_one
 from jaxrock.status import Status
+from jaxrock.transforms.branches import either, when
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[ArrayLike, ""]
@@ -119,9 +124,9 @@ class TaylorStepper(AbstractStepper):
     def step(self, state: State, shaking: Shaking, unit: Scalar) -> State:
         """One step of a lane: waiting at rest, or rocking."""
         resting = state.side == 0
-        waited = self.wait(state, shaking, unit, self.order, self.tolerance, when)
+        waited = wait(self, state, shaking, unit, self.order, self.tolerance, when)
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
-        return self.checked(state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+        return checked(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
@@ -132,7 +137,7 @@ class TaylorStepper(AbstractStepper):
         scene = self.scene.on(state.side)
         moments = scene.moments
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
-        here, there = Visit(moments, scene.restitution), Visit(scene.both_moments[1], scene.far_restitution)
+        here, there = Visit(moments, scene.reset), Visit(scene.both_moments[1], scene.far_reset)
         visits = (here, there) if scene.far is None else (here, there, here)
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
@@ -195,37 +200,37 @@ class TaylorStepper(AbstractStepper):
         stepper, before, *rest = jax.lax.stop_gradient((self, state, start, room))
         step = _Step.of(stepper, before, *rest, rocking)
         cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
-        impact, turning, extremum, crossing, ground = cut.hits
+        hits = cut.hits
         early = cut.length < step.length
         full = step.full & ~early
-        saddle = self.scene.moments.saddle
         end = End(
             length=cut.length,
             opening=cut.opening,
             speed=cut.speed,
-            level=jnp.where(crossing, saddle, jnp.where(ground, jnp.pi / 2, 0.0)),
+            level=level_of(self.scene, hits),
             room=room,
-            meets=impact | crossing | ground,
-            turns=turning,
+            meets=hits.impact | hits.saddle | hits.flat,
+            turns=hits.turning,
             full=full,
         )
         length, opening, speed = arrive(self.order, start, end)
         elapsed, velocity = length * unit, speed / start.stretch
         piece, local, over = self.move_on(state, elapsed, full)
-        escaped = self.escaped(state, start.angle)
+        lost = escaped(self, state, start.angle)
         moved = (step.length > 0) & rocking
         time = jnp.where(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
+        exact = landed(self.scene, hits, opening, jnp.where(moved, velocity, state.velocity))
         passed = replace(
             state,
-            spread=self.spread_after(state, start.angle, shaking.now, elapsed, missed),
+            spread=errors_after(self, state, start.angle, shaking.now, elapsed, missed),
             piece=piece,
             local=local,
-            opening=jnp.where(ground, jnp.pi / 2, jnp.where(crossing, saddle, opening)),
-            velocity=jnp.where(turning, 0.0, jnp.where(moved, velocity, state.velocity)),
-            beyond=state.beyond ^ crossing,
+            opening=exact[0],
+            velocity=exact[1],
+            beyond=state.beyond ^ hits.saddle,
             uplifting=state.uplifting & ~moved,
-            extremal=jnp.where(moved, extremum, state.extremal),
+            extremal=jnp.where(moved, hits.extremum, state.extremal),
             fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
             done=over,
         )
@@ -233,9 +238,11 @@ class TaylorStepper(AbstractStepper):
         def happen(passed, needed, inside):
             return self._happen(state, passed, start, step, (length, opening, velocity), cut, inside)
 
-        stepped = (either if self.taped else when)(step.eventful & (impact | turning | crossing), happen, passed)
+        stepped = (either if self.taped else when)(
+            step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed
+        )
         down = stepped.opening >= jnp.pi / 2
-        overturned = state.overturned | escaped | down if self.scene.falls_flat else state.overturned | escaped
+        overturned = state.overturned | lost | down if self.scene.falls_flat else state.overturned | lost
         # A history goes on to the ground; for an outcome the verdict is enough.
         ends = overturned & down if self.history else overturned
         return replace(stepped, overturned=overturned, done=stepped.done | ends)
@@ -245,36 +252,34 @@ class TaylorStepper(AbstractStepper):
         length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
+        signs = Events(one, *step.signs, jnp.where(state.beyond, 1.0, -1.0), -one)
+        below = state.opening < jnp.pi / 2 if self.history else None  # an outcome needs no fall down to the ground
+        wanted = Events(True, self._matters(state, scaled), step.faster, True, below)
         watches = [
-            Watch(0, one, 0.0, True),
-            Watch(1, step.signs[0], 0.0, self._matters(state, scaled)),
-            Watch(2, step.signs[1], 0.0, step.faster),
-            Watch(0, jnp.where(state.beyond, 1.0, -1.0), saddle, True),
+            Watch(watched.derivative, sign, watched.level(self.scene), active)
+            for watched, sign, active in zip(WATCHED, signs, wanted)
+            if active is not None
         ]
-        if self.history:
-            watches.append(Watch(0, -one, jnp.pi / 2, state.opening < jnp.pi / 2))
         landing = first_event(scaled, watches, _clear_start(state, scaled, saddle), needed)
-        opening, speed, bend = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
-        impact, turning, extremum, crossing = landing.hits[:4]
-        ground = landing.hits[4] if self.history else jnp.zeros_like(impact)
-        hits = impact & (speed <= 0), turning, extremum, crossing, ground
-        return _Cut(landing.x * length, opening, speed, bend, hits)
+        opening, speed, acceleration = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
+        never = [jnp.zeros_like(landing.hits[0])] * (len(Events._fields) - len(watches))
+        hits = Events(*landing.hits, *never)
+        return _Cut(landing.x * length, opening, speed, acceleration, hits._replace(impact=hits.impact & (speed <= 0)))
 
     def _happen(self, state: State, passed: State, start: Start, step: "_Step", end, cut: "_Cut", inside) -> State:
         """Let the event at the end of a step happen."""
         length, opening, velocity = (inside(value) for value in end)
         shaking = start.shaking.each(lambda terms: [inside(u) for u in terms])
-        acceleration, weight = shaking.at(length)
+        ground = shaking.at(length)
         # The value of the series, with the derivatives of the equation.
-        law = self.scene.moments.acceleration(Angle.of(opening), velocity, state.side * acceleration, weight)
-        bend = with_derivatives_of(cut.bend / start.stretch**2, law)
-        impact, turning, _, crossing, _ = cut.hits
-        noted = self.note(passed, step.signs[0] > 0, turning, crossing, opening, velocity, bend)
+        law = self.scene.moments.acceleration(Angle.of(opening), velocity, state.side * ground[0], ground[1])
+        acceleration = with_derivatives_of(cut.acceleration / start.stretch**2, law)
+        hits = cut.hits
+        noted = note(self, passed, step.signs[0] > 0, hits.turning, hits.saddle, opening, velocity, acceleration)
         unit = start.stretch / self.scene.p
         steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(step.length))
         reach = (step.length - length) * unit
-        ground = acceleration, weight
-        return self.impact(noted, impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
+        return impact(self, noted, hits.impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
         """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
@@ -297,8 +302,8 @@ class _Cut(NamedTuple):
     length: Scalar
     opening: Scalar
     speed: Scalar
-    bend: Scalar
-    hits: tuple[Flag, ...]  # impact, turning point, velocity extremum, saddle, ground
+    acceleration: Scalar
+    hits: Events
 
 
 class _Step(NamedTuple):
@@ -330,7 +335,9 @@ class _Step(NamedTuple):
         signs = _signs(state, coefficients)
         turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
         crossing = (opening >= scene.moments.saddle) != state.beyond
-        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(_bend(coefficients, length), state.local)
+        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(
+            _overshoot(coefficients, length), state.local
+        )
         monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top > state.fastest * start.stretch) & ~monotone
         eventful = turning | crossing | faster | (opening <= 0)
@@ -345,7 +352,7 @@ class _Step(NamedTuple):
             signs=signs,
             faster=faster,
             eventful=eventful & rocking & (length > 0),
-            whole=_Cut(length, opening, speed, jnp.zeros_like(speed), (jnp.zeros_like(full),) * 5),
+            whole=_Cut(length, opening, speed, jnp.zeros_like(speed), Events(*[jnp.zeros_like(full)] * 5)),
         )
 
 
@@ -360,7 +367,7 @@ def _signs(state: State, coefficients) -> tuple[Scalar, Scalar]:
     return velocity, jnp.where(state.uplifting, 1.0, acceleration)
 
 
-def _bend(coefficients: list[Scalar], length: Scalar) -> Scalar:
+def _overshoot(coefficients: list[Scalar], length: Scalar) -> Scalar:
     """How far the velocity can exceed its end values within a step (an eighth of its largest second derivative)."""
     one = jnp.ones_like(length)
     third = jnp.maximum(fall_bound(coefficients, one, 3, length), fall_bound(coefficients, -one, 3, length))

@@ -16,7 +16,6 @@ from jaxtyping import ArrayLike, Bool, Inexact
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
-from jaxrock.numerics.polynomial import derivative, horner
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
 Scalar = Inexact[ArrayLike, ""]
@@ -237,29 +236,13 @@ def _(order, primals, tangents):
     (start, end), (d_start, d_end) = primals, tangents
     length, opening, speed = arrive(order, start, end)  # with derivatives of their own, for those of higher order
     d_opening, d_speed = (weights.times(d_start) for weights in _weights(order, start, length))
-    acceleration, weight = start.shaking.at(length)
-    law = start.moments.acceleration(Angle.of(opening), speed, start.side * acceleration, weight)
-    bend = start.stretch**2 * law
+    push, weight = start.shaking.at(length)
+    law = start.moments.acceleration(Angle.of(opening), speed, start.side * push, weight)
+    acceleration = start.stretch**2 * law
     d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinite, for the status to tell.
     d_length = jnp.where(end.full, d_room, 0.0)
-    d_length = jnp.where(end.turns, -d_speed / jnp.where(end.turns, bend, 1.0), d_length)
+    d_length = jnp.where(end.turns, -d_speed / jnp.where(end.turns, acceleration, 1.0), d_length)
     d_length = jnp.where(end.meets, (d_level - d_opening) / jnp.where(end.meets, speed, 1.0), d_length)
-    moved = d_length, d_opening + speed * d_length, d_speed + bend * d_length
+    moved = d_length, d_opening + speed * d_length, d_speed + acceleration * d_length
     return (length, opening, speed), tuple(jnp.broadcast_to(d, length.shape) for d in moved)
-
-
-@jax.custom_jvp
-def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
-    """x, where the series `forcing` meets `level`, as it is given; its derivatives are those of the root."""
-    return x
-
-
-@functools.partial(meet.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    (_, forcing, _), (_, d_forcing, d_level) = primals, tangents
-    x = meet(*primals)
-    moved = [jnp.zeros_like(x) if _is_zero(d) else d for d in d_forcing]
-    slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
-    lack = (0.0 if _is_zero(d_level) else d_level) - horner(moved, x)
-    return x, jnp.where(slope == 0, 0.0, lack / jnp.where(slope == 0, 1.0, slope))

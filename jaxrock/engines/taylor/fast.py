@@ -1,4 +1,4 @@
-"""The quick pass: Taylor steps in one flat loop, for the many scenes that need no care.
+"""The fast pass: Taylor steps in one flat loop, for the many scenes that need no care.
 
 A step is a series, a certificate of its shape, the turning point within it if there is one, and the first level that
 it meets (ground or saddle), where it is cut. What has no certificate is postponed: the series engine, which takes every
@@ -14,6 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, Inexact, Int
 
+from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
+from jaxrock.engines.events import Events, landed
+from jaxrock.engines.impact import impact
+from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
@@ -53,12 +57,12 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
 
     The acceleration keeps its sign there, or its derivative does.
     """
-    bend = derivative(derivative(terms))
-    jerk = derivative(bend)
+    acceleration = derivative(derivative(terms))
+    jerk = derivative(acceleration)
     jerks = _first_sign(jerk[0], jerk[1])
 
     def sure(share):
-        return (keeps_sign(bend, rises, share * length) > 0) | (keeps_sign(jerk, jerks, share * length) > 0)
+        return (keeps_sign(acceleration, rises, share * length) > 0) | (keeps_sign(jerk, jerks, share * length) > 0)
 
     def shorter():
         share = jnp.zeros_like(length)
@@ -73,15 +77,15 @@ def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Scalar, Scalar | None]) 
     """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
     sign = jnp.where(values[0] > 0, 1.0, -1.0)
     value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
-    bend = fall - value - slope
-    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * bend, 0.0))
-    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * bend, root - slope)
+    curvature = fall - value - slope
+    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * curvature, 0.0))
+    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * curvature, root - slope)
     share = jnp.clip(share, 0.0, 1.0)
     if slopes[1] is None:
         return share
-    twist = slope + sign * slopes[1] - 2 * (fall - value)
+    cubic = slope + sign * slopes[1] - 2 * (fall - value)
     for _ in range(2):
-        off, rate = jet([value, slope, bend - twist, twist], share, 1)
+        off, rate = jet([value, slope, curvature - cubic, cubic], share, 1)
         share = jnp.clip(share - off / rate, 0.0, 1.0)
     return share
 
@@ -107,10 +111,10 @@ class _Part(NamedTuple):
     length: Scalar
     opening: Scalar  # at its end, with its derivatives
     speed: Scalar
-    bend: Scalar
+    acceleration: Scalar
     full: Flag  # goes as far as there is room
     outward: Scalar  # sign of the velocity at its start
-    bends: Flag  # the velocity has an extremum
+    has_extremum: Flag  # the velocity has an extremum
     bound: Scalar  # of that
     certain: Flag
 
@@ -126,23 +130,28 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
     share = keep_by(_certified(terms, longest, rises), one)
 
     def extremum(length):
-        opening, speed, bend = (keep_by(x, one) for x in jet(terms, length, 2))
-        bends = rises * bend < 0
+        opening, speed, acceleration = (keep_by(x, one) for x in jet(terms, length, 2))
+        has_extremum = rises * acceleration < 0
         # Between the tangents at the ends.
-        between = (speed - before - bend * length) / jnp.where(bends, first - bend, 1.0)
+        between = (speed - before - acceleration * length) / jnp.where(has_extremum, first - acceleration, 1.0)
         bound = before + first * between
-        return (opening, speed, bend), bends, bound, bends & (outward * speed >= 0) & (outward * bound <= 0)
+        return (
+            (opening, speed, acceleration),
+            has_extremum,
+            bound,
+            has_extremum & (outward * speed >= 0) & (outward * bound <= 0),
+        )
 
     whole = length, *_ = keep_by(share * longest, one), *extremum(share * longest)
-    (_, _, bend), _, _, twice = whole[1:]
+    (_, _, acceleration), _, _, twice = whole[1:]
 
     def shorter():
         # Where the velocity may turn twice, the part ends about where the acceleration is zero.
-        length = keep_by(share * longest * first / jnp.where(twice, first - bend, 1.0), one)
+        length = keep_by(share * longest * first / jnp.where(twice, first - acceleration, 1.0), one)
         return length, *extremum(length)
 
-    length, end, bends, bound, still = _if(twice, shorter, whole)
-    return _Part(length, *end, reaches & (share == 1) & ~twice, outward, bends, bound, (share > 0) & ~still)
+    length, end, has_extremum, bound, still = _if(twice, shorter, whole)
+    return _Part(length, *end, reaches & (share == 1) & ~twice, outward, has_extremum, bound, (share > 0) & ~still)
 
 
 class _Meeting(NamedTuple):
@@ -151,15 +160,13 @@ class _Meeting(NamedTuple):
     at: Scalar
     opening: Scalar  # there, with its derivatives
     speed: Scalar
-    bend: Scalar
+    acceleration: Scalar
     certain: Flag
     turned: Flag  # turned back before
     turn_at: Scalar
     top: Scalar  # opening angle there
-    top_bend: Scalar
-    crossing: Flag  # ends at the saddle
-    impact: Flag  # ends at the ground
-    stops: Flag  # ends where it turns
+    top_acceleration: Scalar
+    hits: Events  # what ends it there
 
 
 def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _Meeting:
@@ -168,12 +175,16 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
-        x, last = _root(_TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.bend))
+        x, last = _root(
+            _TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.acceleration)
+        )
         x = keep_by(x, one)
-        opening, _, bend = (keep_by(value, one) for value in jet(terms, x, 2))
-        return x, opening, bend, last <= 1e-6 * x
+        opening, _, acceleration = (keep_by(value, one) for value in jet(terms, x, 2))
+        return x, opening, acceleration, last <= 1e-6 * x
 
-    turn_at, top, top_bend, sure = _if(turns, turn, (part.length, part.opening, part.bend, part.certain))
+    turn_at, top, top_acceleration, sure = _if(
+        turns, turn, (part.length, part.opening, part.acceleration, part.certain)
+    )
     certain = part.certain & sure
 
     crossing = (top >= saddle) != state.beyond
@@ -197,10 +208,12 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
         return jnp.where(stops, of_turn, of_part)
 
     otherwise = at_end(turn_at, part.length), at_end(top, part.opening), at_end(zero, part.speed)
-    otherwise = *otherwise, at_end(top_bend, part.bend), certain
-    at, opening, speed, bend, certain = _if(crossing | impact, meet, otherwise)
+    otherwise = *otherwise, at_end(top_acceleration, part.acceleration), certain
+    at, opening, speed, acceleration, certain = _if(crossing | impact, meet, otherwise)
     turned = turns & (turn_at <= at)
-    return _Meeting(at, opening, speed, bend, certain, turned, turn_at, top, top_bend, crossing, impact, stops)
+    never = jnp.zeros_like(impact)
+    hits = Events(impact, stops, never, crossing, never)
+    return _Meeting(at, opening, speed, acceleration, certain, turned, turn_at, top, top_acceleration, hits)
 
 
 def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: Scalar) -> tuple[Scalar, Flag]:
@@ -208,10 +221,12 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
-        x, last = _root(_FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.bend), (6 * terms[3], None))
+        x, last = _root(
+            _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
+        )
         return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
 
-    return _if(part.bends & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.bends)))
+    return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
 
 def advance(stepper: TaylorStepper, state: State) -> State:
@@ -226,57 +241,58 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
     part = _part(start, terms, jnp.minimum(stepper.room(state), 32 * unit) / unit, least)
     meeting = _meeting(start, terms, part, state)
-    at, crossing, impact = meeting.at, meeting.crossing, meeting.impact
+    at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
     certain = keep_flag(meeting.certain & sure, state.local)
 
-    opening = jnp.where(crossing, scene.moments.saddle, jnp.where(impact, 0.0, meeting.opening))
+    opening, _ = landed(scene, hits, meeting.opening, meeting.speed)
     velocity = keep_by(meeting.speed / stretch, one)
     elapsed = keep_by(at * unit, one)
-    full = part.full & ~(crossing | impact | meeting.stops)
+    full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
     time = jnp.where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
     errors = 2 * least, 2 * least * jnp.maximum(order / time, 1.0)
-    spread = stepper.spread_after(state, start.angle, shaking.now, elapsed, errors)
+    spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,
         spread=jax.tree.map(lambda x: keep_by(x, one), spread),
         local=state.local + meeting.turn_at * unit,  # until the turning point is noted
         opening=opening,
         velocity=velocity,
-        beyond=state.beyond ^ crossing,
+        beyond=state.beyond ^ hits.saddle,
         uplifting=jnp.zeros_like(state.uplifting),
         fastest=jnp.maximum(state.fastest, jnp.maximum(fast / stretch, jnp.abs(velocity))),
         done=over,
     )
 
-    def note():
-        return stepper.note(
+    def noted_now():
+        return note(
+            stepper,
             passed,
             part.outward > 0,
-            meeting.turned & ~crossing,
-            crossing,
-            jnp.where(crossing, scene.moments.saddle, meeting.top),
-            jnp.where(crossing, velocity, 0.0),
-            keep_by(jnp.where(crossing, meeting.bend, meeting.top_bend) / stretch**2, one),
+            meeting.turned & ~hits.saddle,
+            hits.saddle,
+            jnp.where(hits.saddle, scene.moments.saddle, meeting.top),
+            jnp.where(hits.saddle, velocity, 0.0),
+            keep_by(jnp.where(hits.saddle, meeting.acceleration, meeting.top_acceleration) / stretch**2, one),
         )
 
-    noted = replace(_if(meeting.turned | crossing, note, passed), piece=piece, local=local)
+    noted = replace(_if(meeting.turned | hits.saddle, noted_now, passed), piece=piece, local=local)
 
     def strike():
         steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(part.length))
-        return stepper.impact(noted, impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
+        return impact(stepper, noted, hits.impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
 
-    hit = _if(impact, strike, noted)
-    escaped = stepper.escaped(state, start.angle)
-    postponed = ~certain & ~escaped & (hit.status == Status.successful)
+    struck = _if(hits.impact, strike, noted)
+    lost = escaped(stepper, state, start.angle)
+    postponed = ~certain & ~lost & (struck.status == Status.successful)
     after = replace(
-        hit,
-        overturned=state.overturned | escaped,
-        done=hit.done | escaped | ~certain,
-        status=Status.where(postponed, Status.undecided, hit.status),
+        struck,
+        overturned=state.overturned | lost,
+        done=struck.done | lost | ~certain,
+        status=Status.where(postponed, Status.undecided, struck.status),
     )
-    return stepper.checked(state, after)
+    return checked(stepper, state, after)
 
 
 def wait(stepper: TaylorStepper, state: State) -> State:
@@ -284,7 +300,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     scene, order = stepper.scene, stepper.order
     shaking, unit = stepper.shaking(state.piece, state.local)
     room = jnp.minimum(stepper.room(state), 32 * unit) / unit
-    length = stepper.longest_wait(shaking, room, order, stepper.tolerance)
+    length = longest_wait(stepper, shaking, room, order, stepper.tolerance)
     drives = scene.drives_of(shaking)
     share = jnp.ones_like(length)
     for drive, _ in drives if shaking.vertical is not None else drives[:1]:
@@ -324,7 +340,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         status=Status.where(unclear, Status.undecided, state.status),
     )
     side = jnp.where(second, -1.0, 1.0)
-    return stepper.lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
+    return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
 
 
 def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
@@ -348,7 +364,7 @@ def has_many_pieces(pieces: int) -> bool:
     return pieces > 32
 
 
-def glance(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
+def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
     """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
     pieces = stepper.scene.pieces
     limit = jnp.minimum(limit, most_steps(pieces))

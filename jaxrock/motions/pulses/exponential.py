@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int
 
 from jaxrock._checks import finite, not_nan, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.lookup import pick
 
@@ -11,8 +12,8 @@ from jaxrock.numerics.lookup import pick
 class RectangularPulse(AbstractPulse):
     """Constant `amplitude` [g] for `duration` [s] (positive): the limit shape -> -inf of `ExponentialPulse`."""
 
-    amplitude: Real
-    duration: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    duration: Real = parameter("s", positive, symbol="t_d")
 
     @classmethod
     def word(cls) -> str:
@@ -20,8 +21,7 @@ class RectangularPulse(AbstractPulse):
         return "rectangle"
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.duration = positive("duration", duration)
+        set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
     def knots(self):
@@ -42,8 +42,8 @@ class RectangularPulse(AbstractPulse):
 class TriangularPulse(AbstractPulse):
     """Straight up to `amplitude` [g] at mid `duration` [s] and straight down: shape 0 of `ExponentialPulse`."""
 
-    amplitude: Real
-    duration: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    duration: Real = parameter("s", positive, symbol="t_d")
 
     @classmethod
     def word(cls) -> str:
@@ -51,8 +51,7 @@ class TriangularPulse(AbstractPulse):
         return "triangle"
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.duration = positive("duration", duration)
+        set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
     def knots(self):
@@ -98,14 +97,12 @@ class ExponentialPulse(AbstractPulse):
     **Source:** Voyagaki, Psycharis & Mylonakis (2012), equation 2.1, with the opposite sign of the motion.
     """
 
-    amplitude: Real
-    duration: Real
-    shape: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    duration: Real = parameter("s", positive, symbol="t_d")
+    shape: Real = parameter("-", not_nan, symbol="beta")
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.duration = positive("duration", duration)
-        self.shape = not_nan("shape", shape)
+        set_parameters(self, amplitude=amplitude, duration=duration, shape=shape)
 
     @property
     def _layer(self) -> Real:

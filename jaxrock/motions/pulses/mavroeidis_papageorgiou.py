@@ -3,11 +3,15 @@
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import checked, finite, positive
+from jaxrock._checks import Range, finite, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.motions.pulses.sinusoidal import sinusoid
+
+_above_one = Range("be above 1 and finite", 1.0, np.inf, lambda x: (x > 1) & (x < np.inf))
 
 
 class MavroeidisPapageorgiouPulse(AbstractPulse):
@@ -28,18 +32,14 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
     **Source:** Mavroeidis & Papageorgiou (2003), equation 3 (velocity); its derivative is used.
     """
 
-    amplitude: Real
-    period: Real
-    oscillations: Real
-    phase: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    period: Real = parameter("s", positive, symbol="T")
+    oscillations: Real = parameter("-", _above_one, symbol="gamma")
+    phase: Real = parameter("rad", finite, symbol="nu")
 
     def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
-        self.amplitude = finite("amplitude", amplitude)
-        self.period = positive("period", period)
-        self.oscillations = checked(
-            "oscillations", oscillations, "be above 1 and finite", lambda x: (x > 1) & (x < jnp.inf)
-        )
-        self.phase = finite("phase", phase)
+        set_parameters(self, amplitude=amplitude, period=period)
+        set_parameters(self, oscillations=oscillations, phase=phase)
 
     @property
     def knots(self):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from jaxrock._checks import finite, one_of, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.xla_cpu import keep
 
@@ -35,16 +36,15 @@ class RickerPulse(AbstractPulse):
     Vassiliou & Makris (2011) (antisymmetric).
     """
 
-    amplitude: Real
-    period: Real
-    center: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    period: Real = parameter("s", positive, symbol="T")
+    center: Real = parameter("s", positive)
     kind: str = eqx.field(static=True)
 
     def __init__(
         self, amplitude: ArrayLike, period: ArrayLike, kind: str = "symmetric", center: ArrayLike | None = None
     ):
-        self.amplitude = finite("amplitude", amplitude)
-        self.period = positive("period", period)
+        set_parameters(self, amplitude=amplitude, period=period)
         self.kind = one_of("kind", kind, ("symmetric", "antisymmetric"))
         default = 5.7 / math.pi if kind == "symmetric" else 8.2 * math.sqrt(3) / (2 * math.pi)
         self.center = default * self.period if center is None else positive("center", center)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from jaxrock._checks import finite, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.elementary import sine_cosine_of_any
 from jaxrock.numerics.xla_cpu import keep
@@ -28,12 +29,11 @@ def harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
 class HalfSinePulse(AbstractPulse):
     """amplitude sin(pi t/duration) [g] for `duration` [s] (positive)."""
 
-    amplitude: Real
-    duration: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    duration: Real = parameter("s", positive, symbol="t_d")
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.duration = positive("duration", duration)
+        set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
     def knots(self):
@@ -55,12 +55,11 @@ class HalfSinePulse(AbstractPulse):
 class SinePulse(AbstractPulse):
     """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
-    amplitude: Real
-    period: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    period: Real = parameter("s", positive, symbol="T")
 
     def __init__(self, amplitude: ArrayLike, period: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.period = positive("period", period)
+        set_parameters(self, amplitude=amplitude, period=period)
 
     @property
     def knots(self):
@@ -82,12 +81,11 @@ class SinePulse(AbstractPulse):
 class CosinePulse(AbstractPulse):
     """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
 
-    amplitude: Real
-    period: Real
+    amplitude: Real = parameter("g", finite, symbol="a_g")
+    period: Real = parameter("s", positive, symbol="T")
 
     def __init__(self, amplitude: ArrayLike, period: ArrayLike):
-        self.amplitude = finite("amplitude", amplitude)
-        self.period = positive("period", period)
+        set_parameters(self, amplitude=amplitude, period=period)
 
     @property
     def knots(self):

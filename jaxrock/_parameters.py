@@ -1,0 +1,136 @@
+"""Parameters of blocks, motions and models: declared once, with their fields, and found there by whoever needs them.
+
+    class Ramp(rk.AbstractMotion):
+        amplitude: jax.Array = rk.parameter("g")
+        corners: jax.Array = rk.parameter("s", "positive", axes=1)
+
+A declared number is one for each scene: it is checked, fitted, differentiated by, and may differ from lane to lane. An
+array that is declared with axes belongs to the whole, and all scenes share it. What is not declared is the owner's own
+affair: numbers are parameters of unknown unit and range, arrays are shared.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxrock._checks import RANGES, Range, finite, one_of
+
+
+class Parameter(NamedTuple):
+    """What is known of a parameter beforehand."""
+
+    unit: str = "-"
+    range: Range = finite
+    symbol: str = ""
+    axes: int | None = 0  # of one owner; None: any
+    follows: str = ""  # the property that tells its value where it is not given
+    is_free: bool = True  # whether it is one of its own: what only repeats another is not
+
+
+_UNDECLARED = Parameter(axes=None)
+
+
+def parameter(
+    unit: str, range: Range | str = finite, *, symbol: str = "", axes: int = 0, follows: str = "", is_free=True
+):
+    """Declare a field of a block, a motion or a model as a parameter.
+
+    **Arguments:**
+
+    - `unit`: such as "rad", "s", "g", or "-".
+    - `range`: the numbers that are allowed: "positive", "not_negative" (0 or more), "finite", "acute" (in (0, pi/2)),
+      "share" (in [0, 1]), or "not_nan".
+    - `symbol`: as formulas write it; empty: the name.
+    - `axes`: 0 for a number, 1 for a list that belongs to the whole (samples of a record).
+    - `follows`: name of the property that tells its value where the field is None.
+    - `is_free`: whether it can be varied by itself.
+
+    **Returns:** a field for an Equinox module.
+    """
+    if isinstance(range, str):
+        range = RANGES[one_of("range", range, tuple(RANGES))]
+    return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free)})
+
+
+def declared(kind: type) -> dict[str, Parameter]:
+    """The parameters that a class declares, by the names of its fields."""
+    fields = dataclasses.fields(kind)
+    return {field.name: field.metadata["parameter"] for field in fields if "parameter" in field.metadata}
+
+
+def set_parameters(owner: eqx.Module, **values) -> None:
+    """Check values by what is declared of them, and set them: for the owner's `__init__`.
+
+    **Raises:** ValueError for a value outside its range.
+    """
+    known = declared(type(owner))
+    for name, value in values.items():
+        setattr(owner, name, known[name].range(name, value))
+
+
+class Leaf(NamedTuple):
+    """An array in a tree of modules: where it is, and what is declared of it."""
+
+    path: tuple[str, ...]
+    value: Any
+    declared: Parameter
+
+    @property
+    def name(self) -> str:
+        """The path in words; parts of a motion made of motions have the part's name in front."""
+        return ".".join(self.path)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether it belongs to the whole, and not to one scene of many."""
+        return bool(self.declared.axes) or (self.declared.axes is None and jnp.ndim(self.value) > 0)
+
+
+def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECLARED) -> Iterator[Leaf]:
+    """All leaves of a tree, in the order of `jax.tree.leaves`."""
+    if not isinstance(owner, eqx.Module):
+        for keys, value in jax.tree_util.tree_leaves_with_path(owner, is_leaf=_is_module):
+            inner = (*path, *(jax.tree_util.keystr((key,), simple=True) for key in keys))
+            if _is_module(value):
+                yield from leaves_of(value, inner)
+            else:
+                yield Leaf(inner, value, known)
+        return
+    for field in dataclasses.fields(owner):
+        if not field.metadata.get("static", False):
+            own = field.metadata.get("parameter", _UNDECLARED)
+            yield from leaves_of(getattr(owner, field.name), (*path, field.name), own)
+
+
+def _is_module(value) -> bool:
+    return isinstance(value, eqx.Module)
+
+
+def shared(owner: Any) -> Any:
+    """A tree like the owner, of whether a leaf belongs to the whole."""
+    return jax.tree.unflatten(jax.tree.structure(owner), [leaf.is_shared for leaf in leaves_of(owner)])
+
+
+def broadcast(owner: Any, shape: tuple[int, ...]) -> Any:
+    """The owner with every number of a scene broadcast to a shape; what is shared stays."""
+    return jax.tree.map(lambda x, own: x if own else jnp.broadcast_to(x, shape), owner, shared(owner))
+
+
+def one_of_many(owners: Any, index) -> Any:
+    """One of many owners in one tree, whose numbers have a leading axis."""
+    return jax.tree.map(lambda x, own: x if own else x[index], owners, shared(owners))
+
+
+def check_single(**owners: Any) -> None:
+    """Raise ValueError where a parameter of one scene is an array outside of `jax.vmap`."""
+    for name, owner in owners.items():
+        for leaf in leaves_of(owner):
+            if leaf.declared.axes is not None and jnp.ndim(leaf.value) > leaf.declared.axes:
+                raise ValueError(
+                    f"Argument `{name}` must hold one scene, but `{leaf.name}` has shape {jnp.shape(leaf.value)}. Use "
+                    "jax.vmap for many."
+                )

@@ -1,0 +1,251 @@
+"""Laws of restitution: how an impact slows a block.
+
+A law tells the ratio of the angular velocity after an impact to that before it. All that happens at an impact follows
+from it: the rebound, its derivatives, the energy that is left, and how errors grow. So another law is one class, here
+or in a file of yours:
+
+    class Brittle(rk.restitution.AbstractRestitution):
+        firm: jax.Array
+        speed: jax.Array  # [rad/s]
+
+        def ratio(self, corners, speed):
+            return self.firm / (1 + speed / self.speed)
+
+    block = rk.Block(0.2, 2.0, restitution=Brittle(0.95, 1.0))
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._checks import checked, not_negative, positive, share
+from jaxrock._parameters import parameter, set_parameters
+from jaxrock.numerics.elementary import sine_cosine
+
+Real = Inexact[Array, "..."]
+
+
+class Corners(NamedTuple):
+    """What a law may know of a block: the corner that it leaves at an impact, and the one that it comes to.
+
+    - `alpha`, `next_alpha`: slenderness angles at the one and at the other [rad].
+    - `p`: frequency parameter about the corner that it leaves [rad/s].
+    - `inertia_ratio`: m R^2/I about the corner that it comes to [-]; 3/4 for a rectangle.
+    - `radius_ratio`: distance of the centre of mass from the corner that it leaves, over that from the other [-].
+    - `side`: 1 or -1, the side of which the impact ends a stay.
+    """
+
+    alpha: Real
+    next_alpha: Real
+    p: Real
+    inertia_ratio: Real | float = 0.75
+    radius_ratio: Real | float = 1.0
+    side: int = 1
+
+
+class AbstractRestitution(eqx.Module):
+    """A law of restitution. Its fields are parameters, such as derivatives are taken by."""
+
+    @abc.abstractmethod
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """Angular velocity after an impact over that before it.
+
+        **Arguments:**
+
+        - `corners`: the `Corners` of the impact.
+        - `speed`: |angular velocity| just before it [rad/s], 0 or more.
+
+        **Returns:** the ratio, in [0, 1] if it depends on the speed (a response with any other has the status
+        `not_finite`), smooth in the speed.
+        """
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """Whether the ratio depends on the speed of the impact; if not, it is computed once for a scene."""
+        return True
+
+    def most(self, corners: Corners, speed: Real) -> Real:
+        """An upper bound of the ratio of all impacts up to a speed; as it stands, of a law that rises or falls."""
+        return jnp.maximum(self.ratio(corners, jnp.zeros_like(speed)), self.ratio(corners, speed))
+
+
+class Constant(AbstractRestitution):
+    """The same ratio at every impact.
+
+    **Arguments:**
+
+    - `value`: the ratio, in [0, 1].
+
+    **Raises:** ValueError for a value outside its range.
+    """
+
+    value: Real = parameter("-", share, symbol="e")
+
+    def __init__(self, value: ArrayLike):
+        self.value = share("restitution", value)
+
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """The value."""
+        return self.value
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """It does not."""
+        return False
+
+
+class Housner(AbstractRestitution):
+    """The impact of a rectangle that keeps its angular momentum about the new corner: 1 - 1.5 sin^2(alpha), at least 0.
+
+    **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.4.
+    """
+
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """It follows alpha, under differentiation too."""
+        return jnp.maximum(1 - 1.5 * jnp.sin(corners.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """It does not."""
+        return False
+
+
+class AngularMomentum(AbstractRestitution):
+    """The impact of any block that keeps its angular momentum about the new corner, at least 0.
+
+    From corner s to corner t: 1 - kappa_t [1 - (R_s/R_t) cos(alpha_s + alpha_t)], kappa_t = m R_t^2/I_t; Housner's for
+    a rectangle, as which a `Block` is taken.
+    """
+
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """It follows the block's shape."""
+        (sine, cosine), (next_sine, next_cosine) = sine_cosine(corners.alpha), sine_cosine(corners.next_alpha)
+        of_sum = cosine * next_cosine - sine * next_sine  # cos(alpha_s + alpha_t)
+        return jnp.maximum(1 - corners.inertia_ratio * (1 - corners.radius_ratio * of_sum), 0)
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """It does not."""
+        return False
+
+
+class PerSide(AbstractRestitution):
+    """A ratio of its own for the impacts that end the stays on either side of an asymmetric block.
+
+    **Arguments:**
+
+    - `first`, `second`: the ratio at the end of a stay on side 1, and on side 2, 0 or more.
+
+    **Raises:** ValueError where their product, which is the energy that two impacts keep, exceeds 1. (One of them may:
+    about corners of unequal height it often does.)
+    """
+
+    first: Real = parameter("-", not_negative, symbol="e1")
+    second: Real = parameter("-", not_negative, symbol="e2")
+
+    def __init__(self, first: ArrayLike, second: ArrayLike):
+        self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
+        keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
+        checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
+
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """That of the side."""
+        return self.second if corners.side < 0 else self.first
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """It does not."""
+        return False
+
+
+class SpeedDependent(AbstractRestitution):
+    """A ratio that changes from gentle to violent impacts: violent + (gentle - violent) e^(-speed/scale).
+
+    **Arguments:**
+
+    - `gentle`, `violent`: the ratio of impacts much slower, and much faster, than `scale`, in [0, 1].
+    - `scale`: angular velocity at which it changes [rad/s], positive.
+
+    **Raises:** ValueError for a value outside its range.
+
+    A form to fit to measurements, not a law of materials: contacts that yield keep less of a violent impact.
+    """
+
+    gentle: Real = parameter("-", share)
+    violent: Real = parameter("-", share)
+    scale: Real = parameter("rad/s", positive)
+
+    def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
+        set_parameters(self, gentle=gentle, violent=violent, scale=scale)
+
+    def ratio(self, corners: Corners, speed: Real) -> Real:
+        """Between `gentle` and `violent`."""
+        return self.violent + (self.gentle - self.violent) * jnp.exp(-speed / self.scale)
+
+
+Restitution = ArrayLike | AbstractRestitution
+
+
+def law_of(restitution: Restitution | None, otherwise: AbstractRestitution) -> AbstractRestitution:
+    """The law that an argument `restitution` means: itself, that of a number, or, for None, the usual one."""
+    if restitution is None:
+        return otherwise
+    return restitution if isinstance(restitution, AbstractRestitution) else Constant(restitution)
+
+
+def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
+    """The slenderness angle, where the law is one for such blocks."""
+    if not isinstance(law, Housner):
+        return alpha
+    widest = np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6)
+    allowed = "be at most 0.955 when `restitution` is None, because Housner's value is negative above"
+    return checked("alpha", alpha, allowed, lambda x: x <= widest)
+
+
+class Reset(eqx.Module):
+    """A law at the impacts that end a block's stays on one corner; speeds are per p t, as in the engines.
+
+    Of a law that does not depend on the speed only its number is left.
+    """
+
+    law: AbstractRestitution
+    corners: Corners | None
+    p: Real | None  # unit of the speeds [rad/s]
+
+    @classmethod
+    def of(cls, law: AbstractRestitution, corners: Corners, p: Real) -> "Reset":
+        """Bind a law to a corner."""
+        if law.depends_on_speed:
+            return cls(law, corners, p)
+        ratio = law.ratio(corners, jnp.zeros_like(p))
+        # As it is: of two corners of unequal height the ratio at one may exceed 1.
+        return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
+
+    @property
+    def depends_on_speed(self) -> bool:
+        """Whether the ratio does."""
+        return self.law.depends_on_speed
+
+    def ratio(self, speed: Real) -> Real:
+        """Speed after over speed before an impact; not a number where a law gives what is none."""
+        if not self.depends_on_speed:
+            return self.law.value
+        ratio = self.law.ratio(self.corners, speed * self.p)
+        return jnp.where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
+
+    def slope(self, speed: Real) -> Real:
+        """How the speed after an impact changes with that before it."""
+        if not self.depends_on_speed:
+            return self.law.value
+        return jax.jvp(lambda v: v * self.ratio(v), (speed,), (jnp.ones_like(speed),))[1]
+
+    def most(self, speed: Real) -> Real:
+        """An upper bound of the ratio of all impacts up to a speed."""
+        if not self.depends_on_speed:
+            return self.law.value
+        return self.law.most(self.corners, speed * self.p)

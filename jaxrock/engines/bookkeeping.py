@@ -1,0 +1,109 @@
+"""What is kept of a response on its way: peaks, the distance from overturning, errors, and whether all is well."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact
+
+from jaxrock.engines.state import State, surpasses
+from jaxrock.engines.stepper import AbstractStepper
+from jaxrock.engines.uncertainty import GRAZING, Spread
+from jaxrock.models.equation import Angle
+from jaxrock.numerics.xla_cpu import keep
+from jaxrock.status import Status
+
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
+
+_LOST = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
+
+
+def checked(stepper: AbstractStepper, before: State, after: State) -> State:
+    """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
+    good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
+    lost = (after.side != 0) & ~(after.spread.size <= _LOST * stepper.scene.moments.saddle)
+    if not stepper.history:
+        # In the free stage only the next peak or passage counts, which `note` judges.
+        lost = lost & (before.piece < stepper.scene.pieces)
+    undecided = lost & (after.status == Status.successful)
+    status = Status.where(undecided, Status.undecided, after.status)
+    return replace(
+        after,
+        steps=before.steps + 1,
+        status=Status.where(good, status, Status.not_finite),
+        done=after.done | ~good,
+    )
+
+
+def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
+    """Whether no forcing still to come can bring it back.
+
+    The most helpful forcing is the bound of all that is to come, for good: the block is lost if it is past the
+    stable manifold even then.
+    """
+    moments = stepper.scene.moments
+    ceiling, weight = stepper.scene.most_helpful(state.piece)
+    hold = -moments.acceleration(angle, state.velocity, ceiling, weight)
+    needed = jnp.where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
+    certain = state.velocity - needed > stepper.doubt * state.spread.along(1.0, 1.0)
+    return state.beyond & (state.velocity >= 0) & certain
+
+
+def errors_after(
+    stepper: AbstractStepper, state: State, angle: Angle, ground: tuple, elapsed: Scalar, step: tuple
+) -> Spread:
+    """Errors after `elapsed` seconds of rocking; `ground`: acceleration [g] and weight (`Shaking.at`); `step`: what
+    the engine's own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
+    given = stepper, state, angle, ground, elapsed, step
+    stepper, state, angle, (acceleration, weight), elapsed, step = jax.lax.stop_gradient(given)
+    push = state.side * acceleration
+    moments, p = stepper.scene.moments, stepper.scene.p  # an error has no derivative
+    eps, time, speed = 2 * jnp.finfo(p.dtype).eps, p * elapsed, jnp.abs(state.velocity)
+    clock = eps * p * state.local  # the time of a state is rounded, too
+    pull = eps * (moments.restoring_at_rest + jnp.abs(push) * moments.arm_at_rest)  # of what acceleration is left
+    spread = state.spread.after_flow(moments.repulsion(angle, push, weight), time)
+    return spread.plus(
+        step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
+        step[1] + eps * speed + pull * (time + p * state.local),
+    )
+
+
+def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:
+    """Keep peaks and how close the block came to standing still in balance (see `Outcome.margin`)."""
+    moments = stepper.scene.moments
+    # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
+    # instant, far from its saddle, is not in balance.
+    pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
+    stillness = keep((moments.stiffness * speed**2 + pull**2) / moments.restoring_at_rest**2, state.local)
+    turn = turning & (outward | state.beyond)
+    closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
+    closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
+    beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
+    beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
+    higher = turning & outward
+    first = higher & surpasses(opening, state.peak)
+    # Turning back just above the ground, within the error of the angle: there may have been an impact.
+    off = jnp.abs(opening) + state.spread.angle
+    grazing = turning & ~outward & (off <= GRAZING * state.spread.angle)
+    graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(acceleration) * off), 0.0)
+    # Standing still in balance, within the error of the state along which it leaves.
+    balanced = (turning | crossing) & (jnp.hypot(speed, pull) <= stepper.doubt * state.spread.along(1.0, 1.0))
+    if stepper.scene.falls_flat:
+        balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * state.spread.angle))
+    undecided = balanced & (state.status == Status.successful)
+    highest = higher & (opening > state.peak)
+    clearance = jnp.where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
+    return replace(
+        state,
+        peak=jnp.where(highest, opening, state.peak),
+        second=jnp.where(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
+        clearance=clearance,
+        peak_clearance=jnp.where(highest, clearance, state.peak_clearance),
+        peak_time=jnp.where(first, stepper.time(state), state.peak_time),
+        error=jnp.where(first, jax.lax.stop_gradient(state.spread.angle), state.error),
+        closeness=closeness,
+        closeness_beyond=beyond,
+        spread=jax.lax.stop_gradient(state.spread.plus(0.0, graze)),
+        status=Status.where(undecided, Status.undecided, state.status),
+    )

@@ -1,0 +1,52 @@
+"""The events that end a step, in one list: what an engine watches, and what is exact where one happens."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Bool, Inexact
+
+from jaxrock.engines.scene import Scene
+
+Scalar = Inexact[ArrayLike, ""]
+Flag = Bool[ArrayLike, ""]
+
+
+class Events(NamedTuple):
+    """Something of every event; of a step, whether it ends there.
+
+    Impact; turning point; extremum of the velocity; the saddle, where the block balances; flat on the ground.
+    """
+
+    impact: Any
+    turning: Any
+    extremum: Any
+    saddle: Any
+    flat: Any
+
+
+class Watched(NamedTuple):
+    """An event is where a derivative of the opening angle passes a level."""
+
+    derivative: int
+    level: Callable[[Scene], Scalar | float]
+
+
+WATCHED = Events(
+    impact=Watched(0, lambda scene: 0.0),
+    turning=Watched(1, lambda scene: 0.0),
+    extremum=Watched(2, lambda scene: 0.0),
+    saddle=Watched(0, lambda scene: scene.moments.saddle),
+    flat=Watched(0, lambda scene: jnp.pi / 2),
+)
+
+
+def level_of(scene: Scene, hits: Events) -> Scalar:
+    """The opening angle at which a step ends, if it ends at one."""
+    return jnp.where(hits.saddle, scene.moments.saddle, jnp.where(hits.flat, jnp.pi / 2, 0.0))
+
+
+def landed(scene: Scene, hits: Events, opening: Scalar, velocity: Scalar) -> tuple[Scalar, Scalar]:
+    """Opening angle and velocity at the end of a step, exact where its event sets them; at an impact `impact` does."""
+    opening = jnp.where(hits.flat, jnp.pi / 2, jnp.where(hits.saddle, scene.moments.saddle, opening))
+    return opening, jnp.where(hits.turning, 0.0, velocity)

@@ -1,0 +1,91 @@
+"""The steps of a history: where each starts, so that the block can be followed again to any time after it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact, PyTree
+
+from jaxrock._checks import Values, checked
+
+
+class Trajectory(eqx.Module):
+    """The steps of one history.
+
+    - `stepper`: what follows the block.
+    - `nodes`: every step's start, one axis more; past the last the times are infinite.
+    - `times`: theirs [s].
+    - `impacted`: which of them an impact made.
+    - `duration`: of the history [s].
+    """
+
+    stepper: Any
+    nodes: PyTree
+    times: Inexact[Array, "..."]
+    impacted: Bool[Array, "..."]
+    duration: Inexact[Array, "..."]
+
+    def check_single(self) -> None:
+        """Raise ValueError outside of `jax.vmap`, where it holds many histories."""
+        if jnp.ndim(self.times) > 1:
+            raise ValueError("This response holds many scenes: call it, and read its events, inside jax.vmap.")
+
+    def checked(self, time: Values) -> Inexact[Array, "..."]:
+        """Times within the history."""
+        self.check_single()
+        end = self.duration * (1 + 1e-12)  # a time computed as the duration may round past it
+        return checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
+
+    def along(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
+        """`follow(node, elapsed)` from the node before each time; results have the shape of `time`."""
+
+        def at(t):
+            index = jnp.clip(jnp.searchsorted(self.times, t, side="right") - 1, 0, self.times.size - 1)
+            node = jax.tree.map(lambda x: x[index], self.nodes)
+            return follow(node, jnp.minimum(t, self.duration) - self.times[index])
+
+        return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(at)(time.ravel()))
+
+    def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
+        """The values where something happened, in this order; under jit filled up: infinite times, zeros beside them.
+
+        Each of `values` comes with what fills it up.
+        """
+        self.check_single()
+        order = jnp.argsort(jnp.where(happened, order, jnp.inf), stable=True)
+        found = []
+        for value, filling in values:
+            here = happened.reshape(happened.shape + (1,) * (value.ndim - 1))
+            found.append(jnp.where(here, value, filling)[order])
+        if isinstance(happened, jax.core.Tracer):
+            return tuple(found)
+        count = int(happened.sum())
+        return tuple(value[:count] for value in found)
+
+
+def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> tuple[PyTree, PyTree]:
+    """Repeat `advance` until the state is done, at most `budget` times, and keep all states.
+
+    `loop(unfinished, step, carry, budget)` repeats. **Returns:** the last state, and every state by its number of
+    steps.
+    """
+
+    def store(nodes, state):
+        return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
+
+    def step(carry):
+        state, nodes = carry
+        state = advance(state)
+        return state, store(nodes, state)
+
+    nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
+    start = state, store(nodes, state)
+    return loop(lambda carry: ~carry[0].done & (carry[0].steps < budget), step, start, budget)
+
+
+def times_of(time: Callable, nodes: PyTree, last: PyTree) -> Inexact[Array, " nodes"]:
+    """Times of the nodes up to the last state; infinite past it."""
+    number = jnp.arange(nodes.steps.size)
+    return jnp.where(number <= last.steps, jax.vmap(time)(nodes), jnp.inf)

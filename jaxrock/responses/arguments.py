@@ -1,0 +1,53 @@
+"""What `outcome` and `simulate` take alike: the block's kind, the initial state, the engine."""
+
+import numpy as np
+from jaxtyping import ArrayLike, Inexact
+
+from jaxrock._checks import as_real, checked, scalar
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.diffrax.arcs import Diffrax
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.taylor.careful import Series
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+
+Scalar = Inexact[ArrayLike, ""]
+AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+
+USUAL = Housner()  # the model of a rigid block that nothing is said about
+
+
+def engine_of(engine: AbstractEngine | None, model: AbstractEquation) -> AbstractEngine:
+    """The engine that was asked for, or the usual one of a model."""
+    if engine is not None:
+        return engine
+    return Series() if model.is_series else Diffrax()
+
+
+def start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
+    """Initial rotation and angular velocity, checked."""
+    rotation, velocity = initial
+    rotation = checked(
+        "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)
+    )
+    return scalar("initial[0]", rotation), scalar("initial[1]", as_real("initial[1]", velocity))
+
+
+def steps_of_flexible(model: AbstractEquation, initial: tuple, engine: AbstractEngine | None) -> dict[str, int]:
+    """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
+    if model is not USUAL:
+        raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")
+    if tuple(initial) != (0.0, 0.0):
+        raise ValueError(
+            f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {initial}."
+        )
+    if engine is None:
+        return {}
+    if not isinstance(engine, Series) or engine.order is not None or engine.tolerance is not None:
+        raise ValueError(
+            "Argument `engine` must be None or Series(max_steps=...) for a FlexibleBlock, whose phases are solved in "
+            f"closed form, but is {engine}."
+        )
+    return {} if engine.max_steps is None else {"max_steps": engine.max_steps}

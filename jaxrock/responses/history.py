@@ -1,0 +1,244 @@
+"""The history of a block under a motion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock._checks import Values, checked, scalar
+from jaxrock._precision import say_if_single
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import State, initial_state, surpasses
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.trajectory import Trajectory, followed, times_of
+from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.outcome import Outcome, conclude
+from jaxrock.status import Status
+from jaxrock.transforms.differentiation import differentiable
+
+Scalar = Inexact[ArrayLike, "..."]
+
+
+class Summary(eqx.Module):
+    """What is known of a history as a whole (see `Response`)."""
+
+    impact_count: Int[Array, "..."]
+    max_rotation: Scalar
+    max_velocity: Scalar
+    time_of_max: Scalar
+    overturned: Bool[Array, "..."]
+    margin: Scalar
+    status: Status
+
+
+class Response(eqx.Module):
+    """The history of a scene; call it with times to evaluate it anywhere: `rotation, velocity = response(t)`.
+
+    - `time`, `rotation`, `velocity`: (samples,) equally spaced history [s], [rad], [rad/s].
+    - `impact_times`, `impact_velocities`: of every impact [s] and just before it [rad/s].
+    - `peak_times`, `peak_rotations`: of every turning point [s], [rad].
+    - `impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the duration.
+    - `overturned`, `margin`, `status`: as in `Outcome`; the verdict looks beyond a duration that covers the motion.
+
+    Under jit or vmap the arrays of impacts and peaks have fixed length: times are filled up with inf, values
+    with 0. Outside they hold the events alone.
+    """
+
+    time: Inexact[Array, "..."]
+    rotation: Inexact[Array, "..."]
+    velocity: Inexact[Array, "..."]
+    summary: Summary
+    trajectory: Trajectory
+
+    def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
+        """Rotation and angular velocity.
+
+        **Arguments:**
+
+        - `time`: any shape, in [0, duration] [s].
+
+        **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the
+        steps themselves; at an impact the velocity after it. A block that has fallen lies still.
+
+        **Raises:** ValueError for a time outside the history.
+        """
+        return _evaluate(self.trajectory, self.trajectory.checked(time))
+
+    @property
+    def impact_count(self) -> Int[Array, "..."]:
+        """Impacts within the duration."""
+        return self.summary.impact_count
+
+    @property
+    def max_rotation(self) -> Scalar:
+        """Largest |rotation| within the duration [rad]; infinite if the block overturned."""
+        return self.summary.max_rotation
+
+    @property
+    def max_velocity(self) -> Scalar:
+        """Largest |angular velocity| within the duration [rad/s]; infinite if the block overturned."""
+        return self.summary.max_velocity
+
+    @property
+    def time_of_max(self) -> Scalar:
+        """When `max_rotation` was reached [s]."""
+        return self.summary.time_of_max
+
+    @property
+    def overturned(self) -> Bool[Array, "..."]:
+        """The verdict, which looks beyond a duration that covers the motion."""
+        return self.summary.overturned
+
+    @property
+    def margin(self) -> Scalar:
+        """Signed distance to overturning [-], as in `Outcome`."""
+        return self.summary.margin
+
+    @property
+    def status(self) -> Status:
+        """What the numbers are worth."""
+        return self.summary.status
+
+    @property
+    def duration(self) -> Inexact[Array, "..."]:
+        """How long the block was followed [s]."""
+        return self.trajectory.duration
+
+    @property
+    def scene(self) -> Scene:
+        """What was simulated."""
+        return self.trajectory.stepper.scene
+
+    @property
+    def _impacts(self) -> tuple:
+        path, nodes = self.trajectory, self.trajectory.nodes
+        values = (nodes.impact_time, jnp.inf), (nodes.impact_velocity * self.scene.p, 0.0)
+        return path.events(path.impacted, nodes.impact_time, *values)
+
+    @property
+    def _peaks(self) -> tuple:
+        path, nodes = self.trajectory, self.trajectory.nodes
+        turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
+        return path.events(turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0))
+
+    @property
+    def impact_times(self) -> Inexact[Array, " impacts"]:
+        """Times of the impacts [s]."""
+        return self._impacts[0]
+
+    @property
+    def impact_velocities(self) -> Inexact[Array, " impacts"]:
+        """Angular velocities just before the impacts [rad/s]."""
+        return self._impacts[1]
+
+    @property
+    def peak_times(self) -> Inexact[Array, " peaks"]:
+        """Times of the turning points [s]."""
+        return self._peaks[0]
+
+    @property
+    def peak_rotations(self) -> Inexact[Array, " peaks"]:
+        """Rotations at the turning points [rad]."""
+        return self._peaks[1]
+
+
+def simulate(
+    block: AnyBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = USUAL,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    duration: ArrayLike | None = None,
+    engine: AbstractEngine | None = None,
+    samples: int = 2001,
+) -> Response | FlexibleResponse:
+    """Compute the history of a block under a motion.
+
+    **Arguments:**
+
+    - `block`, `motion`, `model`, `initial`, `engine`: as in `outcome`.
+    - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
+    - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had
+      by calling the result.
+
+    **Returns:** a `Response`; of a flexible block a `FlexibleResponse`.
+
+    **Raises:** ValueError for arguments outside their ranges, or that do not apply.
+    """
+    if isinstance(block, FlexibleBlock):
+        budget = steps_of_flexible(model, initial, engine)
+        return simulate_flexible(block, motion, duration=duration, samples=samples, **budget)
+    if samples < 2:
+        raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
+    if duration is not None:
+        duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
+        duration = scalar("duration", duration)
+    say_if_single()
+    summary, path = _simulate(block, motion, model, start_of(initial), duration, engine_of(engine, model))
+    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
+    return Response(time, *_evaluate(path, time), summary, path)
+
+
+@jax.jit
+def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
+    stop = motion.end + 10 / block.p if duration is None else jnp.asarray(duration)
+
+    def run(scene):
+        return _steps(*scene, engine, taped=False)
+
+    def on_tape(scene):
+        return _steps(*scene, engine, taped=True)
+
+    run = run if engine.reverse else differentiable(run, on_tape)
+    state, nodes, final = run((block, motion, model, initial, stop))
+    scene = Scene.of(block, motion, model)
+    stepper = engine.stepper(scene, stop, history=True)
+    impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
+    # The largest within the duration: the end may be on the way to a peak.
+    higher = surpasses(state.opening, state.peak)
+    lost = final.overturned
+    summary = Summary(
+        impact_count=state.impacts,
+        max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
+        max_velocity=jnp.where(lost, jnp.inf, state.fastest * scene.p),
+        time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
+        overturned=lost,
+        margin=final.margin,
+        status=final.status,
+    )
+    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
+
+
+def _steps(block, motion, model, initial, stop, engine, taped: bool) -> tuple[State, State, Outcome]:
+    """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
+    scene = Scene.of(block, motion, model)
+    stop = stop.astype(scene.p.dtype)
+    stepper, budget = engine.stepper(scene, stop, history=True, taped=taped), engine.budget(scene, history=True)
+    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+    if taped:
+        state, nodes = stepper.on_tape(state, budget)
+        nodes = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]])[: budget + 1], nodes, state)
+    else:
+        state, nodes = followed(lambda s: stepper.advance(s), state, budget, engine.loop)
+    return state, nodes, conclude(stepper, state)
+
+
+@jax.jit
+def _evaluate(path: Trajectory, time):
+    """Rotation [rad] and angular velocity [rad/s] at times."""
+    stepper = path.stepper
+
+    def follow(node, elapsed):
+        opening, speed = stepper.evaluate(node, elapsed)
+        # The last node is the end of the history: the block lies, rests, or is caught in motion there.
+        lies = node.done & (node.opening >= jnp.pi / 2)
+        velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed)
+        velocity = jnp.where(lies, 0.0, velocity)
+        return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity
+
+    return path.along(time, follow)

@@ -1,0 +1,186 @@
+"""What becomes of a block under a motion: peak, verdict, margin."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock._parameters import check_single
+from jaxrock._precision import say_if_single
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import State, initial_state
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
+from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.fast import follow, has_many_pieces, most_steps
+from jaxrock.flexible.response import outcome_flexible
+from jaxrock.flexible.stepper import FlexibleOutcome
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.status import Status
+from jaxrock.transforms.batching import Passes
+from jaxrock.transforms.differentiation import differentiable
+
+Scalar = Inexact[ArrayLike, "..."]
+
+
+class Outcome(eqx.Module):
+    """What came of a scene: the motion, and the free stage after it to its end.
+
+    - `max_rotation`: largest |rotation| [rad]; infinite if the block overturned.
+    - `max_velocity`: largest |angular velocity| [rad/s]; infinite if the block overturned.
+    - `time_of_max`: when `max_rotation` was reached [s]; infinite if the block overturned.
+    - `impact_count`: impacts during the motion, and the one after it if that one decides the verdict. The
+      impacts without end of a block that comes to rest are counted down to hops of rounding height.
+    - `overturned`: the verdict.
+    - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
+    - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
+      peaks tie, or where before the peak an impact is grazed (both within 1e-9); nor if the block overturned. Where an
+      impact or the uplift falls on a jump of the motion, and in a tie, derivatives are those of one side.
+    - `clearance`: how far from a graze the block has been before the peak [rad]: the least height at which it turned
+      back before the ground, or the least depth to which it would have come where it hit the ground while being slowed
+      down; infinite if there was neither. Where it is zero the number of impacts changes.
+    - `error`: estimated standard error of `max_rotation` from rounding and tolerance [rad]; infinite if overturned.
+    - `status`: a `Status`. With any other than successful the numbers are not results.
+
+    The margin is the smallest squared distance from standing still in balance (Voyagaki et al. 2012, 3.11),
+    (velocity/p sin alpha)^2 + (acceleration/p^2 sin alpha)^2, over turning points and crossings of the
+    unstable equilibrium, the acceleration with or without the shaking, whichever is larger; if the block overturned,
+    its negative over those since the last outward crossing. It is at most 1, except for a block that never uplifts:
+    2 - bound of the acceleration/threshold. In a free linear stage it is 1 - E/E_crit. (In the linear model
+    alpha stands for sin alpha.)
+    Its sign is the verdict's; it passes through zero smoothly where a block comes to balance on its corner, and
+    jumps where the shaking itself throws a stocky block flat, or where an impact or a turning point is only just
+    grazed. Of an asymmetric block it is the smaller of both sides'; where a block that just stands on its stronger
+    side comes back to fall on the other, it touches zero from below and jumps. Long after the start of a record the
+    passage through zero can be narrower than the last digit.
+    """
+
+    max_rotation: Scalar
+    max_velocity: Scalar
+    time_of_max: Scalar
+    impact_count: Int[Array, "..."]
+    overturned: Bool[Array, "..."]
+    margin: Scalar
+    differentiable: Bool[Array, "..."]
+    clearance: Scalar
+    error: Scalar
+    status: Status
+
+
+def outcome(
+    block: AnyBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = USUAL,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    duration: ArrayLike | None = None,
+    engine: AbstractEngine | None = None,
+) -> Outcome | FlexibleOutcome:
+    """Tell what becomes of a block under a motion and in the free stage after it.
+
+    **Arguments:**
+
+    - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars (use `jax.vmap` for many).
+    - `motion`: any motion, with a vertical one if it has one (`with_vertical`); the ground rests after its end.
+    - `model`: `Housner()` (nonlinear), `Linear()`, a `Spring(...)`, an `Equation` or `AbstractEquation` of your own.
+    - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
+    - `duration`: how long to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A rigid
+      block is followed to its end.
+    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
+
+    **Returns:** an `Outcome`; of a flexible block, to which `model` and `initial` do not apply, a `FlexibleOutcome`.
+
+    **Raises:** ValueError for arguments outside their ranges, or that do not apply; arrays where scalars are wanted.
+    """
+    if isinstance(block, FlexibleBlock):
+        return outcome_flexible(block, motion, duration=duration, **steps_of_flexible(model, initial, engine))
+    if duration is not None:
+        raise ValueError(
+            "Argument `duration` does not apply to the outcome of a rigid block, which is followed to its end: use "
+            "`simulate`."
+        )
+    say_if_single()
+    return _outcome(block, motion, model, start_of(initial), engine_of(engine, model))
+
+
+@jax.jit
+def _outcome(block, motion, model, initial, engine) -> Outcome:
+    def run(scene):
+        return _to_outcome(*scene, engine, taped=False)
+
+    def on_tape(scene):
+        return _to_outcome(*scene, engine, taped=True)
+
+    scene = block, motion, model, initial
+    if engine.reverse:
+        return run(scene)
+    check_single(block=block, motion=motion)
+    passes = _passes(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
+    return differentiable(run, on_tape, passes)(scene)
+
+
+def _passes(engine: Series, rounds: bool) -> Passes:
+    """The outcome in parts; in rounds where some blocks are lost long before others."""
+
+    def begin(scene):
+        block, motion, model, initial = scene
+        scene = Scene.of(block, motion, model)
+        stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
+        return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+
+    def conclude(stepper, state):
+        result = conclude(stepper, state)
+        return result, result.status != Status.successful
+
+    return Passes(
+        begin=begin,
+        quickly=follow,
+        carefully=lambda stepper, state: _to_the_end(engine, stepper, state),
+        unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
+        conclude=conclude,
+        round=256 if rounds else None,
+    )
+
+
+def _to_outcome(block, motion, model, initial, engine, taped: bool) -> Outcome:
+    scene = Scene.of(block, motion, model)
+    stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
+    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+    if taped:
+        # A tape holds all steps, as a history does.
+        state, _ = stepper.on_tape(state, engine.budget(scene, history=True))
+    else:
+        state = _to_the_end(engine, stepper, state)
+    return conclude(stepper, state)
+
+
+def _to_the_end(engine: AbstractEngine, stepper: AbstractStepper, state: State) -> State:
+    """Follow a block to the end of the motion."""
+    budget = engine.budget(stepper.scene, history=False)
+    return engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+
+
+def conclude(stepper: AbstractStepper, state: State) -> Outcome:
+    """Add the free stage to a state at the end of the motion (or where the block was lost)."""
+    final = stepper.finish(state)
+    overturned = final.overturned
+
+    def unless_overturned(value):
+        return jnp.where(overturned, jnp.inf, value)
+
+    tie = final.peak - final.second <= 1e-9 * final.peak
+    graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
+    return Outcome(
+        differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
+        clearance=jnp.where(overturned, final.clearance, final.peak_clearance),
+        max_rotation=unless_overturned(final.peak),
+        max_velocity=unless_overturned(final.fastest * stepper.scene.p),
+        time_of_max=unless_overturned(final.peak_time),
+        impact_count=final.impacts,
+        overturned=overturned,
+        margin=jnp.where(overturned, -final.closeness_beyond, final.closeness),
+        error=unless_overturned(final.error),
+        status=Status.where(state.done, final.status, Status.step_budget_exhausted),
+    )

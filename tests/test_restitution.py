@@ -1,0 +1,283 @@
+"""Laws of restitution: what an impact leaves of the velocity, wherever an impact is.
+
+Judges: free rocking of the linear block in closed form (the speed of every impact is that after the one before), SciPy
+with a law of its own, a law that only seems to depend on the speed, and the other engine.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxrock as rk
+from jaxrock.blocks.restitution import Corners, Reset
+from jaxrock.studies.parameters import named, rebuilt
+
+SOFT = rk.restitution.SpeedDependent(0.95, 0.6, 0.3)  # changes much within the speeds that occur here
+DIFFRAX = rk.Diffrax(rtol=1e-10)
+ENGINES = {"series": rk.Series(), "diffrax": DIFFRAX}
+
+
+class Brittle(rk.restitution.AbstractRestitution):
+    """The law of the module's docstring: one class."""
+
+    firm: jax.Array
+    speed: jax.Array
+
+    def ratio(self, corners, speed):
+        return self.firm / (1 + speed / self.speed)
+
+
+class Gaining(rk.restitution.AbstractRestitution):
+    """No law: an impact gains energy."""
+
+    def ratio(self, corners, speed):
+        return 1.1 + 0 * speed
+
+
+BRITTLE = Brittle(jnp.asarray(0.95), jnp.asarray(1.5))
+LAWS = {"speed-dependent": SOFT, "of the user": BRITTLE}
+
+
+def after(law, speed: float) -> float:
+    """Speed after an impact, by the formulas in the docstrings."""
+    if isinstance(law, Brittle):
+        return speed * float(law.firm) / (1 + speed / float(law.speed))
+    gentle, violent, scale = (float(x) for x in (law.gentle, law.violent, law.scale))
+    return speed * (violent + (gentle - violent) * np.exp(-speed / scale))
+
+
+def outcomes(found) -> list[np.ndarray]:
+    names = ("max_rotation", "max_velocity", "time_of_max", "margin", "impact_count", "overturned")
+    return [np.asarray(getattr(found, name)) for name in names]
+
+
+@pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+def test_free_rocking(law, engine):
+    """A free linear block comes back as fast as it left, after 2 artanh(v/p alpha)/p."""
+    alpha, p, speed = 0.2, 2.0, 0.3
+    still = rk.RectangularPulse(0.0, 1e-3)
+    block = rk.Block(alpha, p, law)
+    response = rk.simulate(block, still, rk.Linear(), initial=(0.0, speed), duration=3.0, engine=engine)
+    time, times, speeds = 0.0, [], []
+    while True:
+        time += 2 * np.arctanh(speed / (p * alpha)) / p
+        if time > 3.0:
+            break
+        times, speeds, speed = [*times, time], [*speeds, speed], after(law, speed)
+    accuracy = 1e-13 if isinstance(engine, rk.Series) else 1e-7
+    count = len(times)
+    assert count >= 5
+    np.testing.assert_allclose(response.impact_times[:count], times, rtol=accuracy)
+    np.testing.assert_allclose(np.abs(response.impact_velocities[:count]), speeds, rtol=accuracy)
+
+
+def by_scipy(law, alpha, p, amplitude, period, until) -> tuple[float, int]:
+    """Peak and impacts of a Housner block under a sine; hops here are large enough for a plain event."""
+    side = -1.0 if amplitude > 0 else 1.0
+    omega = 2 * np.pi / period
+    begin = np.arcsin(np.tan(alpha) / abs(amplitude)) / omega
+    state, time, peak, impacts = np.array([0.0, 0.0]), begin, 0.0, 0
+
+    def flow(t, y):
+        u = amplitude * np.sin(omega * t) if t < period else 0.0
+        return [y[1], -(p**2) * (np.sin(side * alpha - y[0]) + u * np.cos(side * alpha - y[0]))]
+
+    while time < until:
+        ends = [end for end in (period, until) if end > time]
+
+        def ground(t, y, start=time, side=side):
+            return side * y[0] if t > start + 1e-3 else 1.0
+
+        ground.terminal, ground.direction = True, -1
+        found = solve_ivp(flow, (time, ends[0]), state, "DOP853", events=ground, rtol=1e-12, atol=1e-14, max_step=0.01,
+                          dense_output=True)  # fmt: skip
+        fine = found.sol(np.linspace(time, found.t[-1], 20001))
+        peak = max(peak, np.abs(fine[0]).max())
+        time, state = found.t[-1], found.y[:, -1]
+        if found.t_events[0].size:
+            impacts += 1
+            state = np.array([0.0, np.sign(state[1]) * after(law, abs(state[1]))])
+            side = -side
+    return peak, impacts
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+def test_under_a_pulse_beside_scipy(law):
+    scene = 0.2, 2.0, 0.45, 1.1
+    found = rk.simulate(rk.Block(0.2, 2.0, law), rk.SinePulse(0.45, 1.1), duration=2.4)
+    peak, impacts = by_scipy(law, *scene, until=2.4)
+    assert int(found.impact_count) == impacts >= 2
+    np.testing.assert_allclose(float(found.max_rotation), peak, rtol=1e-8)
+
+
+def scenes(count: int, seed: int = 0):
+    """Random blocks and sine pulses under which much happens."""
+    draw = np.random.default_rng(seed)
+    alpha, p = draw.uniform(0.1, 0.35, count), draw.uniform(1.0, 4.0, count)
+    return alpha, p, np.tan(alpha) * draw.uniform(1.2, 5.0, count), draw.uniform(0.4, 2.5, count)
+
+
+def followed(law, engine=None, count: int = 200):
+    def one(alpha, p, amplitude, period):
+        return rk.outcome(rk.Block(alpha, p, law), rk.SinePulse(amplitude, period), engine=engine)
+
+    return jax.jit(jax.vmap(one))(*scenes(count))
+
+
+def test_a_law_that_does_not_change_is_a_number():
+    """Of the same numbers, by the code for laws that may change: peaks, margins and errors are the same."""
+    plain, seeming = followed(0.9), followed(rk.restitution.SpeedDependent(0.9, 0.9, 1.0))
+    lost = np.asarray(plain.overturned)
+    assert 20 < lost.sum() < 180
+    for one, other in zip(outcomes(plain), outcomes(seeming)):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(plain.error, seeming.error, rtol=1e-6)
+
+
+def test_both_engines_agree():
+    """Free stages by energy and by arcs, verdicts, peaks and margins."""
+    one, other = followed(SOFT, count=40), followed(SOFT, rk.Diffrax(rtol=1e-9), count=40)
+    assert (np.asarray(one.status == rk.Status.successful)).all()
+    np.testing.assert_array_equal(one.overturned, other.overturned)
+    safe = ~np.asarray(one.overturned)
+    assert 5 < safe.sum() < 35
+    np.testing.assert_allclose(one.max_rotation[safe], other.max_rotation[safe], rtol=1e-5)
+    np.testing.assert_allclose(one.margin, other.margin, rtol=1e-4, atol=1e-5)
+
+
+def test_many_scenes_are_as_one():
+    many = followed(SOFT, count=80)
+    for k in (0, 7, 31):
+        alpha, p, amplitude, period = (x[k] for x in scenes(80))
+        one = rk.outcome(rk.Block(alpha, p, SOFT), rk.SinePulse(amplitude, period))
+        np.testing.assert_allclose(float(one.margin), float(many.margin[k]), rtol=1e-9)
+        assert int(one.impact_count) == int(many.impact_count[k])
+
+
+def test_derivatives_by_its_parameters():
+    """Forward and reverse mode beside differences."""
+    motion = rk.SinePulse(0.45, 1.1)
+
+    def peak(x):
+        return rk.outcome(rk.Block(0.2, 2.0, rk.restitution.SpeedDependent(*x)), motion).max_rotation
+
+    at = jnp.array([0.95, 0.6, 0.3])
+    forward, reverse = jax.jacfwd(peak)(at), jax.grad(peak)(at)
+    steps = 1e-6 * jnp.eye(3)
+    differences = jnp.array([(peak(at + h) - peak(at - h)) / 2e-6 for h in steps])
+    assert np.abs(forward).min() > 1e-4
+    np.testing.assert_allclose(forward, differences, rtol=1e-6)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+
+
+def test_sensitivities_name_its_parameters():
+    block, motion = rk.Block(0.2, 2.0, SOFT), rk.SinePulse(0.45, 1.1)
+    names = tuple(named(block, motion))
+    assert names == ("alpha", "p", "restitution.gentle", "restitution.violent", "restitution.scale", "amplitude",
+                     "period")  # fmt: skip
+    found = rk.sensitivity(block, motion)
+    assert found.names[:7] == names
+    again, _ = rebuilt(block, motion, named(block, motion))
+    assert jax.tree.leaves(again) == jax.tree.leaves(block)
+
+
+def test_impacts_that_end_rocking():
+    """A block that comes to rest in a record: the same with any engine budget; impacts are counted to the last hop."""
+    record = rk.example_record()
+    found = rk.outcome(rk.Block(0.25, 2.5, SOFT), 1.5 * record)
+    constant = rk.outcome(rk.Block(0.25, 2.5, 0.95), 1.5 * record)
+    assert found.status == rk.Status.successful
+    assert 0 < int(found.impact_count) < int(constant.impact_count)
+
+
+@pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+def test_a_law_that_gains_energy_has_no_result(engine):
+    found = rk.outcome(rk.Block(0.2, 2.0, Gaining()), rk.SinePulse(0.45, 1.1), engine=engine)
+    assert found.status == rk.Status.not_finite
+
+
+def test_the_laws_of_momentum():
+    """Housner's is that of a rectangle, on one side as on two."""
+    alpha = jnp.linspace(0.05, 0.9, 9)
+    corners, still = Corners(alpha, alpha, jnp.ones_like(alpha)), jnp.zeros_like(alpha)
+    housner = rk.restitution.Housner().ratio(corners, still)
+    np.testing.assert_allclose(rk.restitution.AngularMomentum().ratio(corners, still), housner, atol=1e-15)
+    np.testing.assert_allclose(housner, 1 - 1.5 * np.sin(alpha) ** 2, atol=1e-15)
+    both = rk.AsymmetricBlock(0.2, 0.2, 2.0)
+    np.testing.assert_allclose([both.restitution1, both.restitution2], rk.Block(0.2, 2.0).restitution, rtol=1e-15)
+
+
+def test_a_pair_and_its_mirror():
+    block = rk.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.9, 0.8))
+    assert (float(block.restitution1), float(block.restitution2)) == (0.9, 0.8)
+    assert float(block.mirrored.restitution1) == 0.8
+    one = rk.outcome(block, rk.SinePulse(0.6, 1.0))
+    other = rk.outcome(block.mirrored, -rk.SinePulse(0.6, 1.0))
+    np.testing.assert_allclose(float(one.margin), float(other.margin), rtol=1e-12)
+
+
+def test_a_rock_with_a_law():
+    """An asymmetric block whose sides are alike is a block."""
+    motion = rk.SinePulse(0.45, 1.1)
+    one = rk.outcome(rk.AsymmetricBlock(0.2, 0.2, 2.0, restitution=SOFT), motion)
+    other = rk.outcome(rk.Block(0.2, 2.0, SOFT), motion)
+    for a, b in zip(outcomes(one), outcomes(other)):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_errors_grow_with_its_slope():
+    """Two blocks that hit a little apart: the difference after the impact is as the saltation matrix says."""
+    reset = Reset.of(SOFT, rk.Block(0.2, 2.0).corners, jnp.asarray(2.0))
+    speed, h = jnp.asarray(0.1), 1e-6
+    rebound = [float(reset.ratio(v) * v) for v in (speed - h, speed + h)]
+    np.testing.assert_allclose(float(reset.slope(speed)), (rebound[1] - rebound[0]) / (2 * h), rtol=1e-8)
+    np.testing.assert_allclose(rebound[0], after(SOFT, 2 * float(speed - h)) / 2, rtol=1e-12)
+
+
+def test_friction_at_impacts():
+    """A more violent impact keeps less and needs more friction."""
+    motion = rk.SinePulse(0.45, 1.1)
+    block = rk.Block(0.2, 2.0, SOFT)
+    response = rk.simulate(block, motion)
+    needed = rk.contact_forces(response, block).friction_at_impact
+    speeds = np.asarray(response.impact_velocities)
+    for side, friction in zip((1, -1), needed):
+        ratios = [after(SOFT, abs(v)) / abs(v) for v in speeds if np.sign(v) == -side and v != 0]
+        e = min(ratios)
+        np.testing.assert_allclose(float(friction), (1 - e) / (1 + e) / np.tan(0.2), rtol=1e-9)
+
+
+def test_a_flexible_column_with_a_law():
+    """A stiff column rocks as the rigid block on the same spring: its base's speed sets the ratio."""
+    motion = rk.RickerPulse(0.5, 1.2)
+    column = rk.FlexibleBlock(1.0, 5.0, 1e16, 2400.0, 0.05, masses=6, restitution=SOFT)
+    found = rk.outcome_flexible(column, motion)
+    p = float(column.p) / np.sqrt(1 + 1 / (2 * 5**2))
+    rigid = rk.simulate(rk.Block(float(column.alpha), p, SOFT), motion, rk.Spring("SM1", "linear"))
+    other = rk.outcome_flexible(rk.FlexibleBlock(1.0, 5.0, 1e16, 2400.0, 0.05, masses=6, restitution=0.95), motion)
+    assert int(found.impact_count) >= 1
+    assert abs(float(other.max_rotation) - float(found.max_rotation)) > 1e-4 * float(found.max_rotation)
+    np.testing.assert_allclose(float(found.max_rotation), float(rigid.max_rotation), rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda: rk.draw_blocks(rk.Block(0.2, 2.0, SOFT), 3, restitution=0.1),
+        lambda: rk.critical_durations(rk.Block(0.2, 2.0, SOFT), rk.SinePulse(0.45, 1.1)),
+        lambda: rk.similarity.groups(rk.Block(0.2, 2.0, SOFT), 0.3, 6.0),
+    ],
+    ids=["drawn", "longer motions", "similarity"],
+)
+def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
+    with pytest.raises(ValueError, match="depend"):
+        refused()
+
+
+@pytest.mark.parametrize("given", [(1.2, 0.5, 1.0), (0.9, -0.1, 1.0), (0.9, 0.5, 0.0)])
+def test_parameters_have_ranges(given):
+    with pytest.raises(ValueError, match="must be"):
+        rk.restitution.SpeedDependent(*given)

@@ -1,0 +1,197 @@
+"""Motions and models of a user's own, with arrays and parameters, in all that takes those of the package.
+
+Judges: the same motion as a record, the same model as one of the package.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.studies.parameters import declarations, named
+
+BLOCK = rk.Block(0.2, 2.0)
+CORNERS = np.array([0.0, 0.3, -0.25, 0.35, -0.1, 0.0])
+
+
+class Ramps(rk.AbstractMotion):
+    """Straight lines between corners at equal times, times a height; an array that nobody declares."""
+
+    height: jax.Array
+    corners: jax.Array
+    step: jax.Array = rk.parameter("s", "positive", symbol="h")
+
+    @property
+    def knots(self):
+        return self.step * jnp.arange(self.corners.shape[0])
+
+    @property
+    def scales(self):
+        return jnp.full(self.corners.shape[0] - 1, jnp.inf)
+
+    @property
+    def bounds(self):
+        size = jnp.abs(self.height * self.corners)
+        return jnp.maximum(size[:-1], size[1:])
+
+    def series(self, piece, local, unit, order):
+        left, right = self.corners[piece], self.corners[piece + 1]
+        slope = (right - left) / self.step
+        return [self.height * (left + slope * local), self.height * slope * unit][: order + 1]
+
+
+class Damped(rk.AbstractEquation):
+    """Housner's equation with a damper, as functions."""
+
+    damping: jax.Array
+
+    def moments(self, block):
+        return rk.Equation(
+            lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: self.damping * v
+        ).moments(block)
+
+    @property
+    def is_series(self):
+        return False
+
+
+class Softer(rk.AbstractEquation):
+    """A sinusoid that is weaker than the block's own, by a number: the series engine solves it."""
+
+    strength: jax.Array = rk.parameter("-", "share")
+
+    def moments(self, block):
+        sine, cosine = jnp.sin(block.alpha), jnp.cos(block.alpha)
+        restoring = rk.Terms(sine=-self.strength * cosine, cosine=self.strength * sine)
+        return rk.Coefficients(restoring, rk.Terms(sine=sine, cosine=cosine))
+
+
+def ramps(height=1.0):
+    return Ramps(jnp.asarray(height), jnp.asarray(CORNERS), jnp.asarray(0.25))
+
+
+def record(height=1.0):
+    return rk.Record(height * CORNERS, 0.25)
+
+
+def test_a_motion_with_an_array():
+    """As the record of the same samples: outcome, vmap, gradient."""
+    own, theirs = rk.outcome(BLOCK, ramps()), rk.outcome(BLOCK, record())
+    assert float(own.max_rotation) == pytest.approx(float(theirs.max_rotation), rel=1e-13)
+    assert int(own.impact_count) == int(theirs.impact_count) > 0
+
+    def margin(height, motion=ramps):
+        return rk.outcome(BLOCK, motion(height)).margin
+
+    heights = jnp.linspace(0.8, 2.5, 9)
+    np.testing.assert_allclose(
+        jax.vmap(margin)(heights), jax.vmap(lambda h: rk.outcome(BLOCK, h * record()).margin)(heights), rtol=1e-11
+    )
+    slope = jax.grad(lambda h: rk.outcome(BLOCK, h * record()).margin)(1.0)
+    assert float(jax.grad(margin)(1.0)) == pytest.approx(float(slope), rel=1e-9)
+    by_corners = jax.grad(lambda m: rk.outcome(BLOCK, m).max_rotation)(ramps()).corners
+    by_samples = jax.grad(lambda m: rk.outcome(BLOCK, m).max_rotation)(record()).samples
+    np.testing.assert_allclose(by_corners, by_samples, rtol=1e-9, atol=1e-12)
+
+
+def test_its_parameters():
+    """What is declared, with unit and range; numbers that are not declared; no arrays."""
+    found = declarations(BLOCK, ramps())
+    assert tuple(found) == ("amplitude", "alpha", "p", "restitution", "height", "step")
+    assert set(named(BLOCK, ramps())) == set(found)
+    assert (found["step"].unit, found["step"].range.low, found["step"].symbol) == ("s", 0.0, "h")
+    assert found["height"].unit == "-"
+    assert found["alpha"].range.high == np.pi / 2
+
+
+def test_a_motion_of_ones_own_in_sweeps():
+    grid = rk.sweep(lambda height: rk.outcome(BLOCK, ramps(height)), height=np.linspace(0.8, 2.5, 9), progress=False)
+    theirs = rk.sweep(
+        lambda height: rk.outcome(BLOCK, height * record()), height=np.linspace(0.8, 2.5, 9), progress=False
+    )
+    np.testing.assert_allclose(grid.values.margin, theirs.values.margin, rtol=1e-11)
+
+
+def test_a_motion_of_ones_own_has_critical_amplitudes():
+    """For one block and for many; the corners are shared."""
+    own = rk.critical_amplitudes(BLOCK, ramps(), intensity=(1.0, 6.0), progress=False)
+    theirs = rk.critical_amplitudes(BLOCK, record(), intensity=(1.0, 6.0), progress=False)
+    assert int(own.count) == int(theirs.count) > 0
+    np.testing.assert_allclose(own.value, theirs.value, rtol=1e-12)
+    many = rk.critical_amplitudes(rk.Block([0.2, 0.25], 2.0), ramps(), intensity=(1.0, 6.0), derivatives=False,
+                                  progress=False)  # fmt: skip
+    np.testing.assert_allclose(many.value[0][: int(own.count)], own.value, rtol=1e-12)
+
+
+def test_a_suite_of_ones_own():
+    suite = rk.Suite([Ramps(jnp.array([0.5, 1.0]), jnp.asarray(CORNERS), jnp.asarray(0.25))])
+    np.testing.assert_allclose(suite.peak_acceleration, [0.175, 0.35], rtol=1e-12)
+
+
+def test_batches_are_refused_where_one_scene_is_meant():
+    motion = Ramps(jnp.asarray(1.0), jnp.asarray(CORNERS), jnp.array([0.25, 0.3]))
+    with pytest.raises(ValueError, match=r"`motion` must hold one scene, but `step` has shape \(2,\)"):
+        rk.outcome(BLOCK, motion)
+
+
+def test_a_model_of_ones_own_in_series():
+    """Half the moment is half the threshold; at the full one it is Housner's block, derivatives too."""
+    motion = rk.SinePulse(0.35, 0.9)
+    own, theirs = rk.outcome(BLOCK, motion, Softer(jnp.asarray(1.0))), rk.outcome(BLOCK, motion)
+    assert float(own.max_rotation) == pytest.approx(float(theirs.max_rotation), rel=1e-13)
+    assert float(own.margin) == pytest.approx(float(theirs.margin), rel=1e-11)
+    half = Softer(jnp.asarray(0.5)).moments(BLOCK)
+    assert float(half.threshold) == pytest.approx(np.tan(0.2) / 2)
+
+    def peak(strength, model=Softer, engine=None):
+        return rk.outcome(BLOCK, motion, model(strength), engine=engine).max_rotation
+
+    slope = float(jax.grad(peak)(0.9))
+    assert slope == pytest.approx(float(peak(0.9 + 1e-6) - peak(0.9 - 1e-6)) / 2e-6, rel=1e-6)
+    by_arcs = float(peak(jnp.asarray(0.9), engine=rk.Diffrax(rtol=1e-10)))
+    assert float(peak(jnp.asarray(0.9))) == pytest.approx(by_arcs, rel=1e-7)
+    many = jax.vmap(peak)(jnp.linspace(0.8, 1.0, 5))
+    assert float(many[-1]) == pytest.approx(float(theirs.max_rotation), rel=1e-12)
+
+
+def test_a_model_of_ones_own_as_functions():
+    motion = rk.SinePulse(0.35, 0.9)
+    engine = rk.Diffrax(rtol=1e-9)
+    peaks = [float(rk.outcome(BLOCK, motion, Damped(jnp.asarray(c)), engine=engine).max_rotation) for c in (0.0, 0.1)]
+    assert peaks[0] == pytest.approx(float(rk.outcome(BLOCK, motion).max_rotation), rel=1e-6)
+    assert peaks[1] < peaks[0]
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [rk.Terms(constant=1.0), rk.Terms(cosine=1.0), rk.Terms(line=-1.0, sine=1.0), rk.Terms()],
+    ids=["constant", "cosine", "line and sine", "nothing"],
+)
+def test_moments_whose_balance_is_not_known_are_refused(terms):
+    with pytest.raises(ValueError, match="`restoring_terms` must be"):
+        rk.Coefficients(terms, rk.Terms(constant=1.0))
+
+
+@pytest.mark.parametrize(
+    "arm",
+    [rk.Terms(constant=1.0), rk.Terms(constant=1.0, line=-0.3), rk.Terms(cosine=0.9, line=0.1), rk.Terms(cosine=1.0)],
+    ids=["constant", "line", "cosine and line", "cosine"],
+)
+def test_any_arm_in_both_engines(arm):
+    """Arms that no model of the package has, with their derivatives."""
+
+    class WithArm(rk.AbstractEquation):
+        strength: jax.Array
+
+        def moments(self, block):
+            restoring = rk.Terms(sine=-jnp.cos(block.alpha), cosine=jnp.sin(block.alpha))
+            return rk.Coefficients(restoring, jax.tree.map(lambda c: self.strength * c, arm))
+
+    def peak(strength, engine):
+        return rk.outcome(BLOCK, rk.SinePulse(0.3, 0.9), WithArm(strength), engine=engine).max_rotation
+
+    at, engine = jnp.asarray(1.0), rk.Diffrax(rtol=1e-10)
+    assert float(peak(at, None)) == pytest.approx(float(peak(at, engine)), rel=1e-7)
+    slope = float(jax.jvp(lambda s: peak(s, None), (at,), (jnp.ones_like(at),))[1])
+    assert slope == pytest.approx(float(peak(at + 1e-6, None) - peak(at - 1e-6, None)) / 2e-6, rel=1e-6)
