@@ -21,7 +21,7 @@ class FlexibleBlock(eqx.Module):
     """A rectangular elastic block that rocks: lumped masses on a cantilever whose base is a rocking spring (mmSM).
 
     Small rotations: the column of length 2R carries the ground's acceleration times cos(alpha), and its base turns
-    against the moment M0 (1 - |theta|/alpha), M0 = m g R sin(alpha); below M0 it is locked. When the rotation
+    against the moment M0 (1 - |theta|/balance), M0 = m g R sin(alpha); below M0 it is locked. When the rotation
     returns to zero the velocities of all masses are multiplied by the restitution.
 
     **Arguments:**
@@ -41,14 +41,16 @@ class FlexibleBlock(eqx.Module):
     - `impacts`: which returns of the base to zero count as impacts: "alternate": the first from either side, and later
       ones from that side that end a longer stay, so that a column that bounces on one edge is not braked twice, and
       one that trembles as it uplifts is braked when it comes down; "every": all of them.
+    - `base`: moment of the base. "linear": a constant negative stiffness that balances at alpha; "plastic": M0, less
+      what the weight of the leaning column pulls, m g R theta, so that it balances at sin(alpha).
     - `gravity`: [m/s^2], positive.
 
-    All but `masses`, `damping` and `impacts` may be arrays of one shape, for use under `jax.vmap`.
+    All but `masses`, `base`, `damping` and `impacts` may be arrays of one shape, for use under `jax.vmap`.
 
     **Raises:** ValueError for a value outside its range.
 
     **Source:** Diamantopoulos & Fragiadakis (2017), sections 3.4 and 6, with the constant negative stiffness of
-    figure 3b; Vassiliou, Mackie & Stojadinovic (2016).
+    figure 3b, or the rigid-plastic law of figure 3c; Vassiliou, Mackie & Stojadinovic (2016).
     """
 
     width: Real = parameter("m", positive)
@@ -61,6 +63,7 @@ class FlexibleBlock(eqx.Module):
     masses: int = eqx.field(static=True)
     damping: str = eqx.field(static=True)
     impacts: str = eqx.field(static=True)
+    base: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -74,10 +77,12 @@ class FlexibleBlock(eqx.Module):
         restitution: Restitution | None = None,
         damping: str = "stiffness",
         impacts: str = "alternate",
+        base: str = "linear",
         gravity: ArrayLike = GRAVITY,
     ):
         self.damping = one_of("damping", damping, ("stiffness", "modal", "rayleigh"))
         self.impacts = one_of("impacts", impacts, ("alternate", "every"))
+        self.base = one_of("base", base, ("linear", "plastic"))
         least = 3 if damping == "rayleigh" else 2
         if not isinstance(masses, int) or not least <= masses <= 60:
             raise ValueError(f"Argument `masses` must be a whole number from {least} to 60, but is {masses!r}.")
@@ -159,7 +164,12 @@ class FlexibleBlock(eqx.Module):
     @property
     def spring_rate(self) -> Real:
         """Negative stiffness of the base, over m L^2 [1/s^2]."""
-        return self.strength / self.alpha
+        return self.strength / self.balance
+
+    @property
+    def balance(self) -> Real:
+        """Rotation of the unstable equilibrium [rad]."""
+        return self.alpha if self.base == "linear" else jnp.sin(self.alpha)  # D&F 2017, figure 3 b, c for small angles
 
     @property
     def damping_rates(self) -> tuple[Real, Inexact[Array, "*batch modes"]]:

@@ -7,7 +7,7 @@ Modal coordinates q of the clamped column, with u = L (shapes @ q), and the base
     rocking: sum of rotation (k w + d w') = strength side - spring_rate theta,  w = q - rotation theta
 
 in units of m L^2. While the base rocks this is linear in (q, q', theta), about the unstable equilibrium at
-theta = alpha side. Its rates are the zeros of one function; left and right vectors follow from them in closed form.
+theta = balance side. Its rates are the zeros of one function; left and right vectors follow from them in closed form.
 """
 
 import math
@@ -49,6 +49,7 @@ class Numbers(eqx.Module):
     tip: Inexact[Array, " modes"]
     strength: Scalar
     spring_rate: Scalar
+    balance: Scalar  # rotation of the unstable equilibrium [rad]
     alpha: Scalar
     damped: Bool[Array, ""]
 
@@ -74,6 +75,7 @@ class Numbers(eqx.Module):
             tip=jnp.asarray(column.tip, dtype),
             strength=block.strength,
             spring_rate=block.spring_rate,
+            balance=block.balance,
             alpha=block.alpha,
             damped=damped,
         )
@@ -259,8 +261,8 @@ class Arc(eqx.Module):
 def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array, " order"], length: Scalar) -> Arc:
     """The motion from `state` on one side (0: locked) under a_g = sum of load[k] x^k, x = time/length."""
     n = numbers.rotation.size
-    center = numbers.alpha * side * jnp.concatenate([numbers.rotation, jnp.zeros(n), jnp.ones(1)])
-    offsets = numbers.alpha * side * jnp.array([1.0, 1.0, 0.0, 0.0], center.dtype)
+    center = numbers.balance * side * jnp.concatenate([numbers.rotation, jnp.zeros(n), jnp.ones(1)])
+    offsets = numbers.balance * side * jnp.array([1.0, 1.0, 0.0, 0.0], center.dtype)
     start = phase.project @ (state - center)
     exponents = phase.rates * length
     slow = jnp.abs(exponents) < 1

@@ -215,7 +215,7 @@ class FlexibleScene(eqx.Module):
     def conclude(self, state: FlexibleState) -> FlexibleOutcome:
         """What came of it, from the state at the end."""
         lost = state.fallen | self._never_returns(state)
-        total = sum(self.energy(state.motion)) / (self.numbers.strength * self.numbers.alpha / 2)
+        total = sum(self.energy(state.motion)) / (self.numbers.strength * self.numbers.balance / 2)
         quiet = self.time(state) >= self.knots[-1]
         status = Status.where(lost | (total < 1) | ~quiet, state.status, Status.undecided)
         status = Status.where(state.status == Status.successful, status, state.status)
@@ -229,13 +229,13 @@ class FlexibleScene(eqx.Module):
         """Whether, without further shaking, the unstable mode outgrows all others from here on."""
         side, phase = state.side, self.rocking
         n = self.numbers.rotation.size
-        center = self.numbers.alpha * side * jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
+        center = self.numbers.balance * side * jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
         amplitudes = phase.project @ (state.motion - center)
         growing = phase.rates.real == jnp.max(phase.rates.real)
         outward = side * jnp.sum(jnp.where(growing, amplitudes.real, 0.0))
         others = jnp.sum(jnp.where(growing, 0.0, jnp.abs(amplitudes)))
         quiet = self.time(state) >= self.knots[-1]
-        return quiet & (side != 0) & (outward > 0) & (self.numbers.alpha + outward > others)
+        return quiet & (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
 
 
 def _maxima(rows, maxima, x):

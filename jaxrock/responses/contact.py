@@ -82,7 +82,7 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     horizontal, normal = jax.vmap(lambda *at: _forces(response.scene, sides, *at))(time, rotation, velocity)
     largest, least = _extremes(response, sides)
     corners = [(r * jnp.sin(a), r * jnp.cos(a)) for r, a in zip(radii, alphas)]
-    needed = tuple(_at_impacts(response, side, corners[i], corners[1 - i]) for i, side in enumerate((1, -1)))
+    needed = tuple(_at_impacts(response, side, corners[i], corners[1 - i]) for i, side in enumerate((1.0, -1.0)))
     friction = _friction(horizontal, normal)
     # Between steps, and where the block rests for good and no step is taken.
     below = jnp.abs(rotation) < jnp.where(rotation < 0, alphas[1], alphas[0])
@@ -91,7 +91,7 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     return Contact(time, horizontal, normal, friction, needed, largest, least)
 
 
-def _at_impacts(response: Response, side: int, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]) -> Scalar:
+def _at_impacts(response: Response, side: float, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]) -> Scalar:
     """The most friction that the impacts need which end a stay on a side, or any impact would, if there is none.
 
     `here`, `there`: horizontal and vertical distance of the centre from the corner that it leaves, and from the other.

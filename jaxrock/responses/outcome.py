@@ -12,7 +12,8 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.engines.taylor.fast import follow, has_many_pieces, most_steps
+from jaxrock.engines.taylor.fast import follow, most_steps
+from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.flexible.response import outcome_flexible
 from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
@@ -117,7 +118,7 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
     if engine.reverse:
         return run(scene)
     check_single(block=block, motion=motion)
-    passes = _passes(engine, has_many_pieces(motion.knots.size - 1)) if isinstance(engine, Series) else None
+    passes = _passes(engine, POLICY.is_record(motion.knots.size - 1)) if isinstance(engine, Series) else None
     return differentiable(run, on_tape, passes)(scene)
 
 
@@ -140,7 +141,7 @@ def _passes(engine: Series, rounds: bool) -> Passes:
         carefully=lambda stepper, state: _to_the_end(engine, stepper, state),
         unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
         conclude=conclude,
-        round=256 if rounds else None,
+        round=POLICY.round if rounds else None,
     )
 
 

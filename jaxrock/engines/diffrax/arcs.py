@@ -20,8 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.diffrax.guards import (
-    LONGEST,
-    ORDER,
+    POLICY,
     Arc,
     Forcing,
     Illinois,
@@ -48,12 +47,6 @@ Flag = Bool[ArrayLike, ""]
 
 
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
-
-
-_SHARE = 4  # usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace
-
-
-_MOST_STEPS = 4096  # of one solve
 
 
 _GAUSS = tuple(w / 2 for w in (np.polynomial.legendre.leggauss(12)[0] + 1, np.polynomial.legendre.leggauss(12)[1]))
@@ -118,7 +111,7 @@ class Diffrax(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of solves."""
-        return self.max_solves or 4096 + 4 * scene.pieces
+        return self.max_solves or POLICY.solves + 4 * scene.pieces
 
     def loop(self, unfinished, step, carry, budget: int):
         """A loop that goes with the adjoint."""
@@ -128,7 +121,7 @@ class Diffrax(AbstractEngine):
         """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        return jax.lax.stop_gradient((atol, jnp.minimum(LONGEST, scene.p * scene.scales[piece])))
+        return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scales[piece])))
 
     def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None):
         """The arc, for `length` (p t) at most."""
@@ -147,7 +140,7 @@ class Diffrax(AbstractEngine):
             stepsize_controller=self.controller or diffrax.PIDController(self.rtol, limits[0], dtmax=limits[1]),
             event=event,
             adjoint=self.adjoint,
-            max_steps=_MOST_STEPS,
+            max_steps=POLICY.solve_steps,
             throw=False,
         )
 
@@ -167,7 +160,7 @@ class ArcStepper(AbstractStepper):
         forcing = Forcing.of(scene, state)
         eps = float(jnp.finfo(scene.p.dtype).eps)
         resting = state.side == 0
-        waited = wait(self, state, forcing.shaking, forcing.unit, ORDER, eps, either)
+        waited = wait(self, state, forcing.shaking, forcing.unit, POLICY.order, eps, either)
         rocked = self.on(state.side)._rock(state, forcing, ~resting)
         after = checked(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
         if self.history:
@@ -245,7 +238,7 @@ class ArcStepper(AbstractStepper):
         scene, engine = self.scene, self.engine
         lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
-        share = _SHARE * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
+        share = POLICY.share * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)

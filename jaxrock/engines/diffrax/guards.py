@@ -1,6 +1,6 @@
 """One smooth arc of a rocking block as a problem for diffrax: its forcing, its right-hand side, its guards."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,10 +23,23 @@ Flag = Bool[ArrayLike, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 
-LONGEST = 0.5  # step of the default controller, in 1/p
+class Policy(NamedTuple):
+    """How the diffrax engine goes about it.
+
+    - `longest`: step of the default controller [1/p].
+    - `order`: of the motion's series: for waiting, for coming to rest, and of pieces that are polynomials.
+    - `share`: usual steps in one solve: a longer arc goes on in the next, so that the lanes of a batch keep pace.
+    - `solve_steps`: step budget of one solve; `solves`: of a scene, besides four for each piece of the motion.
+    """
+
+    longest: float = 0.5
+    order: int = 12
+    share: int = 4
+    solve_steps: int = 4096
+    solves: int = 4096
 
 
-ORDER = 12  # of the motion's series: for waiting, for coming to rest, and of pieces that are polynomials
+POLICY = Policy()
 
 
 class Forcing(eqx.Module):
@@ -44,9 +57,9 @@ class Forcing(eqx.Module):
     @classmethod
     def of(cls, scene: Scene, state: State) -> "Forcing":
         """The forcing from a state on."""
-        shaking, unit = scene.shaking(state.piece, state.local, ORDER)
+        shaking, unit = scene.shaking(state.piece, state.local, POLICY.order)
         piece = jnp.minimum(state.piece, scene.pieces - 1)
-        polynomial = all(terms is None or len(terms) <= ORDER for terms in shaking)
+        polynomial = all(terms is None or len(terms) <= POLICY.order for terms in shaking)
         motion = None if polynomial else scene.motion
         return cls(motion, shaking, unit, piece, state.local, state.piece < scene.pieces, scene.p)
 
@@ -181,7 +194,7 @@ def first_guard(t, y, args: Arc, **kwargs):
 
 def usual_step(rtol: float) -> float:
     """Step (p t) that methods of order five take at this tolerance."""
-    return min(0.1 * (rtol / 1e-8) ** 0.2, LONGEST)
+    return min(0.1 * (rtol / 1e-8) ** 0.2, POLICY.longest)
 
 
 def first_step(arc: Arc, rtol: float) -> Scalar:

@@ -26,6 +26,7 @@ from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.motion import Shaking
@@ -49,9 +50,6 @@ Scalar = Inexact[ArrayLike, ""]
 
 
 Flag = Bool[ArrayLike, ""]
-
-
-_OUTCOME_STEPS = 100_000
 
 
 class Series(AbstractEngine):
@@ -86,7 +84,7 @@ class Series(AbstractEngine):
         return TaylorStepper(
             scene=scene,
             stop=stop,
-            order=self.order or (8 if scene.pieces > 32 else 16),
+            order=self.order or (POLICY.record_order if POLICY.is_record(scene.pieces) else POLICY.pulse_order),
             tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
             history=history,
             taped=taped,
@@ -94,7 +92,7 @@ class Series(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of steps."""
-        return self.max_steps or (4096 + 2 * scene.pieces if history else _OUTCOME_STEPS)
+        return self.max_steps or (POLICY.history_steps + 2 * scene.pieces if history else POLICY.outcome_steps)
 
     def loop(self, unfinished, step, carry, budget: int):
         """A loop that stops at the last lane."""

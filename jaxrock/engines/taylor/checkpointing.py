@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Inexact
 
 from jaxrock.engines.state import State
+from jaxrock.engines.taylor.policy import POLICY
 
 Scalar = Inexact[ArrayLike, ""]
 
 
-_BETWEEN = 64  # steps between checkpoints
+_BETWEEN = POLICY.between_checkpoints
 
 
 def on_tape(advance: Callable, shaking: Callable, state: State, budget: int) -> tuple[State, State]:

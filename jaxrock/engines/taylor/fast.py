@@ -21,6 +21,7 @@ from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
+from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, step_length, tangent
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
@@ -32,15 +33,9 @@ Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 
 
-_SHORTER = (0.4, 0.1)  # shares of a step that are tried for a certificate, after the whole
-
-
 # Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
 # proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
 _FLAT, _TURN, _MEET = (6, 10, 16), (5, 10, 16, 16), (5, 9, 13, 16)
-
-
-_STEPS = 1000
 
 
 def _first_sign(value: Scalar, following: Scalar) -> Scalar:
@@ -66,7 +61,7 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
 
     def shorter():
         share = jnp.zeros_like(length)
-        for part in reversed(_SHORTER):
+        for part in reversed(POLICY.shorter):
             share = jnp.where(sure(part), part, share)
         return share
 
@@ -348,7 +343,7 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
     slope = derivative(terms) or [jnp.zeros_like(length)]
     rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
-    for part in (*reversed(_SHORTER), 1.0):
+    for part in (*reversed(POLICY.shorter), 1.0):
         share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
     steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
     return jnp.where(steady, 1.0, share)
@@ -356,12 +351,7 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
 
 def most_steps(pieces: int) -> int:
     """After how many steps a scene is left to the careful engine."""
-    return _STEPS + 3 * pieces
-
-
-def has_many_pieces(pieces: int) -> bool:
-    """Whether a motion is a record rather than a pulse."""
-    return pieces > 32
+    return POLICY.fast_steps + 3 * pieces
 
 
 def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
@@ -375,7 +365,7 @@ def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> S
     def resting(state):
         return state.side == 0
 
-    if has_many_pieces(pieces):
+    if POLICY.is_record(pieces):
         # Among many lanes under a record some rest at any time: each takes the step it needs.
         def step(s):
             return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))

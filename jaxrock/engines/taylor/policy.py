@@ -1,0 +1,33 @@
+"""What is policy in the series engine, not mathematics: numbers that change times, but no result beyond its error."""
+
+from typing import NamedTuple
+
+
+class Policy(NamedTuple):
+    """How the series engine goes about it.
+
+    - `pulse_order`, `record_order`: of Taylor steps under motions of few and many pieces; short ones need few terms.
+    - `many_pieces`: from which number of pieces on a motion counts as a record.
+    - `outcome_steps`: step budget of an outcome; `history_steps`: of a history, besides two for each piece.
+    - `fast_steps`: after which a scene is left to the careful pass, besides three for each piece.
+    - `shorter`: shares of a step that are tried for a certificate, after the whole.
+    - `round`: steps after which scenes under a record make up new chunks where XLA follows them.
+    - `between_checkpoints`: steps of a history that are computed again on the way back.
+    """
+
+    pulse_order: int = 16
+    record_order: int = 8
+    many_pieces: int = 32
+    outcome_steps: int = 100_000
+    history_steps: int = 4096
+    fast_steps: int = 1000
+    shorter: tuple[float, ...] = (0.4, 0.1)
+    round: int = 256
+    between_checkpoints: int = 64
+
+    def is_record(self, pieces: int) -> bool:
+        """Whether a motion of so many pieces counts as a record."""
+        return pieces > self.many_pieces
+
+
+POLICY = Policy()
