@@ -15,7 +15,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.diffrax.guards import (
@@ -33,6 +32,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper, either
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import differentiable
 
@@ -51,7 +51,7 @@ _SHARE = 4  # usual steps in one solve: a longer arc goes on in the next, so tha
 _MOST_STEPS = 4096  # of one solve
 
 
-_GAUSS = tuple(w / 2 for w in (np.polynomial.legendre.leggauss(12)[0] + 1, np.polynomial.legendre.leggauss(12)[1]))
+_GAUSS = gauss_legendre_of_unit(12)
 
 
 _ADJOINTS = {
