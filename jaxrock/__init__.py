@@ -81,7 +81,8 @@ from jaxrock.models.equation import AbstractEquation as AbstractEquation
 from jaxrock.models.rigid import Housner as Housner, Linear as Linear
 from jaxrock.models.spring import Spring as Spring
 from jaxrock.models.user_equation import Equation as Equation
-from jaxrock.motions.files.reading import example_record as example_record, read_record as read_record
+from jaxrock.motions.files.example import example_record as example_record
+from jaxrock.motions.files.reading import read_record as read_record
 from jaxrock.motions.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
 from jaxrock.motions.motion import AbstractMotion as AbstractMotion, WithVertical as WithVertical
 from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)

@@ -1,5 +1,6 @@
 """The command line: what it writes and prints, and one clear line where the input is bad."""
 
+import argparse
 import os
 import re
 import subprocess
@@ -12,6 +13,8 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
+from jaxrock.command_line.options import add_pulse, extent_of, pulse_of
+from jaxrock.motions.pulses import PULSES
 
 STEPS = np.arange(60)
 SAMPLES = np.round(0.5 * np.sin(0.3 * STEPS) * np.exp(-0.04 * STEPS), 5)  # g
@@ -183,6 +186,39 @@ def test_map(command, tmp_path):
     }
 
 
+def test_map_of_a_pulse_with_more_parameters(command, tmp_path):
+    status, _, errors = command("map", "--points", "4", "--pulse", "exponential", "--shape", "0.5", "--model", "linear")
+    assert status == 0 and errors == ""
+    _, rows = table_of(tmp_path / "out" / "map.csv")
+    expected = rk.overturning_map(
+        np.linspace(0.3, 8.0, 4),
+        np.linspace(1.02, 10.0, 4),
+        pulse=lambda amplitude, duration: rk.ExponentialPulse(amplitude, duration, 0.5),
+        model=rk.Linear(),
+    )
+    np.testing.assert_allclose(rows[:, 5], np.ravel(expected.margin), rtol=1e-11)
+
+
+@pytest.mark.parametrize("pulse", PULSES)
+def test_every_pulse_has_its_words(pulse):
+    """Of every pulse the command makes one with what the words do not say: defaults, or a shape of 0."""
+    parser = argparse.ArgumentParser()
+    add_pulse(parser)
+    motion = pulse_of(parser.parse_args(["--pulse", pulse]))(0.5, 1.0)
+    assert type(motion) is PULSES[pulse]
+    assert float(motion.amplitude) == 0.5 and float(getattr(motion, extent_of(type(motion)))) == 1.0
+    assert pulse != "exponential" or motion.shape == 0
+    assert pulse != "mavroeidis-papageorgiou" or (motion.oscillations, motion.phase) == (2, 0)
+
+
+def test_parameters_of_pulses_are_options():
+    parser = argparse.ArgumentParser()
+    add_pulse(parser)
+    given = ["--pulse", "ricker", "--kind", "antisymmetric", "--center", "3"]
+    motion = pulse_of(parser.parse_args(given))(0.5, 1.0)
+    assert (motion.kind, float(motion.center)) == ("antisymmetric", 3.0)
+
+
 def test_as_a_program(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "jaxrock", "map", "--points", "4", "--out", str(tmp_path / "new" / "folder")],
@@ -203,9 +239,10 @@ def test_as_a_program(tmp_path):
         ([], ["run", "spectrum", "map", "examples:"]),
         (["run"], ["--width", "--height", "--duration", "--dt", "--unit", "--column", "--scale", "--restitution"]),
         (["spectrum"], ["--slenderness", "--shortest", "--longest", "--points", "--model", "--out"]),
-        (["map"], ["--pulse", "--alpha", "--frequency-ratio", "--intensity", "--points"]),
+        (["map"], ["--pulse", *PULSES, "--shape", "--alpha", "--frequency-ratio", "--intensity", "--points"]),
+        (["invert"], ["--pulse", *PULSES, "--shape", "--amplitude", "--scatter", "--prior", "--starts", "--points"]),
     ],
-    ids=["jaxrock", "run", "spectrum", "map"],
+    ids=["jaxrock", "run", "spectrum", "map", "invert"],
 )
 @pytest.mark.parametrize("option", ["--help", "-h"])
 def test_help(capsys, words, mentioned, option):
@@ -256,6 +293,7 @@ BAD = {
     "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
     "map, restitution 2": (["map", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
+    "map, shape of a sine": (["map", "--shape", "1"], "Argument `--shape` is not a parameter of the pulse sine"),
     "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), but is 2.0"),
     "map, ratio from 0": (
         ["map", "--frequency-ratio", "0", "8"],

@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxrock.motions.files.reading import STANDARD_GRAVITY, example_record, read_record
+from jaxrock.motions.files.example import example_record
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import STANDARD_GRAVITY
+from jaxrock.motions.files.reading import FORMATS, read_record
 
 SAMPLES = np.array([0.01, -0.2556093, 0.3, -0.04, 0.05, 1.06e-3, -7e-5])  # g
 
@@ -504,6 +507,35 @@ def test_a_wrong_format_raises(file, content, format, error):
 @pytest.mark.parametrize("content, size", [(AT2, 7), (V2, 10)], ids=["at2", "v2"])
 def test_content_comes_before_suffix(file, content, size, name):
     assert read_record(file(content, name)).samples.shape == (size,)
+
+
+def test_v2_may_hold_a_line_like_a_header_of_at2(file):
+    path = file("NPTS= 3, DT= .5\n" + V2)
+    np.testing.assert_array_equal(read_record(path).samples, read_record(file(V2, "a.v2")).samples)
+
+
+class Counted(AbstractFormat):
+    """A format of its own: a line COUNTED, then accelerations in g, a tenth of a second apart."""
+
+    name = "counted"
+    suffixes = (".cnt",)
+
+    def recognises(self, lines):
+        return lines[0] == "COUNTED"
+
+    def read(self, name, lines, dt, unit, column):
+        return Accelerogram(np.array([float(line) for line in lines[-2:]]), 0.1, "g", "")
+
+
+def test_another_format_is_a_line_in_the_table(file, monkeypatch):
+    monkeypatch.setitem(FORMATS, Counted.name, Counted())
+    for path, given in (("a", None), ("a.txt", "counted"), ("a.CNT", None)):
+        text = "COUNTED\n1\n2" if path == "a" else "1\n2"
+        record = read_record(file(text, path), format=given)
+        np.testing.assert_array_equal(record.samples, [1, 2])
+        assert (record.dt, record.name) == (0.1, "a")
+    with pytest.raises(ValueError, match="^Argument `format` must be one of 'at2', 'v2', 'csv', 'counted', but is"):
+        read_record(file("1"), format="smc")
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.dat", "a"])

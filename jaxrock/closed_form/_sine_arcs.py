@@ -63,20 +63,20 @@ def follow(intensity: np.ndarray, ratio: float, restitution: float) -> Lane:
     Some blocks take thousands of arcs, most only a few: those that have arrived are put aside as one goes along.
     """
     lane = start(jnp.asarray(intensity))
-    found = jax.tree.map(np.array, lane)
+    lanes = jax.tree.map(np.array, lane)
     waiting = np.arange(intensity.size)
     for _ in range(_MOST_PIECES // _PIECES):
         # Repeated to a power of 2: few lengths are compiled.
         size = max(64, 1 << (waiting.size - 1).bit_length())
         index = np.resize(waiting, size)
-        part = jax.tree.map(lambda x, index=index: x[index], found)
+        part = jax.tree.map(lambda x, index=index: x[index], lanes)
         part = _advance(part, intensity[index], jnp.full(size, ratio), jnp.full(size, restitution))
-        for whole, new in zip(jax.tree.leaves(found), jax.tree.leaves(part)):
+        for whole, new in zip(jax.tree.leaves(lanes), jax.tree.leaves(part)):
             whole[waiting] = np.asarray(new)[: waiting.size]
-        waiting = waiting[~found.done[waiting]]
+        waiting = waiting[~lanes.done[waiting]]
         if not waiting.size:
             break
-    return found
+    return lanes
 
 
 @jax.jit
@@ -116,8 +116,8 @@ def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
 
     def height(time):
         value = arc(time, lane, intensity, ratio)[0]
-        late = grounded & (time > 0)
-        return jnp.where(late, value / jnp.where(late, time, 1.0), jnp.where(grounded, lane.speed, value))
+        divided = grounded & (time > 0)
+        return jnp.where(divided, value / jnp.where(divided, time, 1.0), jnp.where(grounded, lane.speed, value))
 
     # A small hop lasts about 2 speed/restoring.
     hop = 2 * lane.speed / jnp.maximum(1 + lane.side * intensity * jnp.sin(lane.angle), 1e-30)

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from jaxrock._checks import Values, as_real, checked, positive, scalar, share
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, beside, rising
+from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.roots import search_root
 
 Real = Inexact[Array, "..."]
@@ -29,7 +30,7 @@ Number = Inexact[Array, ""]
 Fragilities = AbstractFragility | Sequence[AbstractFragility]
 
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+_NODES, _WEIGHTS = gauss_legendre(20)
 
 
 # Where `allowed_scale` looks for its factor: 20 steps a decade.

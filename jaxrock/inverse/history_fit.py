@@ -11,50 +11,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxrock._checks import Values, checked, finite, positive, put_down
-from jaxrock._parameters import check_single
+from jaxrock._checks import Values, checked, finite, positive
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
-from jaxrock.engines.diffrax.arcs import Diffrax
-from jaxrock.engines.scene import peak_bound
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.engines.taylor.careful import Series
+from jaxrock.inverse.history_scene import FittedScene, histories
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.pulses.exponential import RectangularPulse
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
-from jaxrock.responses.history import simulate
-from jaxrock.status import Status
-from jaxrock.studies.parameters import named, rebuilt
-
-_OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
-
 
 _GROWTH = 1.6  # from window to window
 
 
 _WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
-
-
-# Open intervals that parameters stay in; of a motion by the last part of their names. Those that begin at zero are
-# fitted by their logarithms: combinations that data do not tell apart are products of powers.
-_BOUNDS = {
-    **dict.fromkeys(("alpha", "alpha1", "alpha2"), (0.0, np.pi / 2)),
-    **dict.fromkeys(("restitution", "inertia_ratio"), (0.0, 1.0)),
-    "initial": (-np.pi / 2, np.pi / 2),
-    "oscillations": (1.0, np.inf),
-    **dict.fromkeys(("p", "p1", "radius_ratio", "duration", "period", "dt", "center"), (0.0, np.inf)),
-    **dict.fromkeys(("restitution1", "restitution2"), (0.0, np.inf)),
-}
-
-
-_USUAL = {
-    Block: ("alpha", "p", "restitution", "initial"),
-    AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
-}
 
 
 class HistoryStatus(eqx.Enumeration):
@@ -179,15 +151,15 @@ def fit_history(
     if np.size(rotation) == 0:
         raise ValueError("Argument `rotation` must hold measurements, but is empty.")
     spread = float(positive("spread", spread))
-    scene = _Scene.of(block, motion, model, parameters, initial, rotation, engine)
+    scene = FittedScene.of(block, motion, model, parameters, initial, rotation, engine)
     time, rotation, weight = _data(time, rotation, scatter, 2 * len(scene.names))
     places = np.arange(time.size)
 
     def at(points: np.ndarray, samples: int):
         """Weighted residuals and their derivatives in a window of the data."""
-        found, slopes, known = map(np.asarray, _histories(jnp.asarray(points), time, time[samples - 1], scene))
+        fitted, slopes, known = map(np.asarray, histories(jnp.asarray(points), time, time[samples - 1], scene))
         inside = np.where(places < samples, weight, 0.0)
-        residuals = np.where(inside > 0, (rotation - found) * inside, 0.0)
+        residuals = np.where(inside > 0, (rotation - fitted) * inside, 0.0)
         return np.where(known[:, None], residuals, np.inf), -slopes * inside[:, None]
 
     first, scale, lower, upper = scene.coordinates()
@@ -196,128 +168,8 @@ def fit_history(
         raise ValueError(f"Parameter `{outside}` can be fitted only from within its range, not from its end.")
     problem = Problem(at, scale, lower, upper)
     progression = Progression(_windows(time.size, first.size), spread, float(_noise(rotation) * np.median(weight)))
-    found = least_squares(problem, first, progression, starts, seed)
-    return _fit(scene, found, covariance(found, scale, scatter is not None), problem, rotation, weight, scatter)
-
-
-class _Scene(eqx.Module):
-    """What is simulated: what is fitted, and what is not."""
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    block: Block | AsymmetricBlock
-    motion: AbstractMotion
-    model: AbstractEquation
-    initial: tuple[Array, Array]
-    engine: AbstractEngine
-
-    @classmethod
-    def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "_Scene":
-        """Check the names, and fill in what was left open."""
-        still = RectangularPulse(0.0, 1.0)
-        check_single(block=block, motion=still if motion is None else motion)
-        names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
-        motion = still if free else motion
-        if not free and not float(peak_bound(motion)) > 0:
-            raise ValueError("Argument `motion` must move the ground; None is free rocking.")
-        allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
-        allowed += _OF_MEASUREMENT
-        unknown = [name for name in names if name not in allowed]
-        if unknown or not names or len(set(names)) < len(names):
-            wanted = f"be different names out of {', '.join(allowed)}"
-            raise ValueError(f"Argument `parameters` must {wanted}, but is {parameters!r}.")
-        if initial is None:
-            initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
-        block = _given(block, names)
-        if engine is None:
-            engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
-        return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
-
-    @property
-    def logarithmic(self) -> np.ndarray:
-        """Which parameters are fitted by their logarithms."""
-        return np.array([_BOUNDS.get(_last(name), (1.0,))[0] == 0 for name in self.names])
-
-    def coordinates(self) -> tuple[np.ndarray, ...]:
-        """Where the fit starts, natural sizes of its coordinates, and lower and upper ends of their open intervals."""
-        alpha, p, reach = *map(float, _size(self.block)), float(self._reach)
-        sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha, "shape": 1.0, "phase": 1.0}
-        known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
-        values = np.array([float(known.get(name, 0.0)) for name in self.names])
-        scale = np.array([sizes.get(_last(n), abs(x) or 1.0) for n, x in zip(self.names, values)])
-        bounds = _BOUNDS | {"delay": (-reach, reach)}
-        bounds = np.array([bounds.get(_last(name), (-np.inf, np.inf)) for name in self.names]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values, bounds = (np.where(self.logarithmic, np.log(x), x) for x in (values, bounds))
-        return values, np.where(self.logarithmic, 1.0, scale), *bounds
-
-    def values(self, point):
-        """Parameters from coordinates."""
-        return jnp.where(self.logarithmic, jnp.exp(jnp.where(self.logarithmic, point, 0.0)), point)
-
-    @property
-    def _reach(self) -> Array:
-        """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
-        return 2 / _size(self.block)[1]
-
-    def at(self, values: dict) -> tuple[Block | AsymmetricBlock, AbstractMotion, tuple]:
-        """Block, motion and initial state with other parameters."""
-        before = named(self.block, self.motion)
-        block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
-        return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
-
-    def rotation(self, point, time, until):
-        """Rotation at times up to `until`, and whether the block could be followed."""
-        values = dict(zip(self.names, self.values(point)))
-        duration = until + (self._reach if "delay" in self.names else 0.0)
-        with put_down() as checks:
-            block, motion, initial = self.at(values)
-            response = simulate(
-                block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
-            )
-            rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
-        # A verdict that is too close to call is about what comes after the data.
-        known = (response.status == Status.successful) | (response.status == Status.undecided)
-        for _, failed in checks:
-            known &= ~failed
-        return rotation + values.get("offset", 0.0), known
-
-
-def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
-    """Slenderness angle, of the weaker side, and frequency parameter."""
-    if isinstance(block, Block):
-        return block.alpha, block.p
-    return jnp.minimum(block.alpha1, block.alpha2), block.p1
-
-
-def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
-    """The block with values of its own for what is fitted, and no longer follows from the rest."""
-    if isinstance(block, Block):
-        return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
-    radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
-    fitted = "restitution1" in names or "restitution2" in names
-    law = (block.restitution1, block.restitution2) if fitted else block.law
-    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, law)
-
-
-def _last(name: str) -> str:
-    """Name of a parameter within its motion."""
-    return name.split(".")[-1]
-
-
-@jax.jit
-def _histories(points, time, until, scene: _Scene):
-    """Of every start: rotations, their derivatives by the coordinates, and whether there is a history."""
-
-    def one(point):
-        def value_twice(point):
-            rotation, known = scene.rotation(point, time, until)
-            return rotation, (rotation, known)
-
-        slopes, (rotation, known) = jax.jacfwd(value_twice, has_aux=True)(point)
-        good = known & jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(slopes))
-        return rotation, slopes, good
-
-    return jax.vmap(one)(points)
+    minimum = least_squares(problem, first, progression, starts, seed)
+    return _fit(scene, minimum, covariance(minimum, scale, scatter is not None), problem, rotation, weight, scatter)
 
 
 def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
@@ -350,21 +202,21 @@ def _noise(rotation: np.ndarray) -> float:
     return max(size, 1e-7 * float(np.max(np.abs(rotation))), 1e-300)
 
 
-def _fit(scene: _Scene, found: Minimum, spread: Covariance, problem, rotation, weight, scatter) -> HistoryFit:
+def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rotation, weight, scatter) -> HistoryFit:
     """The result in the units of the data, with what there is to warn of."""
     size = rotation.size
-    simulated = bool(np.isfinite(found.residuals).all())
+    simulated = bool(np.isfinite(minimum.residuals).all())
     # Of independent residuals the correlation of neighbours has the standard deviation size^(-1/2); of a perfect fit
     # the residuals are the rounding of the engine, which means nothing.
-    real = simulated and np.max(np.abs(found.residuals / weight)) > 1e-7 * np.max(np.abs(rotation))
+    real = simulated and np.max(np.abs(minimum.residuals / weight)) > 1e-7 * np.max(np.abs(rotation))
     correlated = real and spread.correlation > max(3 / np.sqrt(size), 0.1)
-    values = np.asarray(scene.values(found.point))
+    values = np.asarray(scene.values(minimum.point))
     by_coordinates = np.where(scene.logarithmic, values, 1.0)
     both = np.outer(by_coordinates, by_coordinates)
     block, motion, initial = scene.at(dict(zip(scene.names, jnp.asarray(values))))
     status, warnings = HistoryStatus.not_simulated, []
     if simulated:
-        status, warnings = _judged(scene, found, spread, problem, correlated, scatter)
+        status, warnings = _judged(scene, minimum, spread, problem, correlated, scatter)
     estimated = spread.scatter if scatter is None else float(np.sqrt(np.mean(1 / weight**2)))
     return HistoryFit(
         names=scene.names,
@@ -372,12 +224,12 @@ def _fit(scene: _Scene, found: Minimum, spread: Covariance, problem, rotation, w
         covariance=both * spread.independent,
         robust_covariance=both * spread.robust,
         scatter=estimated,
-        residuals=found.residuals / weight,
-        rotation=rotation - found.residuals / weight,
+        residuals=minimum.residuals / weight,
+        rotation=rotation - minimum.residuals / weight,
         correlation=spread.correlation,
         correlated=bool(correlated),
         misfit=1.0 if scatter is None else spread.scatter,
-        agreement=found.agreement,
+        agreement=minimum.agreement,
         block=block,
         motion=motion,
         initial=tuple(float(x) for x in initial),
@@ -386,9 +238,9 @@ def _fit(scene: _Scene, found: Minimum, spread: Covariance, problem, rotation, w
     )
 
 
-def _judged(scene: _Scene, found: Minimum, spread: Covariance, problem: Problem, correlated, scatter):
+def _judged(scene: FittedScene, minimum: Minimum, spread: Covariance, problem: Problem, correlated, scatter):
     """Status, and warnings in words."""
-    size, count = found.residuals.size, found.point.size
+    size, count = minimum.residuals.size, minimum.point.size
     warnings = []
     used = spread.robust if correlated else spread.independent
     variances, directions = np.linalg.eigh(used / np.outer(problem.scale, problem.scale))
@@ -409,12 +261,12 @@ def _judged(scene: _Scene, found: Minimum, spread: Covariance, problem: Problem,
         )
     if scatter is not None and abs(spread.scatter**2 - 1) > 4 * np.sqrt(2 / (size - count)):
         warnings.append(f"Residuals are {spread.scatter:.3g} times the stated scatter.")
-    if found.agreement < 0.25:
-        warnings.append(f"Only {found.agreement:.0%} of the starts came to this minimum: there may be a lower one.")
-    margin = np.minimum(found.point - problem.lower, problem.upper - found.point)
+    if minimum.agreement < 0.25:
+        warnings.append(f"Only {minimum.agreement:.0%} of the starts came to this minimum: there may be a lower one.")
+    margin = np.minimum(minimum.point - problem.lower, problem.upper - minimum.point)
     for name, near in zip(scene.names, margin < np.sqrt(np.diag(used))):
         if near:
             warnings.append(f"`{name}` is at its bound to within its standard error: its interval reaches beyond.")
     # Along what is not told a minimum is never reached.
-    status = HistoryStatus.successful if found.converged else HistoryStatus.not_converged
+    status = HistoryStatus.successful if minimum.converged else HistoryStatus.not_converged
     return status if identified else HistoryStatus.not_identified, warnings

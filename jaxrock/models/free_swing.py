@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock.numerics.elementary import exponential, sine_cosine, sine_lag, sine_ratio
+from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.numerics.roots import bracketed_root
 
 Scalar = Inexact[ArrayLike, ""]
@@ -20,10 +20,7 @@ Scalar = Inexact[ArrayLike, ""]
 
 # As many as leave an error below that of rounding in the energy: with 24, 1e-15 up to lengths of 10 (a turn 1e-4 from
 # the balance), and 1e-11 at 35, where rounding decides whether it turns at all.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-
-
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # of [0, 1]
+_NODES, _WEIGHTS = gauss_legendre_of_unit(24)
 
 
 def moment(gap: Scalar, skew: Scalar) -> Scalar:

@@ -2,13 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Inexact
 
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.numerics.gauss_legendre import gauss_legendre
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+_NODES, _WEIGHTS = gauss_legendre(6)
 
 
 _PARTS = 256  # of every smooth piece, where there are few

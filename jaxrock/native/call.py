@@ -62,10 +62,10 @@ def run(function: Callable, leaves: list, shared: list[bool], refilled: bool = F
         name = registered(part.program, [v not in own for v in part.inputs], emit_loop if is_loop else emit)
         shapes = [(*v.aval.shape, size + more) for v in part.outputs]
         results = [jax.ShapeDtypeStruct(shape, v.aval.dtype) for shape, v in zip(shapes, part.outputs)]
-        found = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
-        values.update((v, x) for v, x in zip(part.outputs, found) if not isinstance(v, Literal))
+        arrays = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
+        values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
         own.update(v for v in part.outputs if not isinstance(v, Literal))
-    return [jnp.moveaxis(x, -1, 0)[:size] for x in found]
+    return [jnp.moveaxis(x, -1, 0)[:size] for x in arrays]
 
 
 def _threads() -> int:
@@ -235,7 +235,7 @@ def _count_up(b: ir.IRBuilder, size, act: Callable):
     last = b.block
     b.cbranch(goes_on, head, after)
     b.position_at_end(after)
-    found = b.phi(_I64)
-    found.add_incoming(number, head)
-    found.add_incoming(number, last)
-    return found
+    end = b.phi(_I64)
+    end.add_incoming(number, head)
+    end.add_incoming(number, last)
+    return end

@@ -120,8 +120,8 @@ class Emitter:
             return self.known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
-            found = self._place(equation, [read(x) for x in equation.invars], active)
-            values.update(zip(equation.outvars, found))
+            results = self._place(equation, [read(x) for x in equation.invars], active)
+            values.update(zip(equation.outvars, results))
         return [read(x) for x in jaxpr.outvars]
 
     def known(self, value, dtype):
@@ -142,12 +142,12 @@ class Emitter:
         vectors = flat([x for x in inputs if not isinstance(x, Memory)])
         depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
         if depth == len(self.before):
-            found = self._apply(equation, inputs, active)
+            results = self._apply(equation, inputs, active)
         else:
             with self.b.goto_block(self.before[depth]):
-                found = self._apply(equation, inputs, active)
-        self.remember(flat([x for x in found if not isinstance(x, Memory)]), depth)
-        return found
+                results = self._apply(equation, inputs, active)
+        self.remember(flat([x for x in results if not isinstance(x, Memory)]), depth)
+        return results
 
     def remember(self, values: list, depth: int) -> None:
         """That values are made anew in so many of the loops that are being written."""
@@ -168,8 +168,8 @@ class Emitter:
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
-            found = MOVES[name](parameters, *map(boxed, inputs))
-            return [unboxed(x) for x in (found if isinstance(found, list) else [found])]
+            moved = MOVES[name](parameters, *map(boxed, inputs))
+            return [unboxed(x) for x in (moved if isinstance(moved, list) else [moved])]
         if name in SUMS and boxed(inputs[0]).size:
             array = boxed(inputs[0])
             for axis in sorted(parameters["axes"], reverse=True):
@@ -197,13 +197,13 @@ class Emitter:
         zero, last = (self.constant_of(k, index.type) for k in (0, memory.size - 1))
         index = self.b.select(self.b.icmp_signed("<", index, zero), zero, index)
         index = self.b.select(self.b.icmp_signed(">", index, last), last, index)
-        found = []
+        numbers = []
         for i in range(self.lanes):
             place = self.lane(index, i)
             place = self.b.sext(place, _I64) if place.type != _I64 else place
             place = place if memory.starts is None else self.b.add(place, memory.starts[i])
-            found.append(self.b.load(self.b.gep(memory.pointer, [place])))
-        return self.gather(found)
+            numbers.append(self.b.load(self.b.gep(memory.pointer, [place])))
+        return self.gather(numbers)
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
         """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""
@@ -224,8 +224,8 @@ class Emitter:
             goes = self.b.and_(goes, self.b.not_(leaves(going)))
         self.b.cbranch(goes, inside, after)
         self.b.position_at_end(inside)
-        found = flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
-        kept = [phi if new is phi else self.b.select(going, new, phi) for new, phi in zip(found, phis)]
+        changed = flat(self.run(parameters["body_jaxpr"], [*of_body, *state], going))
+        kept = [phi if new is phi else self.b.select(going, new, phi) for new, phi in zip(changed, phis)]
         for phi, first, later in zip(phis, firsts, kept):
             phi.add_incoming(first, before)
             phi.add_incoming(later, self.b.block)
@@ -243,10 +243,10 @@ class Emitter:
             which = self.b.icmp_signed("!=", which, self.constant_of(0, which.type))
         first, second = branches
         if first.jaxpr.eqns:
-            found = self._case(first, inputs, self.b.and_(self.b.not_(which), active), None)
+            of_first = self._case(first, inputs, self.b.and_(self.b.not_(which), active), None)
         else:
-            found = self.run(first, inputs, active)
-        return self._case(second, inputs, self.b.and_(which, active), found)
+            of_first = self.run(first, inputs, active)
+        return self._case(second, inputs, self.b.and_(which, active), of_first)
 
     def _case(self, program, inputs: list, mask, others: list | None) -> list:
         """The results of a case in the lanes of `mask`, `others` in the rest (None: whatever it is)."""
@@ -255,19 +255,19 @@ class Emitter:
         self.b.cbranch(self.any(mask), inside, after)
         self.b.position_at_end(inside)
         # What only depends on values from outside the loops goes before them, even if it is not needed there.
-        found = self.run(program, inputs, mask)
-        results = flat(found)
-        others = [ir.Constant(x.type, ir.Undefined) for x in results] if others is None else flat(others)
-        chosen = [new if new is old else self.b.select(mask, new, old) for new, old in zip(results, others)]
+        results = self.run(program, inputs, mask)
+        vectors = flat(results)
+        others = [ir.Constant(x.type, ir.Undefined) for x in vectors] if others is None else flat(others)
+        chosen = [new if new is old else self.b.select(mask, new, old) for new, old in zip(vectors, others)]
         end = self.b.block
         self.b.branch(after)
         self.b.position_at_end(after)
-        joined = [self.b.phi(x.type) for x in results]
+        joined = [self.b.phi(x.type) for x in vectors]
         for phi, new, old in zip(joined, chosen, others):
             phi.add_incoming(new, end)
             phi.add_incoming(old, before)
         self.remember(joined, len(self.before))
-        return like(found, joined)
+        return like(results, joined)
 
 
 def boxed(x) -> np.ndarray:
@@ -288,10 +288,10 @@ def _each(function: Callable, *inputs):
     if not any(isinstance(x, np.ndarray) for x in inputs):
         return function(*inputs)
     inputs = np.broadcast_arrays(*map(boxed, inputs))
-    found = np.empty(inputs[0].shape, object)
-    for place in np.ndindex(found.shape):
-        found[place] = function(*(x[place] for x in inputs))
-    return found
+    results = np.empty(inputs[0].shape, object)
+    for place in np.ndindex(results.shape):
+        results[place] = function(*(x[place] for x in inputs))
+    return results
 
 
 def flat(values: list) -> list:
@@ -303,15 +303,15 @@ def flat(values: list) -> list:
 
 def like(values: list, vectors: list) -> list:
     """Vectors and arrays like `values`, of other vectors."""
-    rest, found = iter(vectors), []
+    rest, alike = iter(vectors), []
     for value in values:
         if isinstance(value, np.ndarray):
             array = np.empty(value.shape, object)
             array.ravel()[:] = [next(rest) for _ in range(value.size)]
-            found.append(array)
+            alike.append(array)
         else:
-            found.append(next(rest))
-    return found
+            alike.append(next(rest))
+    return alike
 
 
 def is_known(equation) -> bool:

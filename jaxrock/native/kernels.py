@@ -114,8 +114,8 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
         return [b.mul(b.add(first, _I64(i)), _I64(size)) for i in range(lanes)]
 
     given = zip(jaxpr.invars, f.sources, shared, strict=True)
-    found = e.run(program, [f.argument(*each, load, starts) for each in given], e.constant(True, bool))
-    for values, target in zip(found, f.targets):
+    results = e.run(program, [f.argument(*each, load, starts) for each in given], e.constant(True, bool))
+    for values, target in zip(results, f.targets):
         for number, value in enumerate(flat([values])):
             f.store(value, target, f.place(number, first))
     b.branch(head)
@@ -206,11 +206,11 @@ class _Refilled:
     def _consts(self) -> list:
         """What stands for the constants of the loop."""
         rooms = iter([room for *_, room in self.own])
-        found = dict(self.known)
+        values = dict(self.known)
         for v in self.consts:
-            if not isinstance(v, Literal) and v not in found:
-                found[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
-        return [self.e.known(v.val, v.aval.dtype) if isinstance(v, Literal) else found[v] for v in self.consts]
+            if not isinstance(v, Literal) and v not in values:
+                values[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
+        return [self.e.known(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v] for v in self.consts]
 
     def _starts(self, size: int) -> list:
         b = self.b

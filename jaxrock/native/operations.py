@@ -63,8 +63,8 @@ def _quotient(of_rest: bool):
         huge = e.b.and_(e.b.icmp_signed("==", x, least), e.b.icmp_signed("==", y, e.b.neg(one)))
         # The processor would stop there, if only in a lane that is done.
         divisor = e.b.select(e.b.or_(none, huge), one, y)
-        found = e.b.srem(x, divisor) if of_rest else e.b.sdiv(x, divisor)
-        return e.b.select(none, x if of_rest else e.b.neg(one), found)
+        result = e.b.srem(x, divisor) if of_rest else e.b.sdiv(x, divisor)
+        return e.b.select(none, x if of_rest else e.b.neg(one), result)
 
     return operation
 
@@ -165,8 +165,8 @@ def _by(function: Callable):
 
     def operation(e, equation, *values):
         like = [jax.ShapeDtypeStruct((), v.aval.dtype) for v in equation.invars]
-        (found,) = e.run(jax.make_jaxpr(function)(*like), list(values), None)
-        return found
+        (result,) = e.run(jax.make_jaxpr(function)(*like), list(values), None)
+        return result
 
     return operation
 
@@ -254,10 +254,10 @@ def _pad(parameters, x, filling):
     if any(min(each) < 0 for each in config):
         raise Unsupported("padding that takes away")
     inner = [n + max(n - 1, 0) * between for n, (_, _, between) in zip(x.shape, config)]
-    found = np.full([low + n + high for n, (low, high, _) in zip(inner, config)], filling[()], object)
+    padded = np.full([low + n + high for n, (low, high, _) in zip(inner, config)], filling[()], object)
     places = zip(inner, config)
-    found[tuple(slice(low, low + n, between + 1) for n, (low, _, between) in places)] = x
-    return found
+    padded[tuple(slice(low, low + n, between + 1) for n, (low, _, between) in places)] = x
+    return padded
 
 
 # What moves the elements of small arrays about: functions of the parameters and NumPy arrays of vectors.

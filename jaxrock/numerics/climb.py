@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-_FARTHEST = 1.0  # a step, in the units of the points
+_LONGEST_STEP = 1.0  # in the units of the points
 
 
-_ENOUGH = 1e-4  # of the gain that the slope promises
+_SUFFICIENT = 1e-4  # of the gain that the slope promises
 
 
-_SHORTEST = 1e-9  # step below which there is a jump
+_SHORTEST_STEP = 1e-9  # below which there is a jump
 
 
 # Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
@@ -69,37 +69,37 @@ def climb(
     count, size = points.shape
     inverse = np.tile(np.eye(size), (count, 1, 1))  # of minus the Hessian
     fresh, done, arrived = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
-    ahead, step = np.zeros_like(points), np.ones(count)
+    search, step = np.zeros_like(points), np.ones(count)
     for number in range(rounds):
-        found = np.einsum("cij,cj->ci", inverse, slopes)
-        found *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(found), axis=1), 1e-300))[:, None]
-        ahead[fresh], step[fresh] = found[fresh], 1.0
-        promised = np.sum(ahead * slopes, axis=1)
+        direction = np.einsum("cij,cj->ci", inverse, slopes)
+        direction *= np.minimum(1.0, _LONGEST_STEP / np.maximum(np.max(np.abs(direction), axis=1), 1e-300))[:, None]
+        search[fresh], step[fresh] = direction[fresh], 1.0
+        promised = np.sum(search * slopes, axis=1)
         level = fresh & ~done & (promised < promise)
         arrived |= level & (values > _NOWHERE)
-        done |= level | (step < _SHORTEST)
+        done |= level | (step < _SHORTEST_STEP)
         done |= _given_up(number, points, values, group)
         if done.all():
             break
         active = np.flatnonzero(~done)
-        trial = points[active] + step[active, None] * ahead[active]
+        trial = points[active] + step[active, None] * search[active]
         higher, new = _finite(*evaluate(trial))
-        gain, asked = higher - values[active], step[active] * promised[active]
-        good = gain >= _ENOUGH * asked
+        gain, expected = higher - values[active], step[active] * promised[active]
+        good = gain >= _SUFFICIENT * expected
         fresh = np.zeros(count, bool)
         moved = active[good]
         fresh[moved] = True
         new = (new * free[active])[good]
-        inverse[moved] = _learned(inverse[moved], trial[good] - points[moved], slopes[moved] - new)
+        inverse[moved] = _bfgs(inverse[moved], trial[good] - points[moved], slopes[moved] - new)
         points[moved], values[moved], slopes[moved] = trial[good], higher[good], new
         # The parabola through both values and the slope tells where to try next.
         bad = active[~good]
-        shorter = asked[~good] / np.maximum(2 * (asked[~good] - gain[~good]), 1e-300)
+        shorter = expected[~good] / np.maximum(2 * (expected[~good] - gain[~good]), 1e-300)
         step[bad] *= np.clip(shorter, 0.1, 0.5)
     return Summits(points, values, arrived)
 
 
-def _learned(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _bfgs(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:
     """BFGS: the matrices with which the change of the slope gives the move; as they were where it is not concave."""
     product = np.sum(move * change, axis=1)
     concave = product > 1e-8 * np.linalg.norm(move, axis=1) * np.linalg.norm(change, axis=1)

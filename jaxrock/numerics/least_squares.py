@@ -15,7 +15,7 @@ _MOST_STEPS, _FEW_STEPS = 60, 8  # of the last window, and of one on the way
 _TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain in a step, below which it is the last one there
 
 
-_UNTOLD = 1e10  # variance of what the data do not tell, in squares of its natural size
+_UNDETERMINED = 1e10  # variance of what the data do not tell, in squares of its natural size
 
 
 _TO_THE_BOUND = 0.9  # share of the way to a bound that one step may go
@@ -113,7 +113,7 @@ def _descend(problem: Problem, points: np.ndarray, samples: int, hold: float, mo
     for _ in range(most):
         if done.all():
             break
-        steps, gains = _proposals(problem, points, residuals, jacobian, begun, hold, damping)
+        steps, gains = _damped_steps(problem, points, residuals, jacobian, begun, hold, damping)
         trial = _inside(problem, points, np.where(done[:, None], 0.0, steps))
         new_residuals, new_jacobian = problem.at(trial, samples)
         new_costs = cost(trial, new_residuals)
@@ -133,7 +133,7 @@ def _descend(problem: Problem, points: np.ndarray, samples: int, hold: float, mo
     return points, residuals, jacobian, done & np.isfinite(costs)
 
 
-def _proposals(problem: Problem, points, residuals, jacobian, begun, hold: float, damping):
+def _damped_steps(problem: Problem, points, residuals, jacobian, begun, hold: float, damping):
     """Damped Gauss-Newton steps, and the gains in the sum of squares that they promise."""
     slopes = np.nan_to_num(jacobian) * problem.scale
     errors = np.where(np.isfinite(residuals), residuals, 0.0)
@@ -167,9 +167,9 @@ def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> C
         return Covariance(unknown, unknown, np.inf, 0.0)
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
     floor = 1e-14 * max(values.max(), 1e-280)
-    untold = vectors[:, values <= floor]
+    undetermined = vectors[:, values <= floor]
     # However small the residuals are: they say nothing about what does not show in them.
-    unknown = _UNTOLD * np.outer(scale, scale) * (untold @ untold.T)
+    unknown = _UNDETERMINED * np.outer(scale, scale) * (undetermined @ undetermined.T)
     values = np.maximum(values, floor)
     inverse = (vectors / values) @ vectors.T
     scatter = float(np.sqrt(np.sum(residuals**2) / (size - count)))
@@ -202,7 +202,7 @@ def _correlations(residuals: np.ndarray) -> np.ndarray:
         merit = size * np.log(max(left, 1e-300)) + 2 * order  # Akaike
         if merit < best:
             best, terms = merit, combination
-    found = list(powers[: terms.size + 1])  # of no order at all: none but with itself
-    while terms.size and len(found) < size - 1 and np.max(np.abs(found[-terms.size :])) > 1e-3:
-        found.append(float(terms @ found[: -terms.size - 1 : -1]))
-    return np.array(found)
+    correlations = list(powers[: terms.size + 1])  # of no order at all: none but with itself
+    while terms.size and len(correlations) < size - 1 and np.max(np.abs(correlations[-terms.size :])) > 1e-3:
+        correlations.append(float(terms @ correlations[: -terms.size - 1 : -1]))
+    return np.array(correlations)

@@ -10,7 +10,7 @@ def pick(values: Shaped[Array, " n"], index: Int[ArrayLike, ""]) -> Shaped[Array
     """`values[index]`; of a few values by comparison, because looking up does not vectorise."""
     if values.shape[0] > _FEW:
         return values[index]
-    found = values[0]
+    value = values[0]
     for i in range(1, values.shape[0]):
-        found = jnp.where(index >= i, values[i], found)
-    return found
+        value = jnp.where(index >= i, values[i], value)
+    return value

@@ -60,9 +60,9 @@ class Kernels(NamedTuple):
 
     def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
         """So many independent places, (count, dimensions); what falls out of the box is drawn again."""
-        size, found = self.low.size, np.empty((0, self.low.size))
+        size, accepted = self.low.size, np.empty((0, self.low.size))
         shares = np.append(self.shares, self.evenly) / (self.shares.sum() + self.evenly)
-        while len(found) < count:
+        while len(accepted) < count:
             which = random.choice(shares.size, size=2 * count, p=shares)
             even = which == len(self.centres)
             which[even] = 0
@@ -70,8 +70,8 @@ class Kernels(NamedTuple):
             anywhere = random.uniform(self.low, self.high, (2 * count, size))
             places = np.where(even[:, None], anywhere, self.centres[which] + away)
             inside = ((places >= self.low) & (places <= self.high)).all(axis=1)
-            found = np.concatenate([found, places[inside]])
-        return found[:count]
+            accepted = np.concatenate([accepted, places[inside]])
+        return accepted[:count]
 
     def log_density(self, places: np.ndarray) -> np.ndarray:
         """Logarithm of the density at places in the box, (n, dimensions), but for a constant that is near zero."""
@@ -190,11 +190,11 @@ def learn(
             raise ValueError("No place was found where the density is not zero.")
         drawn = drawn.and_more(places, values, kernels)
         progress()
-        found = _efficiency(values - kernels.log_density(places)) if np.isfinite(values).any() else 0.0
+        efficiency = _efficiency(values - kernels.log_density(places)) if np.isfinite(values).any() else 0.0
         # While few points have all of the weight, it says nothing yet.
-        if found > _ENOUGH or (plain and found < _RISE * best):
+        if efficiency > _ENOUGH or (plain and efficiency < _RISE * best):
             break
-        best = max(best, found)
+        best = max(best, efficiency)
         kernels, plain = drawn.learned(random)
     return drawn
 

@@ -8,13 +8,13 @@ from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
 from jaxrock.plot.style import BLUE, RED, SAND
 
 
-def fragility(found: SimulatedFragility, fit: LogNormalFragility | None = None, axis=None):
+def fragility(simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis=None):
     """Draw the share of blocks that topple against the level of shaking, and between which bounds it is known.
 
     **Arguments:**
 
-    - `found`: result of `simulated_fragility`.
-    - `fit`: a lognormal fragility to draw over it, such as `found.fit().fragility`.
+    - `simulated`: result of `simulated_fragility`.
+    - `fit`: a lognormal fragility to draw over it, such as `simulated.fit().fragility`.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
@@ -23,28 +23,30 @@ def fragility(found: SimulatedFragility, fit: LogNormalFragility | None = None, 
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 3.6), layout="constrained")
-    levels = np.asarray(found.levels)
-    axis.plot(levels, found.lower, "o-", color=BLUE, markersize=3, linewidth=0.8, label="simulated")
-    if found.undecided:
-        axis.fill_between(levels, found.lower, found.upper, color=SAND, alpha=0.6, linewidth=0, label="undecided")
+    levels = np.asarray(simulated.levels)
+    axis.plot(levels, simulated.lower, "o-", color=BLUE, markersize=3, linewidth=0.8, label="simulated")
+    if simulated.undecided:
+        axis.fill_between(
+            levels, simulated.lower, simulated.upper, color=SAND, alpha=0.6, linewidth=0, label="undecided"
+        )
     if fit is not None:
         dense = np.geomspace(levels[0], levels[-1], 300)
         label = f"lognormal: {float(fit.median):.3g}, {float(fit.dispersion):.2g}"
         axis.plot(dense, fit(dense), color=RED, linewidth=1.2, label=label)
-    unit = {"PGA": "PGA [g]", "PGV": "PGV [m/s]"}[found.measure]
+    unit = {"PGA": "PGA [g]", "PGV": "PGV [m/s]"}[simulated.measure]
     axis.set(xscale="log", xlabel=unit, ylabel="probability to topple", ylim=(-0.02, 1.02))
     axis.legend(loc="upper left", fontsize=8, frameon=False)
     return axis
 
 
 def fragility_surface(
-    found: SimulatedSurface, fit: SurfaceFragility | None = None, axis=None, *, contours=(0.05, 0.5, 0.95)
+    simulated: SimulatedSurface, fit: SurfaceFragility | None = None, axis=None, *, contours=(0.05, 0.5, 0.95)
 ):
     """Draw the share of blocks that topple over PGV/PGA and peak acceleration, with contours.
 
     **Arguments:**
 
-    - `found`: result of `simulated_surface`. What is undecided is drawn at the middle of its bounds.
+    - `simulated`: result of `simulated_surface`. What is undecided is drawn at the middle of its bounds.
     - `fit`: a `SurfaceFragility` whose contours are drawn over it, dashed.
     - `axis`: matplotlib axis; None makes a figure. `contours`: probabilities.
 
@@ -54,8 +56,8 @@ def fragility_surface(
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 4), layout="constrained")
-    ratio, acceleration = np.asarray(found.ratio), np.asarray(found.acceleration)
-    share = (found.lower + found.upper) / 2
+    ratio, acceleration = np.asarray(simulated.ratio), np.asarray(simulated.acceleration)
+    share = (simulated.lower + simulated.upper) / 2
     picture = axis.pcolormesh(
         ratio, acceleration, share, cmap="YlOrBr", vmin=0, vmax=1, shading="nearest", rasterized=True
     )

@@ -7,12 +7,12 @@ from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
 
 
-def tornado(found: Sensitivity, result: str = "max_rotation", axis=None):
+def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis=None):
     """Draw the elasticities of one result as bars, the largest on top.
 
     **Arguments:**
 
-    - `found`: result of `sensitivity`, of one scene.
+    - `sensitivity`: result of `sensitivity`, of one scene.
     - `result`: "max_rotation", "max_velocity" or "margin".
     - `axis`: matplotlib axis; None makes a figure.
 
@@ -22,23 +22,23 @@ def tornado(found: Sensitivity, result: str = "max_rotation", axis=None):
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 3), layout="constrained")
-    elasticity = np.asarray(getattr(found, result).elasticity)
+    elasticity = np.asarray(getattr(sensitivity, result).elasticity)
     order = np.argsort(np.abs(elasticity))
-    names = [found.names[k].replace("_", " ") for k in order]
+    names = [sensitivity.names[k].replace("_", " ") for k in order]
     axis.barh(names, elasticity[order], color=[BLUE if x > 0 else RED for x in elasticity[order]], height=0.6)
     axis.axvline(0, color="black", linewidth=0.8)
     axis.set_xlabel(f"{result.replace('_', ' ')}: per cent for one per cent")
     return axis
 
 
-def sensitivity_map(found: SensitivityMap, parameter: str, result: str = "max_rotation", axis=None, *, limit=None):
+def sensitivity_map(surface: SensitivityMap, parameter: str, result: str = "max_rotation", axis=None, *, limit=None):
     """Draw the elasticity of one result by one parameter over pulse duration and uplift strength.
 
     Blocks that overturn, and responses that are not smooth there, are left grey.
 
     **Arguments:**
 
-    - `found`: result of `sensitivity_map`.
+    - `surface`: result of `sensitivity_map`.
     - `parameter`: one of its names, such as "shape" or "uplift_strength".
     - `result`: "max_rotation", "max_velocity" or "margin".
     - `axis`: matplotlib axis; None makes a figure. `limit`: end of the colour scale; None: the 98th percentile.
@@ -49,13 +49,13 @@ def sensitivity_map(found: SensitivityMap, parameter: str, result: str = "max_ro
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
-    sensitivity = found.sensitivity
+    sensitivity = surface.sensitivity
     values = np.asarray(getattr(sensitivity, result).elasticity)[..., sensitivity.names.index(parameter)]
     known = np.isfinite(values)
     if limit is None:
         limit = max(float(np.percentile(np.abs(values[known]), 98)), 1e-12) if known.any() else 1.0
     axis.set_facecolor("#d5d5d5")
-    x, y = np.asarray(found.pulse_duration), np.asarray(found.uplift_strength)
+    x, y = np.asarray(surface.pulse_duration), np.asarray(surface.uplift_strength)
     picture = axis.pcolormesh(x, y, values, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="nearest", rasterized=True)
     axis.figure.colorbar(picture, ax=axis, label="elasticity")
     axis.set_title(f"{result.replace('_', ' ')} by {parameter.replace('_', ' ')}")
@@ -63,13 +63,13 @@ def sensitivity_map(found: SensitivityMap, parameter: str, result: str = "max_ro
     return axis
 
 
-def critical(abscissa, found: Critical, axis=None):
+def critical(abscissa, ends: Critical, axis=None):
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
 
     **Arguments:**
 
     - `abscissa`: (scenes,) what the scenes differ by, such as periods [s].
-    - `found`: result of `critical_amplitudes` for many scenes.
+    - `ends`: result of `critical_amplitudes` for many scenes.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
@@ -78,18 +78,16 @@ def critical(abscissa, found: Critical, axis=None):
 
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
-    x = np.broadcast_to(np.asarray(abscissa)[:, None], found.intensity.shape)
-    there = np.isfinite(np.asarray(found.intensity))
-    rising, impacts = np.asarray(found.rising), np.asarray(found.impacts)
+    x = np.broadcast_to(np.asarray(abscissa)[:, None], ends.intensity.shape)
+    there = np.isfinite(np.asarray(ends.intensity))
+    rising, impacts = np.asarray(ends.rising), np.asarray(ends.impacts)
     kinds = (
         ("overturns above: without impact", RED, rising & (impacts == 0)),
         ("overturns above: after impacts", BLUE, rising & (impacts > 0)),
         ("safe again above", SAND, ~rising),
     )
     for name, color, kind in kinds:
-        axis.plot(
-            x[there & kind], np.asarray(found.intensity)[there & kind], ".", color=color, markersize=3, label=name
-        )
+        axis.plot(x[there & kind], np.asarray(ends.intensity)[there & kind], ".", color=color, markersize=3, label=name)
     axis.set_ylabel("intensity: amplitude/threshold")
     axis.legend(fontsize=8, frameon=False)
     return axis

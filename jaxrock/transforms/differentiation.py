@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.transforms.batching import Passes, in_lanes
-from jaxrock.transforms.deferred import late
+from jaxrock.transforms.deferred import deferred
 
 _MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
 
@@ -57,7 +57,7 @@ def differentiable(
         along = _Along(structure, moves)
         more = None if passes is None else along.passes(passes)
         both = along.value_and_jacobian(function)
-        value, jacobian = differentiable(both, passes=more, alone=along.late(both, function, leaves))(leaves)
+        value, jacobian = differentiable(both, passes=more, alone=along.deferred(both, function, leaves))(leaves)
 
         def contracted(columns):
             return sum(jnp.tensordot(c, d, axes=d.ndim) for c, d in zip(columns, changes))
@@ -112,7 +112,7 @@ class _Along(NamedTuple):
 
         return both
 
-    def late(self, both: Callable, function: Callable, leaves: list) -> Callable:
+    def deferred(self, both: Callable, function: Callable, leaves: list) -> Callable:
         """`both`, value and Jacobian, traced where it is compiled: what it returns is known from the value."""
         program, value = jax.make_jaxpr(function, return_shape=True)(self.structure.unflatten(leaves))
         if any(isinstance(x, jax.core.Tracer) for x in program.consts):
@@ -124,8 +124,8 @@ class _Along(NamedTuple):
                 return None
             return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
 
-        told = f"value and derivatives by {[int(moves) for moves in self.moves]}"
-        return late(both, program, told, (value, [of(out) for out in jax.tree.leaves(value)]))
+        description = f"value and derivatives by {[int(moves) for moves in self.moves]}"
+        return deferred(both, program, description, (value, [of(out) for out in jax.tree.leaves(value)]))
 
     def passes(self, passes: Passes) -> Passes:
         """The same in parts. Only the careful pass has derivatives, so there is no quick one."""
@@ -152,10 +152,10 @@ def _pushed(function: Callable, values: tuple, tangents: tuple):
     real, rest = eqx.partition(values, eqx.is_inexact_array)
 
     def of_real(real):
-        found, other = eqx.partition(function(*eqx.combine(real, rest)), eqx.is_inexact_array)
-        return found, other
+        return eqx.partition(function(*eqx.combine(real, rest)), eqx.is_inexact_array)
 
-    found, pushed, other = jax.vmap(lambda d: jax.jvp(of_real, (real,), (d,), has_aux=True), out_axes=(None, 0, None))(
-        tangents
-    )
-    return eqx.combine(found, other), pushed
+    def along(tangents):
+        return jax.jvp(of_real, (real,), (tangents,), has_aux=True)
+
+    results, pushed, other = jax.vmap(along, out_axes=(None, 0, None))(tangents)
+    return eqx.combine(results, other), pushed

@@ -15,7 +15,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
@@ -36,6 +35,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.status import Status
 from jaxrock.transforms.branches import either
 from jaxrock.transforms.differentiation import differentiable
@@ -49,7 +49,7 @@ Flag = Bool[ArrayLike, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 
-_GAUSS = tuple(w / 2 for w in (np.polynomial.legendre.leggauss(12)[0] + 1, np.polynomial.legendre.leggauss(12)[1]))
+_GAUSS = gauss_legendre_of_unit(12)
 
 
 _ADJOINTS = {

@@ -1,4 +1,5 @@
 """Accelerograms in files: one module for each format, and `reading`, which finds the format and reads.
 
-Imports `motions.record`. Start with `reading`; another format is a module like `at2`, and its line in `reading`.
+Imports `motions.record`. Start with `format`, then `reading`; another format is a module like `at2`, and its line in
+the table of `reading`.
 """

@@ -1,0 +1,109 @@
+"""The formulas of D&D (see `sine_pulse`) for arrays of one shape, as they are shared; nothing is checked here.
+
+`a` is the intensity, `w` the frequency ratio, `e` the restitution.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact
+
+from jaxrock._checks import checked, elementwise, positive, share
+from jaxrock.closed_form import _sine_arcs as arcs
+from jaxrock.numerics.roots import bracketed_root
+
+Real = Inexact[ArrayLike, "..."]
+Result = Float[Array, "..."]
+
+
+def _above_one(name, value):
+    return checked(name, value, "be greater than 1 (the block uplifts)", lambda x: (x > 1) & (x < np.inf))
+
+
+# Of the public functions: arguments are checked by these names, and broadcast.
+elementwise_in_sine = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=share)
+
+
+def end_of_pulse(a: Array, w: Array) -> Array:
+    """p T_ex: when the pulse ends."""
+    return (2 * jnp.pi - arcs.uplift_phase(a)) / w
+
+
+def series_constants(a: Array, w: Array) -> tuple[Array, ...]:
+    """A0*, B0*, C0*, omega, p T_ex; D&D 3.9."""
+    slope = jnp.sqrt((a - 1) * (a + 1))
+    return w * (w + slope) / (w**2 + 1), w * (w - slope) / (w**2 + 1), 2 * a / (w**2 + 1), w, end_of_pulse(a, w)
+
+
+def free_coordinates(A0, B0, C0, w, end) -> tuple[Array, Array]:
+    """1 - |rotation| +- velocity at the end of the pulse: the factors of D0*, each with its exponential."""
+    return A0 * jnp.exp(-end) - w * C0 / 2, B0 * jnp.exp(end) + w * C0 / 2
+
+
+def coordinate_product(a: Array, w: Array) -> Array:
+    """D0*; D&D 3.9, first line."""
+    decaying, growing = free_coordinates(*series_constants(a, w))
+    return decaying * growing
+
+
+def no_impact(w: Array) -> Array:
+    """The intensity from which on a block overturns without impact; D&D 3.10."""
+
+    def excess(slope, w):
+        a = jnp.sqrt(1 + slope**2)
+        return slope - w - a * jnp.exp(-(2 * jnp.pi - jnp.arctan2(1.0, slope)) / w)
+
+    decay = jnp.exp(-1.5 * jnp.pi / w)
+    # (1 - decay) slope is at most omega + decay, because psi is at most pi/2
+    slope = bracketed_root(excess, w, (w + decay) / -jnp.expm1(-1.5 * jnp.pi / w), w)
+    return jnp.sqrt(1 + slope**2)
+
+
+def impact_at_end(w: Array) -> Array:
+    """The intensity at which the first impact comes just as the pulse ends; D&D 3.31."""
+
+    def excess(logarithm, w):
+        missing = jnp.exp(logarithm)
+        slope = w - missing
+        side = 1 + w**2 + jnp.sqrt(1 + (2 + slope**2) * w**2)
+        return logarithm + (2 * jnp.pi - jnp.arctan2(1.0, slope)) / w - jnp.log(side / w)
+
+    # The slope is near omega where omega is small: what is missing is found by its logarithm.
+    lowest = jnp.log((1 + w**2) / w) - 2 * jnp.pi / w - 1
+    missing = jnp.exp(bracketed_root(excess, lowest, jnp.log(w), w))
+    return jnp.sqrt(1 + (w - missing) ** 2)
+
+
+def first_excursion(time: Array, a: Array, w: Array) -> tuple[Array, Array]:
+    """Opening and speed of the first excursion; D&D 3.4."""
+    return arcs.arc(time, arcs.start(a), a, w)
+
+
+def impact_during_pulse(a: Array, w: Array) -> Array:
+    """First root of D&D 3.21: the block can only fall after the driving stretch, and then falls once."""
+    lower = (jnp.pi - 2 * arcs.uplift_phase(a)) / w
+    return bracketed_root(lambda t, a, w: first_excursion(t, a, w)[0], lower, end_of_pulse(a, w), a, w)
+
+
+def growth_after_impact(a: Array, w: Array, e: Array, time: Array, jump: bool = False) -> Array:
+    """Left minus right side of D&D 3.20, over 2 e^(p T_ex - time): positive where one impact overturns."""
+    A0, B0, C0, _, end = series_constants(a, w)
+    angle = w * time + arcs.uplift_phase(a)
+    if jump:  # 3.22 as it stands: an approximate time is not a zero of the rotation
+        twice_speed = B0 * jnp.exp(time) - A0 * jnp.exp(-time) + C0 * w * jnp.cos(angle)
+    else:
+        twice_speed = -2 * first_excursion(time, a, w)[1]
+    after = e * twice_speed + C0 * (w * jnp.exp(time - end) - w * jnp.cos(angle) - jnp.sin(angle)) - 2
+    return after / 2
+
+
+def approximate_impact(a: Array, w: Array) -> Array:
+    """D&D 3.29, with kappa and lambda of 3.26."""
+    A0, B0, C0, _, _ = series_constants(a, w)
+    angle = w + arcs.uplift_phase(a)
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    falling = A0 - C0 * jnp.e * w / 2 * (cosine + w * sine)
+    rising = B0 + C0 * w / (2 * jnp.e) * (cosine - w * sine)
+    offset = 1 - a * sine
+    square = offset**2 - falling * rising
+    ratio = (offset + jnp.sqrt(jnp.maximum(square, 0.0))) / rising
+    return jnp.where((square >= 0) & (ratio > 0), jnp.log(jnp.where(ratio > 0, ratio, 1.0)), jnp.nan)

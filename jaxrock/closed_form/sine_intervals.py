@@ -1,0 +1,125 @@
+"""Every interval of intensity that overturns a block under one cycle of a sine; terms as in `sine_pulse`."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxrock._checks import positive, share
+from jaxrock.closed_form import _sine_arcs as arcs
+from jaxrock.closed_form.sine_limits import after_pulse_limits, impact_time_limit, no_impact_limit
+
+_MOST_DROP = 8  # impacts lost from one sample to the next, where turns are sought one by one
+
+
+class OverturningIntervals(eqx.Module):
+    """The intensities that overturn a block, from the lowest: everything between `lower` and `upper`.
+
+    - `impacts`: before overturning, in the middle of the interval.
+    Without loss (restitution 1) the safe gap below the last interval closes, and it touches the one before.
+    - `searched_from`: below this intensity nothing was searched.
+    """
+
+    lower: Float[np.ndarray, " n"]
+    upper: Float[np.ndarray, " n"]
+    impacts: Int[np.ndarray, " n"]
+    searched_from: float
+
+
+def overturning_intervals(
+    frequency_ratio: float, restitution: float, *, searched_from: float = 1.0001, points: int = 4096
+) -> OverturningIntervals:
+    """Every interval of intensity that overturns a block, the islands with 3, 5, 7... impacts included.
+
+    **Arguments:**
+
+    - `frequency_ratio`: omega_g/p, positive. `restitution`: in [0, 1].
+    - `searched_from`: lowest intensity searched, above 1.
+    - `points`: samples of the search below `impact_time_limit`. Narrower islands and gaps are found where the number
+      of impacts changes with them, as it did wherever this was checked.
+
+    **Returns:** `OverturningIntervals`; the ends are roots to rounding.
+
+    **Source:** D&D 3.10, 3.18, 3.20 and, for more impacts, the same condition after each arc in closed form; what
+    the paper calls complete covers frequency ratios above 1.05 only.
+    """
+    ratio = float(positive("frequency_ratio", frequency_ratio))
+    restitution = float(share("restitution", restitution))
+    limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
+    samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
+    values, impacts = _at(samples, ratio, restitution)
+    # Where the number of impacts changes there is an island or a gap, however narrow; else it is near an extreme.
+    turns = _impact_turns(samples, impacts, ratio, restitution)
+    step = (limit - searched_from) / points * np.linspace(-1, 1, 129)
+    more = [turns, _inside(turns, samples[1] - samples[0]), (samples[_near_zero(values), None] + step).ravel()]
+    more = np.clip(np.concatenate(more), searched_from, samples[-1])
+    samples, order = np.unique(np.concatenate([samples, more]), return_index=True)
+    values = np.concatenate([values, _at(more, ratio, restitution)[0]])[order]
+    lost = values > 0
+    change = np.flatnonzero(lost[1:] != lost[:-1])
+
+    def unchanged(points):
+        return (_at(points, ratio, restitution)[0] > 0) == lost[change][:, None]
+
+    ends = sum(_narrowed(samples[change], samples[change + 1], unchanged, 17)) / 2
+    lower, upper = list(ends[~lost[change]]), list(ends[lost[change]])
+    if lost[0]:
+        lower.insert(0, searched_from)
+    begins, stops = (float(x) for x in after_pulse_limits(ratio, restitution))
+    if lost[-1]:
+        upper.append(stops if np.isfinite(stops) else limit)
+    elif np.isfinite(stops):
+        lower.append(begins)
+        upper.append(stops)
+    middle = np.minimum((np.array(lower) + np.array(upper)) / 2, np.nextafter(last, 0))
+    impacts = _at(middle, ratio, restitution)[1]
+    return OverturningIntervals(
+        np.array([*lower, last]), np.array([*upper, np.inf]), np.array([*impacts, 0]), float(searched_from)
+    )
+
+
+def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) -> np.ndarray:
+    """Both sides of the intensities at which the number of impacts falls, each to rounding."""
+    drop = impacts[:-1] - impacts[1:]
+    pairs = np.flatnonzero((drop > 0) & (drop <= _MOST_DROP))
+    levels = [(i, level) for i in pairs for level in range(impacts[i + 1], impacts[i])]
+    if not levels:
+        return np.zeros(0)
+    index, level = np.array(levels).T
+
+    def more(points):
+        return _at(points, ratio, restitution)[1] > level[:, None]
+
+    return np.unique(np.concatenate(_narrowed(samples[index], samples[index + 1], more, 9)))
+
+
+def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarray, np.ndarray]:
+    """`growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
+    if not points.size:
+        return np.zeros(points.shape), np.zeros(points.shape, int)
+    end = arcs.follow(points.ravel(), ratio, restitution)
+    directly = end.opening + end.speed > 1
+    return arcs.growth(end, restitution).reshape(points.shape), (end.impacts + ~directly).reshape(points.shape)
+
+
+def _narrowed(below, above, like_below, levels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Brackets of a change, each cut into 9 at every level."""
+    rows = np.arange(below.size)
+    for _ in range(levels):
+        grid = below[:, None] + (above - below)[:, None] * np.linspace(0, 1, 10)
+        first = np.cumprod(like_below(grid[:, 1:-1]), axis=1).sum(axis=1)
+        below, above = grid[rows, first], grid[rows, first + 1]
+    return below, above
+
+
+def _inside(turns: np.ndarray, widest: float) -> np.ndarray:
+    """Samples between neighbouring turns that lie within one step of the search."""
+    gaps = np.diff(turns)
+    narrow = gaps < widest
+    return (turns[:-1, None] + gaps[:, None] * np.linspace(0, 1, 33)[1:-1])[narrow].ravel()
+
+
+def _near_zero(values: np.ndarray) -> np.ndarray:
+    """Samples that are local extremes towards zero."""
+    size, sign = np.abs(values), np.sign(values)
+    lowest = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < 0.3)
+    return 1 + np.flatnonzero(lowest & (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:]))

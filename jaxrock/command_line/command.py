@@ -1,0 +1,20 @@
+"""What a command of `jaxrock` must tell: its name, what it is for, its options, and what it does."""
+
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Command(NamedTuple):
+    """One command.
+
+    - `name`: its word; `purpose`: one line of help.
+    - `add_options`: adds to a parser what only this command has; all have `--model` and `--out`.
+    - `run`: does it and prints; the exit status, 0 good or 1 not computed. **Raises:** ValueError or OSError for
+      input that is bad, before anything is written.
+    """
+
+    name: str
+    purpose: str
+    add_options: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]

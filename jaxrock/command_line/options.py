@@ -1,0 +1,100 @@
+"""Options that several commands have, and what they stand for."""
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from inspect import Parameter, signature
+from typing import Any
+
+import jaxrock as rk
+from jaxrock.motions.pulses import PULSES
+from jaxrock.motions.pulses.pulse import AbstractPulse
+
+
+def model_of(arguments: argparse.Namespace) -> rk.AbstractEquation:
+    """The equation of motion."""
+    return rk.Linear() if arguments.model == "linear" else rk.Housner()
+
+
+def add_restitution(parser: argparse.ArgumentParser) -> None:
+    """Option of the block's restitution."""
+    parser.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
+
+
+def add_record(parser: argparse.ArgumentParser) -> None:
+    """A record, and options for files that do not say all."""
+    parser.add_argument("record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)")
+    parser.add_argument("--dt", type=float, help="time between samples [s], for files that do not say")
+    parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
+    parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
+    parser.add_argument("--scale", type=float, default=1.0, help="factor on the acceleration (default 1)")
+
+
+def record_of(arguments: argparse.Namespace) -> rk.Record:
+    """The record that was asked for, scaled."""
+    if arguments.record is None:
+        for option in ("dt", "unit", "column"):
+            if getattr(arguments, option) is not None:
+                raise ValueError(f"Option --{option} describes a file, but no RECORD is given.")
+        record = rk.example_record()
+    else:
+        record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
+    return rk.Record(record.samples * arguments.scale, record.dt, record.name)
+
+
+def extent_of(pulse: type[AbstractPulse]) -> str:
+    """What a pulse calls its second parameter, after the amplitude: "period" or "duration"."""
+    return list(signature(pulse).parameters)[1]
+
+
+def other_parameters(pulse: type[AbstractPulse]) -> dict[str, Any]:
+    """Defaults of a pulse's parameters beyond amplitude and period or duration, by name.
+
+    `Parameter.empty` for one that has none.
+    """
+    return {name: parameter.default for name, parameter in list(signature(pulse).parameters.items())[2:]}
+
+
+def add_pulse(parser: argparse.ArgumentParser) -> None:
+    """Options of a pulse: which, and its parameters beyond amplitude and period or duration, of every pulse."""
+    parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="shape of the pulse (default sine)")
+    meant, kinds = {}, {}
+    for word, pulse in PULSES.items():
+        for name, default in other_parameters(pulse).items():
+            default = 0.0 if default is Parameter.empty else default
+            shown = default if isinstance(default, str) else "its own" if default is None else f"{default:g}"
+            meant.setdefault(name, []).append(f"{word} (default {shown})")
+            kinds[name] = str if isinstance(default, str) else float
+    for name, words in meant.items():
+        parser.add_argument(_option(name), type=kinds[name], help=f"of the pulse {', '.join(words)}")
+
+
+def pulse_of(arguments: argparse.Namespace) -> Callable[..., AbstractPulse]:
+    """What makes the pulse from amplitude [g] and period or duration [s]."""
+    pulse = PULSES[arguments.pulse]
+    parameters = other_parameters(pulse)
+    fixed = {name: 0.0 for name, default in parameters.items() if default is Parameter.empty}
+    for name in {name for each in PULSES.values() for name in other_parameters(each)}:
+        value = getattr(arguments, name)
+        if value is not None and name not in parameters:
+            raise ValueError(f"Argument `{_option(name)}` is not a parameter of the pulse {arguments.pulse}.")
+        if value is not None:
+            fixed[name] = value
+    return partial(pulse, **fixed) if fixed else pulse
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def check_points(points: int, least: int) -> None:
+    """There are so many points, or more."""
+    if points < least:
+        raise ValueError(f"Argument `--points` must be at least {least}, but is {points}.")
+
+
+def check_range(option: str, ends) -> None:
+    """Both ends of a range are positive, finite and in order."""
+    low, high = ends
+    if not 0 < low <= high < float("inf"):
+        raise ValueError(f"Argument `{option}` must be positive, finite and in order, but is {low:g} to {high:g}.")

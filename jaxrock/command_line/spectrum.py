@@ -1,0 +1,50 @@
+"""The command `jaxrock spectrum`: the rocking spectrum of a record."""
+
+import argparse
+
+import numpy as np
+
+import jaxrock as rk
+from jaxrock.command_line.command import Command
+from jaxrock.command_line.options import add_record, add_restitution, check_points, check_range, model_of, record_of
+from jaxrock.command_line.output import save, status_of_surface, table, write_csv
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--slenderness", type=float, default=5.0, help="height/width of the blocks (default 5)")
+    parser.add_argument("--shortest", type=float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
+    parser.add_argument("--longest", type=float, default=8.0, help="longest 2 pi/p [s] (default 8)")
+    parser.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
+    add_restitution(parser)
+    add_record(parser)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    check_points(arguments.points, 1)
+    if not arguments.slenderness > 0:
+        raise ValueError(f"Argument `--slenderness` must be positive, but is {arguments.slenderness}.")
+    check_range("--shortest, --longest", (arguments.shortest, arguments.longest))
+    record = record_of(arguments)
+    period = np.linspace(arguments.shortest, arguments.longest, arguments.points)
+    alpha = np.arctan(1 / arguments.slenderness)
+    result = rk.rocking_spectrum(alpha, record, period, arguments.restitution, model_of(arguments))
+    lost = np.asarray(result.overturned)
+    longest = (f"{period[lost].max():.3f}", "s") if lost.any() else ("none", "")
+    rows = [
+        ("slenderness, height/width", f"{arguments.slenderness:g}", ""),
+        ("block sizes", f"{period.size}", ""),
+        ("of these overturn", f"{int(lost.sum())}", ""),
+        ("longest 2 pi/p that overturns", *longest),
+        ("not computed", f"{int(np.sum(~np.asarray(result.status == rk.Status.successful)))}", ""),
+    ]
+    print(f"{record.name or 'unnamed record'}\n{table(rows)}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
+    write_csv(arguments.out / "spectrum.csv", header, period, result.max_rotation, result.max_velocity,
+              result.impact_count, lost, result.margin)  # fmt: skip
+    print(f"wrote {arguments.out / 'spectrum.csv'}")
+    save(rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
+    return status_of_surface(result.status)
+
+
+SPECTRUM = Command("spectrum", "rocking spectrum of a record: peak response against block size", _add_options, _run)

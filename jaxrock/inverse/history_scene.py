@@ -1,0 +1,165 @@
+"""What a fit to a measured history simulates: the scene, and the coordinates in which its parameters are fitted."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxrock._checks import put_down
+from jaxrock._parameters import Parameter, check_single
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.diffrax.arcs import Diffrax
+from jaxrock.engines.scene import peak_bound
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.taylor.careful import Series
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.exponential import RectangularPulse
+from jaxrock.responses.history import simulate
+from jaxrock.status import Status
+from jaxrock.studies.parameters import declarations, named, rebuilt
+
+_OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
+
+
+_USUAL = {
+    Block: ("alpha", "p", "restitution", "initial"),
+    AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
+}
+
+
+class FittedScene(eqx.Module):
+    """Block, motion and measurement as they are simulated, and the `names` of those parameters that are fitted."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    block: Block | AsymmetricBlock
+    motion: AbstractMotion
+    model: AbstractEquation
+    initial: tuple[Array, Array]
+    engine: AbstractEngine
+
+    @classmethod
+    def of(cls, block, motion, model, parameters, initial, rotation, engine) -> "FittedScene":
+        """Check the names, and fill in what was left open."""
+        still = RectangularPulse(0.0, 1.0)
+        check_single(block=block, motion=still if motion is None else motion)
+        names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
+        motion = still if free else motion
+        if not free and not float(peak_bound(motion)) > 0:
+            raise ValueError("Argument `motion` must move the ground; None is free rocking.")
+        allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
+        allowed += _OF_MEASUREMENT
+        unknown = [name for name in names if name not in allowed]
+        if unknown or not names or len(set(names)) < len(names):
+            wanted = f"be different names out of {', '.join(allowed)}"
+            raise ValueError(f"Argument `parameters` must {wanted}, but is {parameters!r}.")
+        if initial is None:
+            initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
+        block = _given(block, names)
+        if engine is None:
+            engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
+        return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
+
+    @property
+    def logarithmic(self) -> np.ndarray:
+        """Which parameters are fitted by their logarithms."""
+        return self._ends[:, 0] == 0
+
+    @property
+    def _ends(self) -> np.ndarray:
+        """Open intervals that parameters stay in. Those that begin at zero are fitted by their logarithms: combinations
+        that data do not tell apart are products of powers."""
+        known = {name: (one.range.low, one.range.high) for name, one in self._declared.items()}
+        known |= {"initial": (-np.pi / 2, np.pi / 2), "delay": (-float(self._reach), float(self._reach))}
+        return np.array([known.get(name, (-np.inf, np.inf)) for name in self.names])
+
+    @property
+    def _declared(self) -> dict[str, Parameter]:
+        return declarations(self.block, self.motion)
+
+    def _size(self, name: str, value: float) -> float:
+        """Natural size of a parameter: its value, but of angles and numbers that may be zero."""
+        known = self._declared.get(name)
+        if known is not None and known.axes is not None and known.unit in ("-", "rad") and known.range.low < 0:
+            return 1.0
+        return abs(value) or 1.0
+
+    def coordinates(self) -> tuple[np.ndarray, ...]:
+        """Where the fit starts, natural sizes of its coordinates, and lower and upper ends of their open intervals."""
+        alpha, p = map(float, _size(self.block))
+        sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha}
+        known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
+        values = np.array([float(known.get(name, 0.0)) for name in self.names])
+        scale = np.array([sizes.get(n) or self._size(n, x) for n, x in zip(self.names, values)])
+        bounds = self._ends.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values, bounds = (np.where(self.logarithmic, np.log(x), x) for x in (values, bounds))
+        return values, np.where(self.logarithmic, 1.0, scale), *bounds
+
+    def values(self, point):
+        """Parameters from coordinates."""
+        return jnp.where(self.logarithmic, jnp.exp(jnp.where(self.logarithmic, point, 0.0)), point)
+
+    @property
+    def _reach(self) -> Array:
+        """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
+        return 2 / _size(self.block)[1]
+
+    def at(self, values: dict) -> tuple[Block | AsymmetricBlock, AbstractMotion, tuple]:
+        """Block, motion and initial state with other parameters."""
+        before = named(self.block, self.motion)
+        block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
+        return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
+
+    def rotation(self, point, time, until):
+        """Rotation at times up to `until`, and whether the block could be followed."""
+        values = dict(zip(self.names, self.values(point)))
+        duration = until + (self._reach if "delay" in self.names else 0.0)
+        with put_down() as checks:
+            block, motion, initial = self.at(values)
+            response = simulate(
+                block, motion, self.model, initial=initial, duration=duration, engine=self.engine, samples=2
+            )
+            rotation, _ = response(jnp.clip(time - values.get("delay", 0.0), 0.0, duration))
+        # A verdict that is too close to call is about what comes after the data.
+        known = (response.status == Status.successful) | (response.status == Status.undecided)
+        for _, failed in checks:
+            known &= ~failed
+        return rotation + values.get("offset", 0.0), known
+
+
+def _size(block: Block | AsymmetricBlock) -> tuple[Array, Array]:
+    """Slenderness angle, of the weaker side, and frequency parameter."""
+    if isinstance(block, Block):
+        return block.alpha, block.p
+    return jnp.minimum(block.alpha1, block.alpha2), block.p1
+
+
+def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | AsymmetricBlock:
+    """The block with values of its own for what is fitted, and no longer follows from the rest."""
+    if isinstance(block, Block):
+        return Block(block.alpha, block.p, block.restitution) if "restitution" in names else block
+    radii = block.radius_ratio if "radius_ratio" in names else block.given_radius_ratio
+    fitted = "restitution1" in names or "restitution2" in names
+    law = (block.restitution1, block.restitution2) if fitted else block.law
+    return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, law)
+
+
+@jax.jit
+def histories(points, time, until, scene: FittedScene):
+    """Of every start: rotations, their derivatives by the coordinates, and whether there is a history."""
+
+    def one(point):
+        def value_twice(point):
+            rotation, known = scene.rotation(point, time, until)
+            return rotation, (rotation, known)
+
+        slopes, (rotation, known) = jax.jacfwd(value_twice, has_aux=True)(point)
+        good = known & jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(slopes))
+        return rotation, slopes, good
+
+    return jax.vmap(one)(points)

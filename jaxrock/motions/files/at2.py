@@ -1,0 +1,64 @@
+"""AT2, the format of the database of PEER: a header with NPTS and DT, then samples."""
+
+import re
+
+from jaxrock._text import file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
+
+_UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)", re.IGNORECASE)
+
+
+_COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
+
+
+_STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})", re.IGNORECASE)
+
+
+_BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
+
+
+# Printed numbers may touch, but only a sign tells where the next begins: 1.234562.34567 is refused.
+_NUMBERS = re.compile(rf"\s*{NUMBER}(?:(?:\s+|(?=[-+])){NUMBER})*\s*")
+
+
+class AT2(AbstractFormat):
+    """PEER AT2."""
+
+    name = "at2"
+    suffixes = (".at2",)
+
+    def recognises(self, lines):
+        return any(_counts(line) for line in lines if not line.lstrip().startswith("#"))
+
+    def read(self, name, lines, dt, unit, column):
+        if column is not None:
+            one = f"AT2 file `{name}` has one record"
+            raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+        last = next((number for number, line in enumerate(lines) if _counts(line)), None)
+        if last is None:
+            raise file_error(name, "no header line states NPTS and DT, as an AT2 file must.")
+        count, step = _counts(lines[last])
+        dt = agreed_step(name, dt, step)
+        at = next((number for number in range(last + 1) if _UNIT.search(lines[number])), None)
+        unit = agreed_unit(name, (at or 0) + 1, unit, "" if at is None else _UNIT.search(lines[at])[1])
+        samples = announced_samples(name, lines, last + 1, count, _numbers)
+        # Event, station and component stand above the unit; the first line only names the database.
+        title = " ".join(lines[at - 1].split()) if at is not None and at >= 2 else ""
+        return Accelerogram(samples, dt, unit, title)
+
+
+def _counts(line: str) -> tuple[int, float] | None:
+    """The number of samples and the time step in a header line [s]."""
+    count, step = _COUNT.search(line), _STEP.search(line)
+    if count and step:
+        return int(count[1]), to_float(step[1])
+    before = _BEFORE.match(line)
+    return (int(before[1]), to_float(before[2])) if before else None
+
+
+def _numbers(line: str) -> list[float] | None:
+    """The numbers in a line, or None if it holds anything else; they may touch before a sign."""
+    if not _NUMBERS.fullmatch(line):
+        return None
+    return [to_float(text) for text in re.findall(NUMBER, line)]

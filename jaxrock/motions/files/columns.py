@@ -1,0 +1,112 @@
+"""Columns of text, separated by commas, semicolons, tabs or blanks, with or without times and lines of a header."""
+
+import re
+
+import numpy as np
+
+from jaxrock._text import file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, to_float
+
+_FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
+
+
+class Columns(AbstractFormat):
+    """Columns of text: what a file is taken for that is of no format with a header.
+
+    **Arguments:**
+
+    - `with_headers`: those formats, which the message names for a file that holds no columns.
+    """
+
+    name = "csv"
+
+    def __init__(self, with_headers: tuple[AbstractFormat, ...]):
+        self.with_headers = with_headers
+
+    def recognises(self, lines):
+        return False  # any text may be columns
+
+    def read(self, name, lines, dt, unit, column):
+        table, numbers, printed = _table(name, lines)
+        if not numbers:
+            others = " nor ".join(each.name.upper() for each in self.with_headers)
+            raise file_error(name, f"no line holds columns of numbers, and it is neither {others}.")
+        width = table.shape[1]
+        if column is None and width > 2 or column is not None and column >= width:
+            allowed = f"be 0 to {width - 1}, the column of accelerations in text file `{name}`"
+            raise ValueError(f"Argument `column` must {allowed}, but is {column}.")
+        if unit is None:
+            allowed = "be 'g', 'm/s2' or 'cm/s2'"
+            raise ValueError(f"Argument `unit` must {allowed} for text file `{name}`, which states none, but is None.")
+        chosen = width - 1 if column is None else column
+        times = table[:, 0]
+        # Beside `column` and `dt`, column 0 may hold accelerations too; only times never fall.
+        rising = times[-1] > times[0] and (np.diff(times) >= 0).all()
+        if chosen > 0 and (column is None or dt is None or rising):
+            dt = agreed_step(name, dt, _step(name, times, numbers, printed))
+        if dt is None:
+            raise ValueError(f"Argument `dt` must be given for text file `{name}`, which has no times, but is None.")
+        return Accelerogram(table[:, chosen], dt, unit, "")
+
+
+def _fields(line: str) -> list[str]:
+    """The fields of a line of columns."""
+    # Beside semicolons, commas are decimal: such numbers are refused, not parted.
+    separator = next((mark for mark in ";," if mark in line), None)
+    fields = [field.strip() for field in line.split(separator)]
+    return fields[:-1] if not fields[-1] else fields
+
+
+def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str]]:
+    """The numbers in columns of text, the line number of each row, and its first field as written."""
+    rows, numbers, first = [], [], []
+    for number, line in enumerate(lines, 1):
+        line = line.split("#")[0].strip()
+        fields = _fields(line) if line else []
+        if not fields:
+            continue
+        if not all(_FIELD.fullmatch(field) for field in fields):
+            if rows:
+                raise file_error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
+            if LIKE_DATA.match(line):
+                hint = "if it belongs to a header, let it start with #"
+                raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
+            continue
+        row = [to_float(field) if field[-1].isdigit() or field[-1] == "." else np.nan for field in fields]
+        if not np.isfinite(row).all():
+            raise file_error(name, f"line {number} holds a number that is not finite: {line[:60]!r}.")
+        if rows and len(row) != len(rows[0]):
+            columns = "columns" if len(row) > 1 else "column"
+            raise file_error(name, f"line {number} has {len(row)} {columns}, but line {numbers[0]} has {len(rows[0])}.")
+        rows.append(row)
+        numbers.append(number)
+        first.append(fields[0])
+    return np.array(rows), numbers, first
+
+
+def _rounding(times: np.ndarray, printed: list[str]) -> float:
+    """By how much times may be off through rounding: one in the last digit, and single precision [s]."""
+    digits = max(len(re.sub(r"[ED].*|[-+.]", "", text.upper()).lstrip("0")) for text in printed)
+    largest = np.abs(times).max()
+    return 10.0 ** (np.floor(np.log10(largest)) + 1 - digits) + 1e-7 * largest
+
+
+def _step(name: str, times: np.ndarray, numbers: list[int], printed: list[str]) -> float:
+    """The time step of equally spaced times [s]."""
+    if times.size < 2:
+        raise file_error(name, "has one row only, so its times give no time step.")
+    step = (times[-1] - times[0]) / (times.size - 1)
+    if not step > 0:
+        raise file_error(name, "the times in column 0 do not increase.")
+    # Where rounding is half a step, to allow for it would hide a missing row.
+    rounding = _rounding(times, printed)
+    rounding = rounding if rounding < 0.45 * step else 0.0
+    slack = 1e-3 * step
+    steps, drift = np.diff(times), times - times[0] - step * np.arange(times.size)
+    if np.abs(drift).max() > slack + rounding or np.abs(steps - step).max() > 2 * slack + rounding:
+        usual = np.median(steps)
+        worst = int(np.abs(steps - usual).argmax())
+        where = f"{steps[worst]:g} s before line {numbers[worst + 1]}, but {usual:g} s elsewhere"
+        raise file_error(name, f"the times in column 0 are not equally spaced: {where}.")
+    return float(f"{step:.12g}")  # 0.01, not 0.010000000000000002

@@ -1,0 +1,46 @@
+"""What every format of accelerograms must tell the reader."""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Accelerogram(NamedTuple):
+    """What a file holds of one accelerogram: samples in `unit`, one of `parsing.PER_G`, and a title, perhaps empty."""
+
+    samples: Float[np.ndarray, " n"]
+    dt: float
+    unit: str
+    title: str
+
+
+class AbstractFormat(abc.ABC):
+    """A format of accelerograms.
+
+    - `name`: its word in `read_record(format=...)`.
+    - `suffixes`: of file names, in lower case, that tell the format where the content does not.
+    """
+
+    name: ClassVar[str]
+    suffixes: ClassVar[tuple[str, ...]] = ()
+
+    @abc.abstractmethod
+    def recognises(self, lines: list[str]) -> bool:
+        """Whether the lines of a file are of this format, beyond doubt."""
+
+    @abc.abstractmethod
+    def read(self, name: str, lines: list[str], dt: float | None, unit: str | None, column: int | None) -> Accelerogram:
+        """Read the lines of a file.
+
+        **Arguments:**
+
+        - `name`: of the file, for messages.
+        - `dt`, `unit`, `column`: as given to `read_record`, each valid by itself.
+
+        **Returns:** an `Accelerogram`.
+
+        **Raises:** ValueError, with file and line, for a file that is damaged; ValueError for an argument that is
+        missing, of no use for the format, or contradicted by the file.
+        """

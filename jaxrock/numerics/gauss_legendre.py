@@ -1,0 +1,23 @@
+"""Gauss-Legendre quadrature: its nodes and weights."""
+
+import functools
+
+import numpy as np
+from jaxtyping import Float
+
+
+@functools.cache
+def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
+    """Nodes and weights on [-1, 1], exact for polynomials of degree 2 count - 1; the arrays are read-only."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    nodes.flags.writeable = weights.flags.writeable = False
+    return nodes, weights
+
+
+@functools.cache
+def gauss_legendre_of_unit(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
+    """The same on [0, 1]."""
+    nodes, weights = gauss_legendre(count)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    nodes.flags.writeable = weights.flags.writeable = False
+    return nodes, weights

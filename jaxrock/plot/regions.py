@@ -1,0 +1,50 @@
+"""Figures of motions that rocks allow."""
+
+import numpy as np
+
+from jaxrock.inverse.estimate import Estimate
+from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
+from jaxrock.plot.style import RED
+
+UNITS = {"amplitude": "g", "period": "s", "duration": "s"}  # of parameters of motions
+
+
+def feasible_region(
+    region: FeasibleRegion, estimate: Estimate | None = None, wall: Unexceeded | None = None, axis=None
+):
+    """Draw a feasible region: the log-likelihood below its best, the 95 % region, the estimate, the unexceeded motion.
+
+    **Arguments:**
+
+    - `region`: a `FeasibleRegion`, its first parameter upward; both axes logarithmic if all values are positive.
+    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded; None leaves them out.
+    - `axis`: matplotlib axis; None makes a figure.
+
+    **Returns:** the axis.
+    """
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
+    rows, columns = (np.asarray(x) for x in region.values)
+    below = np.asarray(region.log_likelihood - region.log_likelihood.max())
+    shade = axis.pcolormesh(columns, rows, np.maximum(below, -20), cmap="Blues", shading="nearest", rasterized=True)
+    axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
+    axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
+    if wall is not None:
+        axis.plot(wall.durations, wall.amplitude, color=RED, linewidth=1, label="up to here all that stand, stand")
+    if estimate is not None and set(region.names) <= set(estimate.names):
+        axis.plot(estimate[region.names[1]], estimate[region.names[0]], "k+", markersize=9, label="most likely")
+    for values, scale, ticks in ((rows, axis.set_yscale, axis.yaxis), (columns, axis.set_xscale, axis.xaxis)):
+        if values.min() > 0:
+            scale("log")
+            ticks.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ticks.set_minor_formatter(NullFormatter())
+    axis.set(xlim=(columns.min(), columns.max()), ylim=(rows.min(), rows.max()))
+    unit = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
+    axis.set(ylabel=unit[0], xlabel=unit[1])
+    if wall is not None or estimate is not None:
+        axis.legend(frameon=False, fontsize=8)
+    return axis
