@@ -319,7 +319,7 @@ Errors are the largest over the scenes of a problem, against 40-digit Taylor ser
 of the least of several runs of one compiled response, float64. What an engine refuses (a status other than successful)
 counts neither as an error nor as an answer; hollow marks in the picture are points with refusals, the small numbers are
 orders of the series. The SciPy loop never refuses; its record is cut at the samples, its absolute tolerance is a
-hundredth of the relative one.
+hundredth of the relative one.{chr(10) + results["note"] if "note" in results else ""}
 
 ## Sine pulses in a batch
 
@@ -337,6 +337,8 @@ of both kinds.
 def main():
     """Measure what is asked for, or all; write the report."""
     results = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
+    if not sys.argv[1:]:
+        results = {}
     for name in sys.argv[1:] or [*PROBLEMS, "batch"]:
         if name != "draw":
             results[name] = measure_batch() if name == "batch" else measure(name)
