@@ -1,6 +1,6 @@
 """Derivatives: error and cost. `python benchmarks/derivatives.py` writes `derivatives.md`.
 
-Errors: against 40-digit differences (`reference_derivatives.py`). Costs: times the value alone, both compiled, on one
+Errors: against 40-digit differences (`references/derivatives.py`). Costs: times the value alone, both compiled, on one
 core, best of several. Takes some ten minutes, most of them compiling.
 """
 
@@ -13,37 +13,27 @@ from pathlib import Path
 if hasattr(os, "sched_setaffinity"):  # before JAX counts cores
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
-import jax  # noqa: E402
+import common  # noqa: F401, the search path and double precision
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-import jaxrock as rk  # noqa: E402
+import jaxrock as rk
+from references.in_jaxrock import MODELS, PULSES
 
 HERE = Path(__file__).parent
-SCENES = json.loads((HERE.parent / "tests" / "derivatives.json").read_text())["scenes"]
-MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
-MOTIONS = {
-    "sine": rk.SinePulse,
-    "exponential": rk.ExponentialPulse,
-    "half sine": rk.HalfSinePulse,
-    "cosine": rk.CosinePulse,
-    "triangle": rk.TriangularPulse,
-    "ricker symmetric": rk.RickerPulse,
-    "record": lambda factor: factor * rk.example_record(),
-}
+SCENES = json.loads((HERE.parent / "references" / "derivatives.json").read_text())["scenes"]
+KINDS = ("sine", "exponential", "half sine", "cosine", "triangle", "ricker symmetric", "record")
 LANES, POINTS = 64, 4096
 
 
 def peak(kind, model, x):
     """Peak rotation from alpha, p, restitution and the motion's parameters."""
-    motion = MOTIONS[kind](*[x[k] for k in range(3, x.size)])
+    motion = x[3] * rk.example_record() if kind == "record" else PULSES[kind](*[x[k] for k in range(3, x.size)])
     return rk.outcome(rk.Block(x[0], x[1], x[2]), motion, MODELS[model]).max_rotation
 
 
-def errors(derivative, key, motions=tuple(MOTIONS)):
+def errors(derivative, key, motions=KINDS):
     """Relative errors of all scenes of each kind: rows of (kind, model, scenes, median, worst)."""
     for kind in motions:
         for model in MODELS:

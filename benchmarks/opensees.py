@@ -10,23 +10,18 @@ elastic column (linear kinematics on both sides). OpenSees integrates by Newmark
 """
 
 import platform
-import sys
 import time
 from pathlib import Path
 
+import common  # noqa: F401, the search path and double precision
 import jax
+import jax.numpy as jnp
+import numpy as np
+import openseespy.opensees as ops
+from scipy.integrate import solve_ivp
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-import openseespy.opensees as ops  # noqa: E402
-from scipy.integrate import solve_ivp  # noqa: E402
-
-import jaxrock as rk  # noqa: E402
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from test_flexible import PULSE, TALL, independent  # noqa: E402
+import jaxrock as rk
+from references.flexible_column import PULSE, TALL, independent
 
 GRAVITY, YIELD = 9.81, 1e-9  # m/s^2; rotation up to which the spring is stiff [rad]
 DURATION, STEPS = 12.0, (1e-2, 1e-3, 1e-4)

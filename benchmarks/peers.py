@@ -2,8 +2,9 @@
 
     python benchmarks/peers.py [--problems P1 P4 ...] [--peers taylor scipy ...] [--quick] [--repeat 3]
 
-Five problems (`peers_solvers/problems.py`), every peer with settings for errors of about 1e-6, 1e-10 and 1e-12 where
-it can, all on all cores, timed after compilation. Errors are against 36-digit references (`peers_references.json`).
+Five problems (`references/peer_problems.py`), every peer with settings for errors of about 1e-6, 1e-10 and 1e-12 where
+it can, all on all cores, timed after compilation. Errors are against references of 30 digits (`references/peers.json`).
+And one block at a time under a record, on one core (`--problems one`).
 Writes `peers.md`, `peers.png` and `peers.json` beside this file. `--quick`: fewer scenes, once each; `--draw`: table
 and picture again from the numbers; `--keep`: measures some again and keeps the others. A peer that is not installed
 is listed as skipped.
@@ -14,15 +15,16 @@ import importlib
 import importlib.util
 import json
 import pathlib
-import sys
 import time
 
+import common  # noqa: F401, the search path and double precision
 import numpy as np
+from peers_solvers import one_block, report
+
+import jaxrock as rk
+from references import peer_problems, peers as references
 
 HERE = pathlib.Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
-
-from peers_solvers import problems, report  # noqa: E402
 
 # Name on the command line: module, what it needs, name in the tables.
 PEERS = {
@@ -105,7 +107,7 @@ def rows_of(name, problem, known, options):
 def arguments():
     """What the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--problems", nargs="+", default=["P1", "P2", "P3", "P4", "P5"])
+    parser.add_argument("--problems", nargs="+", default=["P1", "P2", "P3", "P4", "P5", "one"])
     parser.add_argument("--peers", nargs="+", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--quick", action="store_true", help="fewer scenes, once each")
     parser.add_argument("--repeat", type=int, default=3)
@@ -119,15 +121,13 @@ def main():
     options, file = arguments(), HERE / "peers.json"
     data = json.loads(file.read_text()) if (options.draw or options.keep) and file.exists() else {"rows": []}
     if not options.draw:
-        import jax
-
-        jax.config.update("jax_platforms", "cpu")
-        jax.config.update("jax_enable_x64", True)
-        import jaxrock as rk
-
-        if hasattr(rk, "use_cpu_devices"):
+        if "one" in options.problems:
+            data["one"] = {"rows": one_block.measure(), "surroundings": report.surroundings()}
+            file.write_text(json.dumps(data, indent=0))
+            options.problems.remove("one")
+        if options.problems:
             rk.use_cpu_devices()
-        measure(options, data, file)
+            measure(options, data, file)
     report.write(data, {name: peer[2] for name, peer in PEERS.items()}, HERE)
 
 
@@ -137,7 +137,7 @@ def measure(options, data, file):
     data["skipped"] = [PEERS[name][2] for name in options.peers if name not in there]
     data["surroundings"], data["repeat"] = report.surroundings(), options.repeat
     data["runs"] = data.get("runs", 0) + 1
-    answers = json.loads((HERE / "peers_references.json").read_text())
+    answers = json.loads(references.FILE.read_text())
     done = [(p, name) for p in options.problems for name in there]
     data["rows"] = [row for row in data["rows"] if (row["problem"], row["peer"]) not in done]
     data["problems"] = data.get("problems", {})
@@ -147,7 +147,7 @@ def measure(options, data, file):
             "references": len(known), "overturned": sum(a["peak"] is None for a in known),
             "conditions": np.quantile([a["condition"] for a in known if a["condition"]], [0.5, 0.9, 1]).tolist(),
         }  # fmt: skip
-        for problem in problems.load(code, options.quick):
+        for problem in peer_problems.load(code, options.quick):
             for name in there:
                 data["rows"] += rows_of(name, problem, known, options)
                 file.write_text(json.dumps(data, indent=0))

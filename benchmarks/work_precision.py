@@ -1,10 +1,10 @@
 """Error against time of every way to solve a rocking block: `python benchmarks/work_precision.py`.
 
 The series engine at several orders, the diffrax engine with explicit and implicit solvers, and the usual SciPy loop
-(`scipy_peer.py`) on four problems; errors are against 40-digit Taylor series (`reference_taylor.py`). Writes the table
-`work_precision.md`, the picture `work_precision.png` and the numbers `work_precision.json` beside this file.
-`work_precision.py draw` makes table and picture again from the numbers; `work_precision.py record batch` measures
-these two again and keeps the others.
+(`peers_solvers/scipy_loop.py`) on four problems; errors are against 40-digit Taylor series (`references/taylor.py`).
+Writes the table `work_precision.md`, the picture `work_precision.png` and the numbers `work_precision.json` beside
+this file. `work_precision.py draw` makes table and picture again from the numbers; `work_precision.py record batch`
+measures these two again and keeps the others.
 """
 
 import functools
@@ -13,26 +13,19 @@ import math
 import pathlib
 import sys
 import time
-from unittest import mock
 
+import diffrax
 import jax
+import numpy as np
+from common import least_time, seconds, table
+from mpmath import mp, mpf
+from peers_solvers import scipy_loop
 
-jax.config.update("jax_platforms", "cpu")
-jax.config.update("jax_enable_x64", True)
-
-import diffrax  # noqa: E402
-import numpy as np  # noqa: E402
-from mpmath import mp, mpf  # noqa: E402
-from scipy.integrate import solve_ivp  # noqa: E402
+import jaxrock as rk
+from references import responses
+from references.in_jaxrock import MODELS, PULSES
 
 HERE = pathlib.Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent)]
-
-import reference_taylor  # noqa: E402
-import scipy_peer  # noqa: E402
-
-import jaxrock as rk  # noqa: E402
-
 NUMBERS = HERE / "work_precision.json"
 SEED, SCENES, LANES = 20261121, 5, 1000
 PATIENCE, MOST_REPEATS = 0.3, 30  # seconds to repeat a measurement of one scene, and how often at most
@@ -64,7 +57,7 @@ def safe_ones(draw, impacts):
     random, scenes, answers = np.random.default_rng(SEED), [], []
     while len(scenes) < SCENES:
         scene = draw(random)
-        known = reference_taylor.answer(scene)
+        known = responses.answer(scene)
         if known["peak"] and float(known["peak"]) > scene[0][0] / 5 and known["impacts"] >= impacts:
             scenes.append(scene)
             answers.append(known)
@@ -95,25 +88,14 @@ def problem(name):
         block, record = rk.Block.from_dimensions(*SIZE), rk.example_record()
         numbers = tuple(float(x) for x in (block.alpha, block.p, block.restitution))
         scenes = [(numbers, "record", (np.asarray(record.samples), float(record.dt)))]
-        return scenes, reference_taylor.reference(scenes)
+        return scenes, responses.kept(scenes)
     scenes = [
         ((alpha, 1.0, e), "sine", (a * math.tan(alpha), 2 * math.pi / ratio)) for alpha, e, a, ratio in CHATTERING
     ]
-    return scenes, reference_taylor.answers(scenes)
+    return scenes, responses.answers(scenes)
 
 
 # Measuring
-
-
-def least_time(function):
-    """Least time of several calls [s]."""
-    best, spent, count = math.inf, 0.0, 0
-    while count < 2 or (spent < PATIENCE and count < MOST_REPEATS):
-        start = time.perf_counter()
-        function()
-        taken = time.perf_counter() - start
-        best, spent, count = min(best, taken), spent + taken, count + 1
-    return best
 
 
 def error_of(peak, scene, answer):
@@ -133,7 +115,7 @@ def measured(label, setting, scenes, answers, solve):
     for k, (scene, answer) in enumerate(zip(scenes, answers)):
         run = solve(scene)
         peak = run() if k else first
-        times.append(least_time(run))
+        times.append(least_time(run, MOST_REPEATS, PATIENCE))
         if peak is None:
             refused += 1
         else:
@@ -155,18 +137,10 @@ def measured(label, setting, scenes, answers, solve):
 # jaxrock
 
 
-def motion(kind, numbers):
-    """A motion of jaxrock from the reference's numbers."""
-    if kind == "record":
-        return rk.Record(*numbers)
-    return {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse}[kind](*numbers)
-
-
 @functools.cache
 def compiled(model, engine):
     """The compiled outcome of one scene by an engine."""
-    equation = {"nonlinear": rk.Housner(), "linear": rk.Linear()}[model]
-    return jax.jit(lambda block, moving: rk.outcome(block, moving, equation, engine=engine))
+    return jax.jit(lambda block, moving: rk.outcome(block, moving, MODELS[model], engine=engine))
 
 
 def by_engine(engine):
@@ -175,7 +149,8 @@ def by_engine(engine):
     def solve(scene):
         block, kind, numbers, *options = scene
         run = compiled(options[0]["model"] if options else "nonlinear", engine)
-        given = jax.tree.map(jax.numpy.asarray, (rk.Block(*block), motion(kind, numbers)))
+        moving = rk.Record(*numbers) if kind == "record" else PULSES[kind](*numbers)
+        given = jax.tree.map(jax.numpy.asarray, (rk.Block(*block), moving))
 
         def once():
             found = jax.block_until_ready(run(*given))
@@ -198,87 +173,19 @@ def engines():
 # The SciPy loop
 
 
-class ExponentialPulse:
-    """The pulse of `rk.ExponentialPulse` for the SciPy loop, in two pieces, on a linear block."""
-
-    longest_step = math.inf
-
-    def __init__(self, threshold, amplitude, duration, shape):
-        self.threshold, self.amplitude, self.end, self.shape = threshold, amplitude, duration, shape
-        self.largest = abs(amplitude)
-
-    def __call__(self, time):
-        foot = min(time, self.end - time)
-        return self.amplitude * math.expm1(2 * self.shape * foot / self.end) / math.expm1(self.shape)
-
-    def next_cut(self, time):
-        """Where the smooth piece at `time` ends [s]."""
-        return self.end / 2 if time < self.end / 2 * (1 - 1e-15) else self.end
-
-    def uplift(self, time, threshold):
-        """First time from `time` on at which |u| exceeds the linear model's threshold [s]."""
-        if abs(self(time)) > self.threshold:
-            return time
-        if time >= self.end / 2 or self.largest <= self.threshold:
-            return None
-        share = math.log1p(self.threshold / self.largest * math.expm1(self.shape)) / self.shape
-        return max(time, share * self.end / 2)
-
-
-def linear_equations(alpha, p, side, moving):
-    """`scipy_peer.equations` of the linear model."""
-    square, escape = p * p, alpha + moving.largest
-    events = scipy_peer_equations(alpha, p, side, moving)[2]
-
-    def acceleration(t, x):
-        return -square * (alpha - x + side * moving(t))
-
-    def flow(t, state):
-        x, v = state.tolist()
-        return v, acceleration(float(t), x)
-
-    def lost(t, state):
-        return state[0] - escape
-
-    lost.terminal, lost.direction = True, 1
-    return acceleration, flow, (events[0], lost, events[2])
-
-
-def linear_free_rocking(alpha, p, restitution, x, v):
-    """`scipy_peer.free_rocking` of the linear model."""
-    missing, balanced = (alpha - x) ** 2 - (v / p) ** 2, alpha**2
-    inward = v < 0 and (x < alpha or missing < 0)
-    if inward:
-        missing = balanced - restitution**2 * (balanced - missing)
-    if missing < 0 or (x >= alpha and not inward):
-        return math.inf, int(inward)
-    return max(x, alpha - math.sqrt(missing)), 0
-
-
-scipy_peer_equations = scipy_peer.equations
-
-
-def by_scipy(method, rtol, cut=True):
+def by_scipy(method, rtol):
     """How `measured` is to solve a scene with SciPy's `method` from event to event."""
-
-    def other(flow, span, start, _, **settings):
-        return solve_ivp(flow, span, start, method, **settings)
+    settings = scipy_loop.settings_of(rtol, 1e-2 * rtol, method)
 
     def solve(scene):
         (alpha, p, restitution), kind, numbers, *_ = scene
-        linear = kind == "exponential"
-        patches = {"solve_ivp": other}
-        if linear:
-            patches |= {"equations": linear_equations, "free_rocking": linear_free_rocking}
-            moving = ExponentialPulse(alpha, *numbers)
+        if kind == "record":
+            moving = scipy_loop.Record(numbers[0].tolist(), numbers[1])
+        elif kind == "exponential":
+            moving = scipy_loop.Exponential(numbers[0], 2 * math.pi / numbers[1], numbers[2])
         else:
-            moving = scipy_peer.Record(*numbers, cut) if kind == "record" else scipy_peer.SinePulse(*numbers)
-
-        def once():
-            with mock.patch.multiple(scipy_peer, **patches):
-                return scipy_peer.peak(alpha, p, restitution, moving, rtol, 1e-2 * rtol)[0]
-
-        return once
+            moving = scipy_loop.Sine(numbers[0], 2 * math.pi / numbers[1])
+        return lambda: alpha * scipy_loop.follow(alpha, p, restitution, moving, kind == "exponential", settings)
 
     return solve
 
@@ -317,7 +224,7 @@ def measure_batch():
             start = time.perf_counter()
             run = jax.jit(function).lower(*arguments).compile()
             row[f"{kind} compile"] = time.perf_counter() - start
-            row[kind] = least_time(lambda: jax.block_until_ready(run(*arguments)))  # noqa: B023
+            row[kind] = least_time(lambda: jax.block_until_ready(run(*arguments)), MOST_REPEATS, PATIENCE)  # noqa: B023
         row["refused"] = int((np.asarray(run(*arguments).status != rk.Status.successful)).sum())
         rows.append(row)
         print(row, flush=True)
@@ -325,20 +232,6 @@ def measure_batch():
 
 
 # Report
-
-
-def seconds(value):
-    """A duration as text."""
-    for size, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
-        if value >= size:
-            return f"{value / size:.3g} {unit}"
-    return f"{value * 1e9:.3g} ns"
-
-
-def table(header, rows):
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 STYLES = {  # colours of Okabe and Ito; every curve has its own marker too
@@ -426,7 +319,7 @@ Errors are the largest over the scenes of a problem, against 40-digit Taylor ser
 of the least of several runs of one compiled response, float64. What an engine refuses (a status other than successful)
 counts neither as an error nor as an answer; hollow marks in the picture are points with refusals, the small numbers are
 orders of the series. The SciPy loop never refuses; its record is cut at the samples, its absolute tolerance is a
-hundredth of the relative one.
+hundredth of the relative one.{chr(10) + results["note"] if "note" in results else ""}
 
 ## Sine pulses in a batch
 
@@ -444,6 +337,8 @@ of both kinds.
 def main():
     """Measure what is asked for, or all; write the report."""
     results = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
+    if not sys.argv[1:]:
+        results = {}
     for name in sys.argv[1:] or [*PROBLEMS, "batch"]:
         if name != "draw":
             results[name] = measure_batch() if name == "batch" else measure(name)

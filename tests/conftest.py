@@ -51,4 +51,4 @@ def few_compiled_programs():
 @pytest.fixture(scope="session")
 def references():
     """Reference values from 200-bit integrations (see the file's `about`)."""
-    return json.loads((Path(__file__).parent / "references.json").read_text())
+    return json.loads((Path(__file__).parents[1] / "references" / "papers.json").read_text())

@@ -10,7 +10,7 @@ import pytest
 
 import jaxrock as rk
 
-FOLDER = Path(__file__).parents[1] / "benchmarks" / "asymmetric_references"
+FOLDER = Path(__file__).parents[1] / "references" / "asymmetric"
 CASES = json.loads((FOLDER / "asymmetric.json").read_text())["cases"] if FOLDER.exists() else []
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxrock as rk
 
-SCENES = json.loads((Path(__file__).parent / "critical.json").read_text())["scenes"]
+SCENES = json.loads((Path(__file__).parents[1] / "references" / "critical.json").read_text())["scenes"]
 PULSES = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "half sine": rk.HalfSinePulse}
 
 

@@ -13,18 +13,10 @@ import jaxrock as rk
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.motions.motion import Shaking
 from jaxrock.numerics.polynomial import jet
+from references.in_jaxrock import MODELS, PULSES
 
-MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
-PULSES = {
-    "sine": rk.SinePulse,
-    "exponential": rk.ExponentialPulse,
-    "half sine": rk.HalfSinePulse,
-    "cosine": rk.CosinePulse,
-    "triangle": rk.TriangularPulse,
-    "ricker symmetric": rk.RickerPulse,
-}
 RESULTS = ("max_rotation", "max_velocity", "time_of_max")
-SCENES = json.loads((Path(__file__).parent / "derivatives.json").read_text())["scenes"]
+SCENES = json.loads((Path(__file__).parents[1] / "references" / "derivatives.json").read_text())["scenes"]
 
 
 def scene(kind, x):
@@ -55,7 +47,7 @@ def slow(*row):
     return pytest.param(*row, marks=pytest.mark.slow)
 
 
-EVERYWHERE = [(kind, model) for kind in (*PULSES, "record") for model in MODELS]
+EVERYWHERE = [(kind, model) for kind in dict.fromkeys(row["kind"] for row in SCENES) for model in MODELS]
 QUICK = [("sine", "nonlinear"), ("exponential", "linear")]
 
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard_cases import LANES, SAMPLES, engines, outcomes
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import jaxrock as rk
+from references.hard_cases import LANES, SAMPLES, engines, outcomes
 
 RTOL = 1e-8
 NUDGE = 1e-6  # relative change of amplitude and initial state, for condition numbers

@@ -2,18 +2,18 @@
 
 import itertools
 
-import hard_cases
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hard_cases import KINDS, MODELS as NAMES
 
 import jaxrock as rk
+from references import hard_cases
+from references.hard_cases import KINDS, MODELS as NAMES
+from references.in_jaxrock import MODELS
 
 outcome = jax.jit(rk.outcome)
 STILL = rk.Record([0.0], 0.01)
-MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
 model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 
 

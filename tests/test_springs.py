@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 import jaxrock as rk
 from jaxrock.engines.free_stage import Visit, free_stage
 from jaxrock.models.equation import Angle
+from references.in_jaxrock import PULSES
 
-SCENES = json.loads((Path(__file__).parent / "springs.json").read_text())["scenes"]
-MOTIONS = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "ricker symmetric": rk.RickerPulse}
+SCENES = json.loads((Path(__file__).parents[1] / "references" / "springs.json").read_text())["scenes"]
 RESULTS = ("max_rotation", "max_velocity", "time_of_max")
 SPRINGS = (("SM1", "sine"), ("SM1", "linear"), ("SM1", "plastic"), ("SM3", "plastic"))
 MOMENTS = {  # over m g R at an opening angle: Diamantopoulos & Fragiadakis (2017)
@@ -102,7 +102,7 @@ def run(kind, spring):
 
     def results(x):
         block = rk.Block(x[0], x[1], x[2])
-        motion = x[3] * rk.example_record() if kind == "record" else MOTIONS[kind](*[x[k] for k in range(3, x.size)])
+        motion = x[3] * rk.example_record() if kind == "record" else PULSES[kind](*[x[k] for k in range(3, x.size)])
         found = rk.outcome(block, motion, rk.Spring(*spring))
         return jnp.stack([getattr(found, name) for name in RESULTS]), found
 

@@ -238,6 +238,34 @@ def test_the_public_names_are_found():
     assert {"Block", "Record", "outcome", "simulate", "overturning_map", "Status"} <= set(exports())
 
 
+ROOT = PACKAGE.parent
+FOLDERS = ("jaxrock", "references", "benchmarks", "tests")
+
+
+@pytest.mark.parametrize(
+    ("folder", "allowed"),
+    [
+        ("jaxrock", {"jaxrock"}),
+        ("references", {"jaxrock", "references"}),
+        ("benchmarks", {"jaxrock", "references", "benchmarks"}),
+        ("tests", {"jaxrock", "references"}),
+    ],
+)
+def test_what_tests_and_benchmarks_share_lies_in_references(folder, allowed):
+    """Tests import nothing of benchmarks, benchmarks nothing of tests; the package only itself."""
+    if not (ROOT / folder).exists():
+        pytest.skip("a package without its repository")
+    homes = {path.stem: name for name in ("benchmarks", "tests") for path in (ROOT / name).glob("*.py")}
+    homes |= {path.name: "benchmarks" for path in (ROOT / "benchmarks").iterdir() if path.is_dir()}
+    homes |= {name: name for name in FOLDERS}
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
+            found = {homes.get(name.split(".")[0]) for name in names} - {None}
+            assert found <= allowed, f"{path.relative_to(ROOT)} imports {names}"
+
+
 def test_import_draws_nothing_and_configures_nothing():
     settings = "{k: v for k, v in jax.config.values.items()}"
     code = f"import sys, jax; before = {settings}; import jaxrock; after = {settings}\n"

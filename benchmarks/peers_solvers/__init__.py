@@ -1,4 +1,1 @@
-"""Peers of jaxrock, each an implementation of its own, and the problems and references that compare them.
-
-`problems`: what is solved; `reference`: with 36 digits; the other modules: one way each to solve it.
-"""
+"""Peers of jaxrock: one way each to solve the problems of `references.peer_problems`, and the report of them."""

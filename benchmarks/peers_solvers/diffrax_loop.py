@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import problems
+from references import peer_problems as problems
 
 ARCS = 500  # solves of one scene at most
 FEW = {"P4": 4, "P5": 16}  # scenes; else 200

@@ -4,10 +4,8 @@ import jax
 import numpy as np
 
 import jaxrock as rk
-
-from . import problems
-
-MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
+from references import peer_problems as problems
+from references.in_jaxrock import MODELS
 
 
 def exponential(amplitude, duration):

@@ -7,7 +7,7 @@ The loop is that of `numba_taylor`; a step reaches over half a crest-to-crest in
 
 import functools
 
-from . import numba_taylor
+from . import numba_events, numba_taylor
 
 STATE = """
 B = s * A / (1.0 + w * w)
@@ -36,12 +36,11 @@ def events_text():
     for at in "hr":
         table |= {f"x_{at}": "(alpha + E + G + sine)", f"v_{at}": "(E - G + cosine)"}
         table |= {f"a_{at}": "(E + G - w * w * sine)", f"j_{at}": "(E - G - w * w * cosine)"}
-    table |= {"top": f"top = {table['x_r']}", "arrival": f"vh = {table['v_h']}", "depart": "pass"}
     lines = []
-    for line in ("q = h * h\n" + numba_taylor.filled(numba_taylor.EVENTS, table)).split("\n"):
+    for line in numba_events.events_of(table).split("\n"):
         bare, depth = line.strip(), (len(line) - len(line.lstrip())) // 4
         if bare in ("q = h * h", "q = r * r"):
-            lines.append("    " * depth + numba_taylor.indented(AT.format(at=bare[4]), depth))
+            lines.append("    " * depth + numba_events.indented(AT.format(at=bare[4]), depth))
         else:
             lines.append(line)
     return "\n".join(lines)

@@ -7,7 +7,7 @@ length of the step itself, integrated anew each time, so that it is as accurate 
 
 import functools
 
-from . import numba_taylor
+from . import numba_events, numba_taylor
 
 NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
 ROWS = (
@@ -109,13 +109,13 @@ def dopri5_parts(model, motion):
     """What makes a step of a template one of the pair."""
     words = {"stages": stages(model, motion, "e"), "quintic": QUINTIC.strip("\n")}
     words |= {"error_x": weighted("v", ERROR), "error_v": weighted("a", ERROR)}
-    hooks = {name: numba_taylor.filled(text, words) for name, text in
+    hooks = {name: numba_events.filled(text, words) for name, text in
              (("top", TOP), ("arrival", ARRIVAL), ("depart", DEPART))}  # fmt: skip
     start = f"start = {ACCELERATION[model].format(x='x', f=FORCE[motion].format(t='t'))}"
-    parts = {"series": start, "events": numba_taylor.events_text(5, hooks)}
+    parts = {"series": start, "events": numba_events.events_text(5, hooks)}
     if motion == "record":
-        return parts | {"middle": numba_taylor.filled(FIXED, words)}
-    return parts | {"length": numba_taylor.filled(CONTROLLED, words)}
+        return parts | {"middle": numba_events.filled(FIXED, words)}
+    return parts | {"length": numba_events.filled(CONTROLLED, words)}
 
 
 @functools.cache

@@ -6,6 +6,8 @@ import os
 import pathlib
 import platform
 
+from . import one_block
+
 COLOURS = {
     "jaxrock": "#c1272d",
     "jaxrock-diffrax": "#f0929b",
@@ -132,6 +134,22 @@ def picture(rows, names, file):
     plt.close(figure)
 
 
+def one_block_text(data):
+    """The section on one block at a time."""
+    record = f"`rk.example_record()` ({SAMPLES:,} samples)"
+    return f"""
+## One block at a time under a record
+
+Measured by `python benchmarks/peers.py --problems one --keep`. {data["surroundings"]}.
+
+{record}, Housner's restitution. One response at a time on one core, the least of {one_block.REPEATS} (jaxrock, after
+compilation) or {one_block.REPEATS_SCIPY} (SciPy) runs. "Cut at samples": one `solve_ivp` for each sample while the
+block rocks; "steps ≤ dt": the usual short cut, where steps run across the kinks of the record.
+
+{one_block.text(data["rows"])}
+"""
+
+
 def write(data, names, folder):
     """`peers.md` and `peers.png`."""
     rows = data["rows"]
@@ -143,7 +161,7 @@ Written by `python benchmarks/peers.py`. {data["surroundings"]}.{several}
 
 Peak |theta|/alpha of every scene, over the motion and the free rocking after it. Speed: responses a second, wall
 clock, the best of {data["repeat"]} runs after compilation, all cores for everyone. Error: |peak - reference|/alpha
-over random scenes with references of 36 digits (`peers_references.py`) whose condition number is below 1e4; the
+over random scenes with references of 30 digits (`references/peers.py`) whose condition number is below 1e4; the
 condition number is the sum of |d peak/alpha| over relative changes of alpha, restitution, amplitude and frequency.
 Wrong verdicts: of such scenes (in brackets: of all). Refused: answered with a status instead of a number.
 Cores busy: processor time over wall clock of that run (unknown where other processes work); less than there are
@@ -167,5 +185,7 @@ Responses a second (worst error); the worst error over its condition number is b
         text += f"{facts['references']} references, {facts['overturned']} overturned"
         text += f"; condition numbers: median {median:.2g}, 90 % {most:.2g}, largest {largest:.2g}.\n\n"
         text += table(part, names) + "\n"
+    if "one" in data:
+        text += one_block_text(data["one"])
     (folder / "peers.md").write_text(text)
     picture(rows, names, folder / "peers.png")

@@ -1,0 +1,23 @@
+"""What the references' names mean in jaxrock: models and motions, those of the references' numbers."""
+
+import jaxrock as rk
+
+MODELS = {"nonlinear": rk.Housner(), "linear": rk.Linear()}
+PULSES = {
+    "sine": rk.SinePulse,
+    "cosine": rk.CosinePulse,
+    "half sine": rk.HalfSinePulse,
+    "rectangle": rk.RectangularPulse,
+    "triangle": rk.TriangularPulse,
+    "exponential": rk.ExponentialPulse,
+    "ricker symmetric": rk.RickerPulse,
+}
+
+
+def motion(kind, numbers):
+    """A motion from a kind and its numbers; of a record: dt, then its samples."""
+    if kind == "sum":
+        return rk.CosinePulse(*numbers[:2]) + rk.RectangularPulse(*numbers[2:4]).shifted(numbers[4])
+    if kind == "record":
+        return rk.Record(numbers[1:], numbers[0])
+    return PULSES[kind](*numbers)
