@@ -74,7 +74,7 @@ class FittedScene(eqx.Module):
         """Open intervals that parameters stay in. Those that begin at zero are fitted by their logarithms: combinations
         that data do not tell apart are products of powers."""
         known = {name: (one.range.low, one.range.high) for name, one in self._declared.items()}
-        known |= {"initial": (-np.pi / 2, np.pi / 2), "delay": (-float(self._reach), float(self._reach))}
+        known |= {"initial": (-np.pi / 2, np.pi / 2)}
         return np.array([known.get(name, (-np.inf, np.inf)) for name in self.names])
 
     @property
@@ -95,7 +95,8 @@ class FittedScene(eqx.Module):
         known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
         values = np.array([float(known.get(name, 0.0)) for name in self.names])
         scale = np.array([sizes.get(n) or self._size(n, x) for n, x in zip(self.names, values)])
-        bounds = self._ends.T
+        reach = float(self._reach)
+        bounds = np.array([(-reach, reach) if n == "delay" else ends for n, ends in zip(self.names, self._ends)]).T
         with np.errstate(divide="ignore", invalid="ignore"):
             values, bounds = (np.where(self.logarithmic, np.log(x), x) for x in (values, bounds))
         return values, np.where(self.logarithmic, 1.0, scale), *bounds

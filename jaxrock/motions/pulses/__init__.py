@@ -4,6 +4,7 @@ Imports `motions.motion` and `numerics`. Start with `pulse`, then `sinusoidal`.
 """
 
 import importlib
+import inspect
 import pkgutil
 
 from jaxrock.motions.pulses.pulse import AbstractPulse
@@ -16,7 +17,7 @@ def _defined() -> dict[str, type[AbstractPulse]]:
     return {
         kind.__name__: kind
         for kind in kinds
-        if isinstance(kind, type) and issubclass(kind, AbstractPulse) and kind is not AbstractPulse
+        if isinstance(kind, type) and issubclass(kind, AbstractPulse) and not inspect.isabstract(kind)
     }
 
 

@@ -52,8 +52,8 @@ class HalfSinePulse(AbstractPulse):
         return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
-class SinePulse(AbstractPulse):
-    """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
+class _OneCycle(AbstractPulse):
+    """One full cycle of a sinusoid."""
 
     amplitude: Real = parameter("g", finite, symbol="a_g")
     period: Real = parameter("s", positive, symbol="T")
@@ -72,32 +72,18 @@ class SinePulse(AbstractPulse):
     @property
     def bounds(self):
         return jnp.abs(self.amplitude)[None]
+
+
+class SinePulse(_OneCycle):
+    """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
     def series(self, piece, local, unit, order):
         rate = 2 * math.pi / self.period
         return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
 
-class CosinePulse(AbstractPulse):
+class CosinePulse(_OneCycle):
     """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
-
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    period: Real = parameter("s", positive, symbol="T")
-
-    def __init__(self, amplitude: ArrayLike, period: ArrayLike):
-        set_parameters(self, amplitude=amplitude, period=period)
-
-    @property
-    def knots(self):
-        return one_piece(self.period)
-
-    @property
-    def scales(self):
-        return (self.period / (2 * math.pi))[None]
-
-    @property
-    def bounds(self):
-        return jnp.abs(self.amplitude)[None]
 
     def series(self, piece, local, unit, order):
         rate = 2 * math.pi / self.period
