@@ -131,7 +131,7 @@ def _passes(engine: Series, rounds: bool) -> Passes:
         stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
         return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
 
-    def conclude(stepper, state):
+    def result_of(stepper, state):
         result = conclude(stepper, state)
         return result, result.status != Status.successful
 
@@ -140,7 +140,7 @@ def _passes(engine: Series, rounds: bool) -> Passes:
         quickly=follow,
         carefully=lambda stepper, state: _to_the_end(engine, stepper, state),
         unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
-        conclude=conclude,
+        conclude=result_of,
         round=POLICY.round if rounds else None,
     )
 
