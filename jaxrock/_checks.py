@@ -17,7 +17,14 @@ Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
 
 def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
-    """Return `value` as a floating-point array, or say what it is instead."""
+    """Return `value` as a floating-point array, or say what it is instead; what is known stays so within `jax.jit`."""
+    if any(isinstance(part, jax.core.Tracer) for part in jax.tree.leaves(value)):
+        return _as_real(name, value)
+    with jax.ensure_compile_time_eval():
+        return _as_real(name, value)
+
+
+def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
@@ -33,12 +40,12 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
     """Return `value` as an array for which `holds` is true everywhere.
 
-    A known value that fails raises ValueError at once; one that is traced carries an
+    A known value that fails raises ValueError at once, within `jax.jit` too; one that is traced carries an
     `equinox.error_if`, which raises when the compiled function meets it.
     """
     array = as_real(name, value)
     message = f"Argument `{name}` must {allowed}"
-    good = holds(array)
+    good = holds(array if isinstance(array, jax.core.Tracer) else np.asarray(array))
     if isinstance(array, jax.core.Tracer) or isinstance(good, jax.core.Tracer):
         if _put_down is not None and _put_down[0] == get_opaque_trace_state():
             _put_down[1].append((message, ~jnp.all(good)))
