@@ -5,8 +5,7 @@ verdict of every scene is kept, so that nothing is made monotone before a lognor
 without a verdict bounds the probability from both sides.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -22,6 +21,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.motions.suite import Suite, pick, size_of
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.rigid import outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
@@ -228,16 +228,13 @@ def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, e
         np.tile(np.repeat(draw, levels), motions),
         np.repeat(factors[:, None, :], draws, axis=1).ravel(),
     )
-    found = surface(_verdict(model, engine), points, (blocks, group), "fragility", progress, outer=False)
+    scene = blocks, group, current_model(model, blocks, group, factors), engine
+    found = surface(_verdict, points, scene, "fragility", progress, outer=False)
     return np.asarray(found).reshape(motions, draws, levels).swapaxes(1, 2)
 
 
-@functools.lru_cache(maxsize=32)
-def _verdict(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
-    def one(index, draw, factor, scene):
-        blocks, group = scene
-        found = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)
-        verdict = jnp.where(found.overturned, TOPPLED, STOOD)
-        return jnp.where(found.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)
-
-    return one
+def _verdict(index, draw, factor, scene):
+    blocks, group, model, engine = scene
+    found = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)
+    verdict = jnp.where(found.overturned, TOPPLED, STOOD)
+    return jnp.where(found.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -63,13 +63,14 @@ def feasible_region(
         if values.ndim != 1 or values.size == 0 or not bool(jnp.isfinite(values).all()):
             raise ValueError(f"Argument `over` must hold lists of finite values, but not for `{name}`.")
     rows, columns = (x.ravel() for x in jnp.meshgrid(*lists.values(), indexing="ij"))
+    rest = {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
+    likelihood = likelihood.current((*lists, *rest))
     bar, found = Progress(rows.size, "region", progress), []
     for begin in range(0, rows.size, _LANES):
         parts = (x[begin : begin + _LANES] for x in (rows, columns))
         count = min(_LANES, rows.size - begin)
         parts = (jnp.pad(x, (0, _LANES - count), mode="edge") for x in parts)
-        values = dict(zip(lists, parts)) | {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
-        found.append(np.asarray(_log_likelihood(likelihood, values))[:count])
+        found.append(np.asarray(_log_likelihood(likelihood, dict(zip(lists, parts)) | rest))[:count])
         bar.add(count)
     total = jnp.asarray(np.concatenate(found)).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.

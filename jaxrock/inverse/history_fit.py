@@ -25,6 +25,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.rigid import simulate
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
@@ -229,6 +230,7 @@ class _Scene(eqx.Module):
         block = _given(block, names)
         if engine is None:
             engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
+        model = current_model(model, block, motion)
         return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
 
     @property

@@ -20,7 +20,7 @@ Of an asymmetric rock of which it is not known which way round it stood in the s
 both ways.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -37,8 +37,10 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.rigid import outcome
 from jaxrock.status import Status
+from jaxrock.transforms.user_function import ByIdentity, current_function
 
 Real = Inexact[Array, "..."]
 
@@ -55,7 +57,8 @@ class Likelihood(eqx.Module):
     **Arguments:**
 
     - `observations`: an `Observations`.
-    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do.
+    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
+      as it is when the likelihood is asked.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
@@ -69,7 +72,7 @@ class Likelihood(eqx.Module):
     observations: Observations
     scatter: Real
     lapse: Real
-    motion: Callable = eqx.field(static=True)
+    motion: Callable[..., AbstractMotion]
     model: AbstractEquation
     engine: AbstractEngine | None
 
@@ -84,9 +87,16 @@ class Likelihood(eqx.Module):
     ):
         if isinstance(motion, AbstractMotion):
             raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
-        self.observations, self.motion, self.model, self.engine = observations, motion, model, engine
+        self.observations, self.model, self.engine = observations, model, engine
+        self.motion = motion if isinstance(motion, eqx.Module) else ByIdentity(motion)
         self.scatter = positive("scatter", scatter)
         self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+
+    def current(self, names: Sequence[str]) -> "Likelihood":
+        """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`."""
+        seen, number = self.observations, jax.ShapeDtypeStruct((), jnp.result_type(float))
+        parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
+        return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
     def log_terms(self, values: dict[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.

@@ -185,7 +185,7 @@ class _Density:
     """Log-densities at any number of places, in batches of one compiled program; it counts."""
 
     def __init__(self, problem: Problem):
-        self.problem, self.count = problem, 0
+        self.problem, self.count = problem.current(), 0
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         self.count += len(places)

@@ -99,6 +99,10 @@ class Problem(eqx.Module):
         """Ranges of the places: logarithms of parameters, or parameters themselves."""
         return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
 
+    def current(self) -> "Problem":
+        """The same with motion and model as they are now."""
+        return eqx.tree_at(lambda problem: problem.likelihood, self, self.likelihood.current(self.names))
+
     def values(self, places: Real) -> dict[str, Real]:
         """Parameters by name."""
         return {
@@ -149,7 +153,7 @@ class Evaluator:
     """
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
-        self.problem, self.count, self.progress = problem, 0, progress
+        self.problem, self.count, self.progress = problem.current(), 0, progress
         self.ends = np.asarray(problem.ends).T
         self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
 

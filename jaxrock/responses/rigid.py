@@ -20,6 +20,7 @@ from jaxrock.engines.taylor.fast import glance, has_many_pieces, most_steps
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status
 from jaxrock.transforms.batching import Passes
 from jaxrock.transforms.differentiation import differentiable
@@ -181,7 +182,7 @@ def outcome(
     engine: AbstractEngine | None = None,
 ) -> Outcome:
     """What becomes of a rigid block under a motion and in the free stage after it: `jaxrock.outcome` tells more."""
-    return _outcome(block, motion, model, _start(initial), _engine(engine, model))
+    return _outcome(block, motion, current_model(model, block, motion), _start(initial), _engine(engine, model))
 
 
 def simulate(
@@ -200,6 +201,7 @@ def simulate(
     if duration is not None:
         duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
         duration = scalar("duration", duration)
+    model = current_model(model, block, motion)
     response = _simulate(block, motion, model, _start(initial), duration, _engine(engine, model))
     time = jnp.linspace(jnp.zeros_like(response.duration), response.duration, samples)
     rotation, velocity = _evaluate(response, time)

@@ -6,7 +6,6 @@ still. A bisection of the verdict finds one end of them by chance. Here the marg
 at sampled points tell where something may hide between two of them, and only there the sampling is refined.
 """
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -23,6 +22,7 @@ from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.rigid import outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
@@ -96,6 +96,7 @@ def critical_amplitudes(
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
     low, high = _rising("intensity", intensity)
+    model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
@@ -125,6 +126,7 @@ def critical_durations(
     **Raises:** ValueError for arguments outside their ranges.
     """
     low, high = _rising("factor", factor)
+    model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
@@ -184,12 +186,12 @@ def _pick(
     return jax.tree_util.tree_map_with_path(lambda path, leaf: leaf if _shared(path) else leaf[index], scenes)
 
 
-# What is varied: z is the logarithm of a factor. Equal settings are one object, so that they compile once.
+# What is varied: z is the logarithm of a factor.
 
 
-class _Kind:
-    def __init__(self, model: AbstractEquation, engine: AbstractEngine | None):
-        self.model, self.engine = model, engine
+class _Kind(eqx.Module):
+    model: AbstractEquation
+    engine: AbstractEngine | None
 
     def margin(self, z, block, motion):
         """Margin and outcome of the scene with the factor e^z."""
@@ -249,21 +251,25 @@ class _Duration(_Kind):
         return name not in ("duration", "period", "dt")
 
 
-@functools.lru_cache(maxsize=32)
-def _compiled(kind: type, model: AbstractEquation, engine: AbstractEngine | None, slopes: bool) -> Callable:
-    return kind(model, engine).slopes if slopes else kind(model, engine).at
+def _at(z, index, scene):
+    kind, scenes = scene
+    return kind.at(z, index, scenes)
+
+
+def _slopes(z, index, scene):
+    kind, scenes = scene
+    return kind.slopes(z, index, scenes)
 
 
 def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool, progress: bool | None) -> Critical:
     """Search, find, differentiate, and sort by scenes."""
     scene = scenes.block, scenes.motion
 
-    def run(slopes, z, index):
-        function = _compiled(type(kind), kind.model, kind.engine, slopes)
-        return surface(function, (z, index), scene, "critical", progress, outer=False)
+    def run(function, z, index):
+        return surface(function, (z, index), (kind, scene), "critical", progress, outer=False)
 
     def at(z, index):
-        return tuple(map(np.asarray, run(False, z, index)))
+        return tuple(map(np.asarray, run(_at, z, index)))
 
     found, complete = _brackets(at, grid)
     ends = _roots(at, found)
@@ -274,7 +280,7 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
     value = np.exp(ends["z"]) * units[ends["index"]]
     derivative = np.full((order.size, len(names)), np.nan)
     if derivatives and order.size:
-        slopes = run(True, ends["safe"], ends["index"])
+        slopes = run(_slopes, ends["safe"], ends["index"])
         derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
         derivative[~ends["balanced"]] = np.nan
     amplitude = value if isinstance(kind, _Amplitude) else scenes.amplitude[ends["index"]]

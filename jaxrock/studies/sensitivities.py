@@ -1,8 +1,5 @@
 """How a response depends on the parameters of its scene, and how far that can be trusted."""
 
-import functools
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +14,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.rigid import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
@@ -174,19 +172,16 @@ def sensitivity_map(
     """
     strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
     shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
-    Block(alpha, 1.0, restitution)  # raises here, where values are known
-    scene = shape, alpha, None if restitution is None else as_real("restitution", restitution)
-    found = surface(_under_lobe(model, engine), (strength, duration), scene, "sensitivity", progress)
+    block = Block(alpha, 1.0, restitution)  # raises here, where values are known
+    model = current_model(model, block, shape, strength, duration)
+    scene = shape, block.alpha, block.given_restitution, model, engine
+    found = surface(_under_lobe, (strength, duration), scene, "sensitivity", progress)
     return SensitivityMap(strength, duration, shape, found)
 
 
-@functools.lru_cache(maxsize=32)
-def _under_lobe(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
-    def one(strength, duration, scene):
-        shape, alpha, restitution = scene
-        block = Block(alpha, jnp.ones_like(alpha), restitution)
-        # Positive acceleration drives negative rotation; the size of the response is the same.
-        pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
-        return sensitivity(block, pulse, model, engine=engine)
-
-    return one
+def _under_lobe(strength, duration, scene) -> Sensitivity:
+    shape, alpha, restitution, model, engine = scene
+    block = Block(alpha, jnp.ones_like(alpha), restitution)
+    # Positive acceleration drives negative rotation; the size of the response is the same.
+    pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
+    return sensitivity(block, pulse, model, engine=engine)

@@ -76,7 +76,7 @@ def sweep(
     if store is not None:
         keeper = _keeper(store, plan, lists, traced)
         plan = plan._replace(block=keeper.block)
-    values, resumed = compute(traced, plan, traced.constants, "sweep", progress, store=keeper, load=load)
+    values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
     return Grid(lists, values, outer, resumed) if load else None
 
 
