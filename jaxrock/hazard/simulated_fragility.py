@@ -106,11 +106,11 @@ class SimulatedFragility(eqx.Module):
         """
         toppled = self.counts(bound)
         motions, _, draws = self.verdict.shape
-        found = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
-        if motions == 1 or found.status != FitStatus.successful:
-            return found
-        clustered = _clustered(found, self.levels, jnp.asarray(toppled), float(draws))
-        return eqx.tree_at(lambda f: f.covariance, found, clustered)
+        fit = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
+        if motions == 1 or fit.status != FitStatus.successful:
+            return fit
+        clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
+        return eqx.tree_at(lambda f: f.covariance, fit, clustered)
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -152,14 +152,14 @@ class SimulatedFragility(eqx.Module):
 
 
 @eqx.filter_jit
-def _clustered(found: FragilityFit, levels, toppled, draws):
+def _clustered(fit: FragilityFit, levels, toppled, draws):
     """Covariance of (ln median, ln dispersion) where what one motion (a row) does at all levels is one outcome."""
-    median, dispersion = found.fragility.median, found.fragility.dispersion
+    median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
     rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
     scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
     motions = toppled.shape[0]
-    return found.covariance @ (scores.T @ scores * motions / (motions - 1)) @ found.covariance
+    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance
 
 
 def simulated_fragility(
@@ -229,12 +229,12 @@ def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, e
         np.repeat(factors[:, None, :], draws, axis=1).ravel(),
     )
     scene = blocks, group, current_model(model, blocks, group, factors), engine
-    found = surface(_verdict, points, scene, "fragility", progress, outer=False)
-    return np.asarray(found).reshape(motions, draws, levels).swapaxes(1, 2)
+    table = surface(_verdict, points, scene, "fragility", progress, outer=False)
+    return np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2)
 
 
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
-    found = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)
-    verdict = jnp.where(found.overturned, TOPPLED, STOOD)
-    return jnp.where(found.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)
+    result = outcome(pick(blocks, draw), Scaled(pick(group, index), factor), model, engine=engine)
+    verdict = jnp.where(result.overturned, TOPPLED, STOOD)
+    return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -58,7 +58,7 @@ class Likelihood(eqx.Module):
 
     - `observations`: an `Observations`.
     - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
-      as it is when the likelihood is asked.
+      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced).
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
@@ -117,9 +117,9 @@ class Likelihood(eqx.Module):
         ends = jnp.full_like(density[:1], _FLAT)
         density = jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0)
         stands, topples = possible.log_probability(True, density), possible.log_probability(False)
-        found = jnp.where(seen.seen == TOPPLED, topples, stands)
-        found = self._or_lapse(found, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
-        return jnp.where(impossible[..., None], -jnp.inf, found)
+        terms = jnp.where(seen.seen == TOPPLED, topples, stands)
+        terms = self._or_lapse(terms, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
+        return jnp.where(impossible[..., None], -jnp.inf, terms)
 
     def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
         """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
@@ -180,10 +180,10 @@ class Likelihood(eqx.Module):
                 with put_down():  # those of the motion are looked at before, and the rocks are known to be good
                     motion = self.motion(**dict(zip(names, parameters)))
                     motion = _of_strength(motion, level, way)
-                    found = outcome(block, motion, self.model, engine=self.engine)
-                rotation = jnp.where(found.overturned, 0.0, found.max_rotation)
-                real = jnp.stack([found.margin, rotation])
-                return real, (real, found.overturned, found.status == Status.successful)
+                    result = outcome(block, motion, self.model, engine=self.engine)
+                rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
+                real = jnp.stack([result.margin, rotation])
+                return real, (real, result.overturned, result.status == Status.successful)
 
             if not slopes:
                 return None, results(parameters)[1]

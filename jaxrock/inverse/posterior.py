@@ -189,8 +189,8 @@ class _Density:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         self.count += len(places)
-        (found,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
-        return np.where(np.isnan(found), -np.inf, found)
+        (density,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
+        return np.where(np.isnan(density), -np.inf, density)
 
 
 def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:

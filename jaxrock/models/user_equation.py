@@ -29,8 +29,8 @@ class Equation(AbstractEquation):
 
     The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
     Equinox modules may carry parameters to differentiate. They may read what changes: every call of the package sees
-    them as they are then. A block that has stopped below its unstable equilibrium after the motion counts as safe: what
-    dissipates does not lift.
+    them as they are then (within a function of yours under `jax.jit`, as when that was traced). A block that has
+    stopped below its unstable equilibrium after the motion counts as safe: what dissipates does not lift.
 
     **Raises:** ValueError where neither or both ways are used.
     """

@@ -195,15 +195,15 @@ class _Kind(eqx.Module):
 
     def margin(self, z, block, motion):
         """Margin and outcome of the scene with the factor e^z."""
-        found = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
-        return found.margin, found
+        result = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
+        return result.margin, result
 
     def at(self, z, index, scenes):
         """Margin, its slope, impacts and status of one point."""
         place = _pick(scenes, index)
-        margin, slope, found = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
-        decided = (found.status == Status.successful) | (found.status == Status.undecided)
-        return jnp.where(decided, margin, jnp.nan), slope, found.impact_count
+        margin, slope, result = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
+        decided = (result.status == Status.successful) | (result.status == Status.undecided)
+        return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
 
     def slopes(self, z, index, scenes):
         """Derivatives of the logarithm of the critical value by the parameters."""
@@ -271,8 +271,8 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
     def at(z, index):
         return tuple(map(np.asarray, run(_at, z, index)))
 
-    found, complete = _brackets(at, grid)
-    ends = _roots(at, found)
+    brackets, complete = _brackets(at, grid)
+    ends = _roots(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
     names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
@@ -357,9 +357,9 @@ def _may_hide(z: np.ndarray, margin: np.ndarray, slope: np.ndarray, impacts: np.
     return (lowest < 0.3 * np.minimum(low, high)) | plunges | gap
 
 
-def _roots(at: Callable, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _roots(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The end in every bracket to rounding, by Newton's method, which bisection keeps within it."""
-    index, z, margin, slope, impacts = (found[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
+    index, z, margin, slope, impacts = (brackets[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
     columns = np.arange(index.size)
     for count in range(120):
         width = z[1] - z[0]

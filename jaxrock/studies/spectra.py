@@ -111,7 +111,8 @@ def self_similar_spectrum(
     - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
     - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
     - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
-    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that).
+    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that): a pulse of the
+      package, or any function that JAX can trace; what it reads may have changed since the last call.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Spectrum` with results of shape (rows, n).
@@ -120,10 +121,10 @@ def self_similar_spectrum(
 
     **Source:** Dimitrakopoulos & DeJong (2012), section 4.
     """
-    found, ratio, intensity = _over_pulses(
+    results, ratio, intensity = _over_pulses(
         _peaks_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
     )
-    return Spectrum(abscissa=ratio, intensity=intensity, **found)
+    return Spectrum(abscissa=ratio, intensity=intensity, **results)
 
 
 def overturning_map(
@@ -147,10 +148,10 @@ def overturning_map(
 
     **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
     """
-    found, ratio, intensity = _over_pulses(
+    results, ratio, intensity = _over_pulses(
         _states_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
     )
-    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **found)
+    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **results)
 
 
 def _over_pulses(function, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
@@ -162,8 +163,8 @@ def _over_pulses(function, frequency_ratio, intensity, alpha, restitution, pulse
     pulse, model = current_function(pulse, number, number), current_model(model, block, ratio, intensity)
     scene = block.alpha, block.given_restitution, pulse, model, engine
     # Neighbours in intensity share a chunk: they move alike.
-    found = surface(function, (intensity, ratio), scene, label, progress, columns=True)
-    return found, ratio, intensity
+    results = surface(function, (intensity, ratio), scene, label, progress, columns=True)
+    return results, ratio, intensity
 
 
 def axis(name: str, values: Values) -> Float[Array, " n"]:
@@ -176,19 +177,19 @@ def axis(name: str, values: Values) -> Float[Array, " n"]:
 # What a surface keeps of an outcome: computed with it, point by point.
 
 
-def _peaks(found: Outcome, block: Block) -> dict:
+def _peaks(result: Outcome, block: Block) -> dict:
     """Of a spectrum."""
-    rest = {name: getattr(found, name) for name in ("impact_count", "overturned", "margin", "status")}
-    velocity = found.max_velocity / (block.p * block.alpha)
-    return {"max_rotation": found.max_rotation / block.alpha, "max_velocity": velocity, **rest}
+    rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
+    velocity = result.max_velocity / (block.p * block.alpha)
+    return {"max_rotation": result.max_rotation / block.alpha, "max_velocity": velocity, **rest}
 
 
-def _states(found: Outcome, block: Block) -> dict:
+def _states(result: Outcome, block: Block) -> dict:
     """Of a map."""
-    rest = {name: getattr(found, name) for name in ("impact_count", "margin", "status")}
-    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
-    state = jnp.where(found.status == Status.successful, state, -1)
-    return {"state": state, "max_rotation": found.max_rotation / block.alpha, **rest}
+    rest = {name: getattr(result, name) for name in ("impact_count", "margin", "status")}
+    state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
+    state = jnp.where(result.status == Status.successful, state, -1)
+    return {"state": state, "max_rotation": result.max_rotation / block.alpha, **rest}
 
 
 # The functions of surfaces. What is given for all points lies in the scene, a pytree, so that a second surface of a

@@ -31,8 +31,8 @@ class Runner:
         like = [jax.ShapeDtypeStruct(self._layout, values.dtype, sharding=self._dealt) for values in axes]
         checked = self._call.eval_shape(like, np.int32(0), self._scene)
         self._messages = checked.messages
-        found, self.tree = jax.tree.flatten(checked.found)
-        self.shapes = [jax.ShapeDtypeStruct(x.shape[3:], x.dtype) for x in found]
+        results, self.tree = jax.tree.flatten(checked.results)
+        self.shapes = [jax.ShapeDtypeStruct(x.shape[3:], x.dtype) for x in results]
 
     def __call__(
         self,
@@ -43,21 +43,21 @@ class Runner:
         """Results at flat points: the leaves of what the function returns, as NumPy arrays; `order`: in which they are
         computed."""
         order = np.arange(points[0].size) if order is None else order
-        found = [np.empty((order.size, *x.shape), x.dtype) for x in self.shapes]
+        results = [np.empty((order.size, *x.shape), x.dtype) for x in self.shapes]
         for numbers, leaves in self._batches(points, order):
             for device, dealt in enumerate(dealt_to(self._layout)):
                 there = dealt < numbers.size
                 targets = numbers[dealt] if there.all() else numbers[dealt[there]]
                 own = [self._of_device(part, device) for part in leaves]
                 own = own if there.all() else [x[there] for x in own]
-                for message, failed in zip(self._messages, own[len(found) :]):
+                for message, failed in zip(self._messages, own[len(results) :]):
                     if failed.any():
                         place = ", ".join(f"{x[targets[failed.argmax()]]:g}" for x in points)
                         raise ValueError(f"{message}, but is not at the point ({place}).")
-                for whole, part in zip(found, own):
+                for whole, part in zip(results, own):
                     whole[targets] = part
             report(numbers.size)
-        return found
+        return results
 
     @staticmethod
     def _of_device(dealt: jax.Array, device: int) -> np.ndarray:
@@ -73,8 +73,8 @@ class Runner:
             numbers = order[begin : begin + batch]
             rows = np.int32(-(-numbers.size // math.prod(self._layout[1:])))
             parts = [np.pad(x[numbers], (0, batch - numbers.size), mode="edge") for x in points]
-            found = self._call(jax.device_put([deal(x, self._layout) for x in parts], self._dealt), rows, self._scene)
-            waiting.append((numbers, jax.tree.leaves(found)))
+            results = self._call(jax.device_put([deal(x, self._layout) for x in parts], self._dealt), rows, self._scene)
+            waiting.append((numbers, jax.tree.leaves(results)))
             if len(waiting) > 1:
                 yield waiting.popleft()
         yield from waiting
@@ -83,7 +83,7 @@ class Runner:
 class _Checked(eqx.Module):
     """Results, and for each of the messages whether it applies."""
 
-    found: Any
+    results: Any
     failed: tuple
     messages: tuple[str, ...] = eqx.field(static=True)
 
@@ -101,8 +101,8 @@ def _compiled(function: Callable, mesh: Mesh) -> Callable:
             if isinstance(function, Program):
                 return _Checked(*function(*point, scene), function.messages)
             with put_down() as checks:
-                found = function(*point, scene)
-            return _Checked(found, tuple(failed for _, failed in checks), tuple(message for message, _ in checks))
+                results = function(*point, scene)
+            return _Checked(results, tuple(failed for _, failed in checks), tuple(message for message, _ in checks))
 
         def row(number):
             return jax.vmap(one)(*(x[number] for x in own))
