@@ -104,7 +104,10 @@ from jaxrock.responses.contact import Contact as Contact, contact_forces as cont
 from jaxrock.responses.history import Response as Response, simulate as simulate
 from jaxrock.responses.outcome import Outcome as Outcome, outcome as outcome
 from jaxrock.status import Status as Status
-from jaxrock.studies import similarity as similarity
+from jaxrock.studies import (
+    saved_outcomes as saved_outcomes,  # what `Grid.load` knows again
+    similarity as similarity,
+)
 from jaxrock.studies.critical import (
     Critical as Critical,
     critical_amplitudes as critical_amplitudes,

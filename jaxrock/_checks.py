@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
@@ -47,14 +47,19 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     message = f"Argument `{name}` must {allowed}"
     good = holds(array if isinstance(array, jax.core.Tracer) else np.asarray(array))
     if isinstance(array, jax.core.Tracer) or isinstance(good, jax.core.Tracer):
-        if _put_down is not None and _put_down[0] == get_opaque_trace_state():
-            _put_down[1].append((message, ~jnp.all(good)))
-            return array
-        return eqx.error_if(array, ~jnp.all(good), message + ".")
+        return watched(array, message, ~jnp.all(good))
     known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
     if not good.all():
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
+
+
+def watched(values, message: str, failed: Bool[ArrayLike, ""]):
+    """Return `values`, which are traced, with a check: it is put down, or made where they are computed."""
+    if _put_down is not None and _put_down[0] == get_opaque_trace_state():
+        _put_down[1].append((message, failed))
+        return values
+    return eqx.error_if(values, failed, message + ".")
 
 
 _put_down: tuple | None = None

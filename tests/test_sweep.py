@@ -222,7 +222,7 @@ def fresh(code, *, seed="0"):
 def test_fingerprints_are_the_same_in_every_process():
     code = """
 import jax, numpy as np, jaxrock as rk
-from jaxrock.traced import Traced
+from jaxrock.transforms.fingerprint import Traced
 record = rk.Record(np.arange(5.0), 0.01)
 print(Traced(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtypeStruct((), "float32")}).fingerprint)
 """

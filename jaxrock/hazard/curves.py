@@ -365,8 +365,8 @@ def _first_factor(excess: Callable, numbers: PyTree) -> Number:
 def _first_factor_jvp(excess, primals, tangents):
     (numbers,), (changes,) = primals, tangents
     factor = _first_factor(excess, numbers)
-    found = (factor > 0) & (factor < jnp.inf)
-    logarithm = jnp.log(jnp.where(found, factor, 1.0))
+    exists = (factor > 0) & (factor < jnp.inf)
+    logarithm = jnp.log(jnp.where(exists, factor, 1.0))
     _, slope = jax.jvp(lambda x: excess(x, numbers), (logarithm,), (jnp.ones_like(logarithm),))
     _, change = jax.jvp(lambda n: excess(logarithm, n), (numbers,), (changes,))
-    return factor, change * jnp.where(found, -jnp.exp(logarithm) / jnp.where(found, slope, 1.0), 0.0)
+    return factor, change * jnp.where(exists, -jnp.exp(logarithm) / jnp.where(exists, slope, 1.0), 0.0)

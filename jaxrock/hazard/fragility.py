@@ -188,16 +188,16 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)
     status = FitStatus.where(converged, status, FitStatus.not_converged)
     status = FitStatus.where(separable, FitStatus.separable, status)
-    found = (
+    fit = (
         LogNormalFragility(1.0, 1.0),
         jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T)),
         likelihood,
     )
     # Put in afterwards: the constructor refuses NaN.
-    found = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), found, (median, dispersion))
+    fit = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), fit, (median, dispersion))
     good = status == FitStatus.successful
-    found = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), found)
-    return FragilityFit(*found, highest_survived, lowest_toppled, status)
+    fit = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), fit)
+    return FragilityFit(*fit, highest_survived, lowest_toppled, status)
 
 
 def probit(z, toppled, survived):

@@ -5,8 +5,7 @@ verdict of every scene is kept, so that nothing is made monotone before a lognor
 without a verdict bounds the probability from both sides.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -23,6 +22,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.motions.suite import Suite, size_of
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
@@ -107,11 +107,11 @@ class SimulatedFragility(eqx.Module):
         """
         toppled = self.counts(bound)
         motions, _, draws = self.verdict.shape
-        found = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
-        if motions == 1 or found.status != FitStatus.successful:
-            return found
-        clustered = _clustered(found, self.levels, jnp.asarray(toppled), float(draws))
-        return eqx.tree_at(lambda f: f.covariance, found, clustered)
+        fit = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
+        if motions == 1 or fit.status != FitStatus.successful:
+            return fit
+        clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
+        return eqx.tree_at(lambda f: f.covariance, fit, clustered)
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -153,14 +153,14 @@ class SimulatedFragility(eqx.Module):
 
 
 @eqx.filter_jit
-def _clustered(found: FragilityFit, levels, toppled, draws):
+def _clustered(fit: FragilityFit, levels, toppled, draws):
     """Covariance of (ln median, ln dispersion) where what one motion (a row) does at all levels is one outcome."""
-    median, dispersion = found.fragility.median, found.fragility.dispersion
+    median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
     rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
     scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
     motions = toppled.shape[0]
-    return found.covariance @ (scores.T @ scores * motions / (motions - 1)) @ found.covariance
+    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance
 
 
 def simulated_fragility(
@@ -229,16 +229,13 @@ def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, e
         np.tile(np.repeat(draw, levels), motions),
         np.repeat(factors[:, None, :], draws, axis=1).ravel(),
     )
-    found = surface(_verdict(model, engine), points, (blocks, group), "fragility", progress, outer=False)
-    return np.asarray(found).reshape(motions, draws, levels).swapaxes(1, 2)
+    scene = blocks, group, current_model(model, blocks, group, factors), engine
+    table = surface(_verdict, points, scene, "fragility", progress, outer=False)
+    return np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2)
 
 
-@functools.lru_cache(maxsize=32)
-def _verdict(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
-    def one(index, draw, factor, scene):
-        blocks, group = scene
-        found = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
-        verdict = jnp.where(found.overturned, TOPPLED, STOOD)
-        return jnp.where(found.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)
-
-    return one
+def _verdict(index, draw, factor, scene):
+    blocks, group, model, engine = scene
+    result = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
+    verdict = jnp.where(result.overturned, TOPPLED, STOOD)
+    return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

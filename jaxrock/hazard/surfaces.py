@@ -108,13 +108,13 @@ def fit_surface(
     )
     if labels.shape != acceleration.shape:
         raise ValueError(f"Argument `clusters` must have shape {acceleration.shape}, but has shape {labels.shape}.")
-    found, scores = _fit(acceleration, ratio, toppled, trials - toppled)
+    fit, scores = _fit(acceleration, ratio, toppled, trials - toppled)
     count = int(labels.max()) + 1
     if count < 2 or count == acceleration.size:
-        return found
+        return fit
     summed = jnp.zeros((count, 3)).at[labels].add(scores)
     middle = summed.T @ summed * count / (count - 1)
-    return eqx.tree_at(lambda f: f.covariance, found, found.covariance @ middle @ found.covariance)
+    return eqx.tree_at(lambda f: f.covariance, fit, fit.covariance @ middle @ fit.covariance)
 
 
 @jax.jit

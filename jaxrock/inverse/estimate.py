@@ -164,23 +164,23 @@ def estimate_motion(
     problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
     bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
-    found = climb(evaluate, _starts(starts, evaluate))
+    summits = climb(evaluate, _starts(starts, evaluate))
     if not np.isfinite(evaluate.lowest):
         raise ValueError("Argument `unknowns` must have ranges in which there are motions, but all its values are bad.")
     for _ in range(_ROUNDS_BESIDE):
-        more, before = climb(evaluate, _beside(evaluate, found)), found.values.max()
-        found = _joined(more, found)
-        if found.values.max() < before + _GAIN:
+        more, before = climb(evaluate, _beside(evaluate, summits)), summits.values.max()
+        summits = _joined(more, summits)
+        if summits.values.max() < before + _GAIN:
             break
     for _ in range(3):
-        best = int(np.argmax(found.values))
-        shape = shape_at(evaluate, found.points[best])
-        profiled = profile(evaluate, found, shape)
+        best = int(np.argmax(summits.values))
+        shape = shape_at(evaluate, summits.points[best])
+        profiled = profile(evaluate, summits, shape)
         if profiled.better is None:
             break
         # A profile went over a pass to a higher summit.
-        found = _joined(climb(evaluate, profiled.better[None]), found)
-    result = _conclude(evaluate, found, shape, profiled)
+        summits = _joined(climb(evaluate, profiled.better[None]), summits)
+    result = _conclude(evaluate, summits, shape, profiled)
     bar.add(bar.total - bar.done)
     return result
 
@@ -196,19 +196,19 @@ def _starts(count: int, evaluate: Evaluator) -> np.ndarray:
     return evaluate.points(places[np.concatenate([order[~beside], order[beside]])[:count]])
 
 
-def _beside(evaluate: Evaluator, found: Summits) -> np.ndarray:
+def _beside(evaluate: Evaluator, summits: Summits) -> np.ndarray:
     """The best of some points around the highest summit: gaps that are narrower than the scatter make small summits
     beside it."""
     low, high = evaluate.ends
-    best = evaluate.places(found.points[np.argmax(found.values)])
+    best = evaluate.places(summits.points[np.argmax(summits.values)])
     places = best + _BESIDE * (_spread(_SCREENED_BESIDE, evaluate) - (low + high) / 2)
     places = np.clip(places, low, high)
     order = np.argsort(-evaluate.at(places)[0], kind="stable")
     return evaluate.points(places[order[: _SCREENED_BESIDE // _SCREENED]])
 
 
-def _joined(more: Summits, found: Summits) -> Summits:
-    return Summits(*(np.concatenate(pair) for pair in zip(more, found)))
+def _joined(more: Summits, summits: Summits) -> Summits:
+    return Summits(*(np.concatenate(pair) for pair in zip(more, summits)))
 
 
 def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
@@ -221,24 +221,24 @@ def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
     return low + (high - low) * (0.01 + 0.98 * share)
 
 
-def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profile) -> Estimate:
+def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Profile) -> Estimate:
     problem = evaluate.problem
-    best = int(np.argmax(found.values))
-    places = jnp.asarray(evaluate.places(found.points))
+    best = int(np.argmax(summits.values))
+    places = jnp.asarray(evaluate.places(summits.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     values = {name: x[best] for name, x in problem.values(places).items()}
-    stands, computed, *facts = evaluate.facts(evaluate.places(found.points[best]))
+    stands, computed, *facts = evaluate.facts(evaluate.places(summits.points[best]))
     surprise = _surprise(facts)
     probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
     remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
     status = EstimateStatus.successful
     if profiled.open.any():
         status = EstimateStatus.open_interval
-    if found.values[best] - evaluate.lowest < _RATIO:
+    if summits.values[best] - evaluate.lowest < _RATIO:
         status = EstimateStatus.no_information
     elif profiled.open.all():
         remarks += ("They allow some combinations of these and not others: `feasible_region` maps them.",)
-    if not found.arrived[best] and not profiled.open.any():
+    if not summits.arrived[best] and not profiled.open.any():
         status = EstimateStatus.not_converged
     if np.mean(computed) < _COMPUTED:
         status = EstimateStatus.not_computed
@@ -246,7 +246,7 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
     if surprise > _SURPRISED:
         status = EstimateStatus.contradictory
         interval, covariance = np.full_like(interval, np.nan), np.full_like(covariance, np.nan)
-        consistent = _consistent(evaluate, found.points[best])
+        consistent = _consistent(evaluate, summits.points[best])
         names = problem.likelihood.observations.names
         worst = np.argsort(np.asarray(probability))[:3]
         worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
@@ -262,13 +262,13 @@ def _conclude(evaluate: Evaluator, found: Summits, shape: Shape, profiled: Profi
         covariance=jnp.asarray(covariance),
         directions=jnp.asarray(shape.directions),
         deviations=jnp.asarray(shape.deviations),
-        log_likelihood=jnp.asarray(found.values[best]),
+        log_likelihood=jnp.asarray(summits.values[best]),
         surprise=jnp.asarray(surprise),
         probability=probability,
         scatter=problem.likelihood.scatter,
         consistent_scatter=jnp.asarray(consistent),
         summits=jnp.stack(list(problem.values(places).values()), axis=-1),
-        summit_values=jnp.asarray(found.values),
+        summit_values=jnp.asarray(summits.values),
         responses=evaluate.count * per_point,
         remarks=remarks,
         status=status,
@@ -288,9 +288,9 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
         again = Evaluator(problem)
         starts = np.concatenate([point[None], _starts(_RETRIES, again)])
-        found = climb(again, starts)
+        summits = climb(again, starts)
         evaluate.count += again.count
-        if _surprise(again.facts(again.places(found.points[np.argmax(found.values)]))[2:]) <= _SURPRISED:
+        if _surprise(again.facts(again.places(summits.points[np.argmax(summits.values)]))[2:]) <= _SURPRISED:
             return float(scatter)
     return np.inf
 

@@ -63,15 +63,16 @@ def feasible_region(
         if values.ndim != 1 or values.size == 0 or not bool(jnp.isfinite(values).all()):
             raise ValueError(f"Argument `over` must hold lists of finite values, but not for `{name}`.")
     rows, columns = (x.ravel() for x in jnp.meshgrid(*lists.values(), indexing="ij"))
-    bar, found = Progress(rows.size, "region", progress), []
+    rest = {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
+    likelihood = likelihood.current((*lists, *rest))
+    bar, terms = Progress(rows.size, "region", progress), []
     for begin in range(0, rows.size, _LANES):
         parts = (x[begin : begin + _LANES] for x in (rows, columns))
         count = min(_LANES, rows.size - begin)
         parts = (jnp.pad(x, (0, _LANES - count), mode="edge") for x in parts)
-        values = dict(zip(lists, parts)) | {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
-        found.append(np.asarray(_log_likelihood(likelihood, values))[:count])
+        terms.append(np.asarray(_log_likelihood(likelihood, dict(zip(lists, parts)) | rest))[:count])
         bar.add(count)
-    total = jnp.asarray(np.concatenate(found)).reshape(*(x.size for x in lists.values()))
+    total = jnp.asarray(np.concatenate(terms)).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
     return FeasibleRegion(tuple(lists), tuple(lists.values()), total, total > total.max() + np.log(0.05))
 
@@ -132,7 +133,7 @@ def unexceeded_motion(
     seen = observations.of(standing)
     ways, size = seen.ways, durations.size
     blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, size), len(ways)), seen.blocks)
-    found = critical_amplitudes(
+    critical = critical_amplitudes(
         blocks,
         jax.vmap(motion)(jnp.repeat(ways.ravel(), size), jnp.tile(positive("durations", durations), ways.size)),
         model,
@@ -141,8 +142,8 @@ def unexceeded_motion(
         engine=engine,
         progress=progress,
     )
-    by_rock = found.lowest.reshape(*ways.shape, size).max(axis=0)
+    by_rock = critical.lowest.reshape(*ways.shape, size).max(axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
-    complete = found.complete.reshape(-1, size).all(axis=0)
+    complete = critical.complete.reshape(-1, size).all(axis=0)
     return Unexceeded(durations, amplitude, by_rock, weakest, complete)

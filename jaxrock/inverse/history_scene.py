@@ -19,6 +19,7 @@ from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.history import simulate
 from jaxrock.status import Status
 from jaxrock.studies.parameters import declarations, named, rebuilt
@@ -62,6 +63,7 @@ class FittedScene(eqx.Module):
         block = _given(block, names)
         if engine is None:
             engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
+        model = current_model(model, block, motion)
         return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
 
     @property

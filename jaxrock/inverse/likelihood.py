@@ -20,7 +20,7 @@ Of an asymmetric rock of which it is not known which way round it stood in the s
 both ways.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -37,8 +37,10 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
+from jaxrock.transforms.user_function import ByIdentity, current_function
 
 Real = Inexact[Array, "..."]
 
@@ -55,7 +57,8 @@ class Likelihood(eqx.Module):
     **Arguments:**
 
     - `observations`: an `Observations`.
-    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do.
+    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
+      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced).
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
@@ -69,7 +72,7 @@ class Likelihood(eqx.Module):
     observations: Observations
     scatter: Real
     lapse: Real
-    motion: Callable = eqx.field(static=True)
+    motion: Callable[..., AbstractMotion]
     model: AbstractEquation
     engine: AbstractEngine | None
 
@@ -84,9 +87,16 @@ class Likelihood(eqx.Module):
     ):
         if isinstance(motion, AbstractMotion):
             raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
-        self.observations, self.motion, self.model, self.engine = observations, motion, model, engine
+        self.observations, self.model, self.engine = observations, model, engine
+        self.motion = motion if isinstance(motion, eqx.Module) else ByIdentity(motion)
         self.scatter = positive("scatter", scatter)
         self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+
+    def current(self, names: Sequence[str]) -> "Likelihood":
+        """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`."""
+        seen, number = self.observations, jax.ShapeDtypeStruct((), jnp.result_type(float))
+        parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
+        return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
     def log_terms(self, values: dict[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
@@ -107,9 +117,9 @@ class Likelihood(eqx.Module):
         ends = jnp.full_like(density[:1], _FLAT)
         density = jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0)
         stands, topples = possible.log_probability(True, density), possible.log_probability(False)
-        found = jnp.where(seen.seen == TOPPLED, topples, stands)
-        found = self._or_lapse(found, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
-        return jnp.where(impossible[..., None], -jnp.inf, found)
+        terms = jnp.where(seen.seen == TOPPLED, topples, stands)
+        terms = self._or_lapse(terms, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
+        return jnp.where(impossible[..., None], -jnp.inf, terms)
 
     def _or_lapse(self, log_probability: Real, flat: Real | float = 0.0) -> Real:
         """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
@@ -170,10 +180,10 @@ class Likelihood(eqx.Module):
                 with put_down():  # those of the motion are looked at before, and the rocks are known to be good
                     motion = self.motion(**dict(zip(names, parameters)))
                     motion = _of_strength(motion, level, way)
-                    found = outcome(block, motion, self.model, engine=self.engine)
-                rotation = jnp.where(found.overturned, 0.0, found.max_rotation)
-                real = jnp.stack([found.margin, rotation])
-                return real, (real, found.overturned, found.status == Status.successful)
+                    result = outcome(block, motion, self.model, engine=self.engine)
+                rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
+                real = jnp.stack([result.margin, rotation])
+                return real, (real, result.overturned, result.status == Status.successful)
 
             if not slopes:
                 return None, results(parameters)[1]

@@ -81,7 +81,7 @@ def read_observations(path: str | Path) -> Observations:
         raise file_error(path.name, "holds no rocks: it must have a line of column names, and one for each rock.")
     header = rows[0][1]
     _check_header(path.name, header)
-    found = []
+    rocks = []
     for number, fields in rows[1:]:
         try:
             if len(fields) != len(header):
@@ -90,8 +90,8 @@ def read_observations(path: str | Path) -> Observations:
             _observations([rock])
         except ValueError as error:
             raise file_error(path.name, f"line {number}: {error}") from None
-        found.append(rock)
-    return _observations(found, [rock["name"] or f"line {number}" for rock, (number, _) in zip(found, rows[1:])])
+        rocks.append(rock)
+    return _observations(rocks, [rock["name"] or f"line {number}" for rock, (number, _) in zip(rocks, rows[1:])])
 
 
 def _observations(rocks: list[dict], names: list[str] | None = None) -> Observations:

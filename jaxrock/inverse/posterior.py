@@ -185,12 +185,12 @@ class _Density:
     """Log-densities at any number of places, in batches of one compiled program; it counts."""
 
     def __init__(self, problem: Problem):
-        self.problem, self.count = problem, 0
+        self.problem, self.count = problem.current(), 0
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         self.count += len(places)
-        (found,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
-        return np.where(np.isnan(found), -np.inf, found)
+        (density,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
+        return np.where(np.isnan(density), -np.inf, density)
 
 
 def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:

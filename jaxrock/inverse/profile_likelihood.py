@@ -64,7 +64,7 @@ class _Row(NamedTuple):
     place: np.ndarray
 
 
-def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
+def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
     """Ends of the intervals in which the profile of the log-likelihood is less than 1.92 below its maximum.
 
     For every parameter and side: some values outward to the end of the range, the others climbing at each; then the
@@ -72,7 +72,7 @@ def profile(evaluate: Evaluator, found: Summits, shape: Shape) -> Profile:
     """
     low, high = evaluate.ends
     size = high - low
-    sides = _Sides(evaluate, found.values.max(), shape.place)
+    sides = _Sides(evaluate, summits.values.max(), shape.place)
     variance = np.diagonal(shape.covariance)
     spread = np.minimum(np.sqrt(np.where(np.isfinite(variance), variance, np.inf)), size / 8)
     for multiple in (1.0, 2.0, 3.5, np.inf):

@@ -51,8 +51,8 @@ class Unknown(eqx.Module):
             raise ValueError(f"Argument `prior` must be a median and a standard deviation, but is {prior!r}.")
         self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
         if prior is not None and not _FARTHEST >= self._away:
-            found = f"{prior} with a range of {low} to {high}"
-            raise ValueError(f"Argument `prior` must be within five standard deviations of the range, but is {found}.")
+            given = f"{prior} with a range of {low} to {high}"
+            raise ValueError(f"Argument `prior` must be within five standard deviations of the range, but is {given}.")
 
     @property
     def ends(self) -> Float[Array, "2"]:
@@ -99,6 +99,10 @@ class Problem(eqx.Module):
         """Ranges of the places: logarithms of parameters, or parameters themselves."""
         return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
 
+    def current(self) -> "Problem":
+        """The same with motion and model as they are now."""
+        return eqx.tree_at(lambda problem: problem.likelihood, self, self.likelihood.current(self.names))
+
     def values(self, places: Real) -> dict[str, Real]:
         """Parameters by name."""
         return {
@@ -132,13 +136,13 @@ def in_batches(
 ) -> list[np.ndarray]:
     """Results of `function`, each (n, ...), at any number of places, (n, parameters): so many of them at a time that
     one compiled program serves for all."""
-    found = []
+    results = []
     for begin in range(0, len(places), lanes):
         part = places[begin : begin + lanes]
         padded = np.pad(part, ((0, lanes - len(part)), (0, 0)), mode="edge")
-        found.append([np.asarray(x)[: len(part)] for x in function(padded)])
+        results.append([np.asarray(x)[: len(part)] for x in function(padded)])
         progress(len(part))
-    return [np.concatenate(x) for x in zip(*found)]
+    return [np.concatenate(x) for x in zip(*results)]
 
 
 class Evaluator:
@@ -149,7 +153,7 @@ class Evaluator:
     """
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
-        self.problem, self.count, self.progress = problem, 0, progress
+        self.problem, self.count, self.progress = problem.current(), 0, progress
         self.ends = np.asarray(problem.ends).T
         self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar
 
@@ -28,13 +29,14 @@ class Equation(AbstractEquation):
     A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
     The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
-    Equinox modules may carry parameters to differentiate. A block that has stopped below its unstable equilibrium
-    after the motion counts as safe: what dissipates does not lift.
+    Equinox modules may carry parameters to differentiate. They may read what changes: every call of the package sees
+    them as they are then (within a function of yours under `jax.jit`, as when that was traced). A block that has
+    stopped below its unstable equilibrium after the motion counts as safe: what dissipates does not lift.
 
     **Raises:** ValueError where neither or both ways are used.
     """
 
-    _acceleration: "_Function"
+    _acceleration: Callable
     _falls_flat: bool = eqx.field(static=True)
 
     def __init__(
@@ -49,7 +51,7 @@ class Equation(AbstractEquation):
         if (restoring is None) == (acceleration is None) or (acceleration is not None and (arm or dissipation)):
             raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
         parts = (restoring, arm, dissipation) if acceleration is None else (acceleration,)
-        self._acceleration = _Function(parts)
+        self._acceleration = Functions(parts)
         self._falls_flat = falls_flat
 
     def moments(self, block: Block | Side) -> "FunctionMoments":
@@ -67,7 +69,7 @@ class Equation(AbstractEquation):
         return False
 
 
-class _Function(eqx.Module):
+class Functions(eqx.Module):
     """Functions, as leaves where they are modules (with parameters) and static where they are plain."""
 
     modules: tuple
@@ -86,18 +88,26 @@ class _Function(eqx.Module):
         return -moment if dissipation is None else -moment - dissipation(x, v, block)
 
 
+def as_functions_see(block: Block | Side) -> Block | Side:
+    """A block with a restitution, given or not, so that functions are traced for all blocks of a kind at once."""
+    if isinstance(block, Side):
+        return block
+    law = eqx.tree_at(lambda constant: constant.value, Constant(0.0), block.restitution)
+    return eqx.tree_at(lambda b: b.law, block, law, is_leaf=lambda x: x is block.law)
+
+
 class FunctionMoments(AbstractMoments):
     """The moments of a model that is given as functions."""
 
-    function: _Function
+    function: Callable
     block: Block | Side
     factor: Scalar | None  # of all accelerations (see `times`)
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
 
-    def __init__(self, function: _Function, block: Block | Side, factor: Scalar | None = None):
-        self.function, self.block, self.factor = function, block, factor
+    def __init__(self, function: Callable, block: Block | Side, factor: Scalar | None = None):
+        self.function, self.block, self.factor = function, as_functions_see(block), factor
         zero = Angle.of(jnp.zeros_like(block.alpha))
         self.restoring_at_rest = eqx.error_if(
             self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."

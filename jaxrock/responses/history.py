@@ -17,6 +17,7 @@ from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, conclude
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import differentiable
@@ -179,6 +180,7 @@ def simulate(
         duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
         duration = scalar("duration", duration)
     say_if_single()
+    model = current_model(model, block, motion)
     summary, path = _simulate(block, motion, model, start_of(initial), duration, engine_of(engine, model))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     return Response(time, *_evaluate(path, time), summary, path)

@@ -19,6 +19,7 @@ from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status
 from jaxrock.transforms.batching import Passes
 from jaxrock.transforms.differentiation import differentiable
@@ -103,7 +104,7 @@ def outcome(
             "`simulate`."
         )
     say_if_single()
-    return _outcome(block, motion, model, start_of(initial), engine_of(engine, model))
+    return _outcome(block, motion, current_model(model, block, motion), start_of(initial), engine_of(engine, model))
 
 
 @jax.jit

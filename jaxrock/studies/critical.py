@@ -6,7 +6,6 @@ still. A bisection of the verdict finds one end of them by chance. Here the marg
 at sampled points tell where something may hide between two of them, and only there the sampling is refined.
 """
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -24,6 +23,7 @@ from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
@@ -97,6 +97,7 @@ def critical_amplitudes(
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
     low, high = _rising("intensity", intensity)
+    model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
@@ -128,6 +129,7 @@ def critical_durations(
     low, high = _rising("factor", factor)
     if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
+    model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
@@ -174,24 +176,24 @@ class _Scenes(eqx.Module):
         return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
 
 
-# What is varied: z is the logarithm of a factor. Equal settings are one object, so that they compile once.
+# What is varied: z is the logarithm of a factor.
 
 
-class _Kind:
-    def __init__(self, model: AbstractEquation, engine: AbstractEngine | None):
-        self.model, self.engine = model, engine
+class _Kind(eqx.Module):
+    model: AbstractEquation
+    engine: AbstractEngine | None
 
     def margin(self, z, block, motion):
         """Margin and outcome of the scene with the factor e^z."""
-        found = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
-        return found.margin, found
+        result = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
+        return result.margin, result
 
     def at(self, z, index, scenes):
         """Margin, its slope, impacts and status of one point."""
         place = one_of_many(scenes, index)
-        margin, slope, found = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
-        decided = (found.status == Status.successful) | (found.status == Status.undecided)
-        return jnp.where(decided, margin, jnp.nan), slope, found.impact_count
+        margin, slope, result = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
+        decided = (result.status == Status.successful) | (result.status == Status.undecided)
+        return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
 
     def slopes(self, z, index, scenes):
         """Derivatives of the logarithm of the critical value by the parameters."""
@@ -239,24 +241,28 @@ class _Duration(_Kind):
         return name not in ("duration", "period", "dt")
 
 
-@functools.lru_cache(maxsize=32)
-def _compiled(kind: type, model: AbstractEquation, engine: AbstractEngine | None, slopes: bool) -> Callable:
-    return kind(model, engine).slopes if slopes else kind(model, engine).at
+def _at(z, index, scene):
+    kind, scenes = scene
+    return kind.at(z, index, scenes)
+
+
+def _slopes(z, index, scene):
+    kind, scenes = scene
+    return kind.slopes(z, index, scenes)
 
 
 def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool, progress: bool | None) -> Critical:
     """Search, find, differentiate, and sort by scenes."""
     scene = scenes.block, scenes.motion
 
-    def run(slopes, z, index):
-        function = _compiled(type(kind), kind.model, kind.engine, slopes)
-        return surface(function, (z, index), scene, "critical", progress, outer=False)
+    def run(function, z, index):
+        return surface(function, (z, index), (kind, scene), "critical", progress, outer=False)
 
     def at(z, index):
-        return tuple(map(np.asarray, run(False, z, index)))
+        return tuple(map(np.asarray, run(_at, z, index)))
 
-    found, complete = _brackets(at, grid)
-    ends = _roots(at, found)
+    brackets, complete = _brackets(at, grid)
+    ends = _roots(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
     names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
@@ -264,7 +270,7 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
     value = np.exp(ends["z"]) * units[ends["index"]]
     derivative = np.full((order.size, len(names)), np.nan)
     if derivatives and order.size:
-        slopes = run(True, ends["safe"], ends["index"])
+        slopes = run(_slopes, ends["safe"], ends["index"])
         derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
         derivative[~ends["balanced"]] = np.nan
     amplitude = value if isinstance(kind, _Amplitude) else scenes.amplitude[ends["index"]]
@@ -341,9 +347,9 @@ def _may_hide(z: np.ndarray, margin: np.ndarray, slope: np.ndarray, impacts: np.
     return (lowest < 0.3 * np.minimum(low, high)) | plunges | gap
 
 
-def _roots(at: Callable, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _roots(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The end in every bracket to rounding, by Newton's method, which bisection keeps within it."""
-    index, z, margin, slope, impacts = (found[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
+    index, z, margin, slope, impacts = (brackets[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
     columns = np.arange(index.size)
     for count in range(120):
         width = z[1] - z[0]

@@ -1,8 +1,5 @@
 """How a response depends on the parameters of its scene, and how far that can be trusted."""
 
-import functools
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +14,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
@@ -93,11 +91,11 @@ def sensitivity(
 
     def results(values):
         changed = rebuilt(block, motion, dict(zip(names, values)))
-        found = outcome(*changed, model, engine=engine)
-        return jnp.stack([getattr(found, name) for name in _RESULTS]), found
+        result = outcome(*changed, model, engine=engine)
+        return jnp.stack([getattr(result, name) for name in _RESULTS]), result
 
-    rows, found = jax.jacfwd(results, has_aux=True)(values)
-    valid = (found.status == Status.successful) & found.differentiable
+    rows, result = jax.jacfwd(results, has_aux=True)(values)
+    valid = (result.status == Status.successful) & result.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]
     strength = uplift_threshold(block, model) / jnp.abs(amplitude)
@@ -106,7 +104,7 @@ def sensitivity(
     values = jnp.append(values, strength)
 
     def slopes(name, known):
-        value, row = getattr(found, name), rows[_RESULTS.index(name)]
+        value, row = getattr(result, name), rows[_RESULTS.index(name)]
         relative = row * values / jnp.where(value == 0, 1.0, value)
         row, relative = (jnp.where(known, x, jnp.nan) for x in (row, relative))
         return Slopes(value, row, relative)
@@ -117,7 +115,7 @@ def sensitivity(
         near = jnp.isfinite(value) & (steepest > 0)
         return jnp.where(near, jnp.abs(value) / jnp.where(near, steepest, 1.0), jnp.inf)
 
-    successful = found.status == Status.successful
+    successful = result.status == Status.successful
     rotation = slopes("max_rotation", valid)
     return Sensitivity(
         names=(*names, "uplift_strength"),
@@ -125,11 +123,11 @@ def sensitivity(
         max_rotation=rotation,
         max_velocity=slopes("max_velocity", valid),
         margin=slopes("margin", successful),
-        outcome=found,
+        outcome=result,
         valid=valid,
         condition=jnp.linalg.norm(rotation.elasticity[:independent]),
-        graze_distance=distance("clearance", found.clearance),
-        boundary_distance=distance("margin", found.margin),
+        graze_distance=distance("clearance", result.clearance),
+        boundary_distance=distance("margin", result.margin),
     )
 
 
@@ -174,19 +172,16 @@ def sensitivity_map(
     """
     strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
     shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
-    Block(alpha, 1.0, restitution)  # raises here, where values are known
-    scene = shape, alpha, None if restitution is None else as_real("restitution", restitution)
-    found = surface(_under_lobe(model, engine), (strength, duration), scene, "sensitivity", progress)
-    return SensitivityMap(strength, duration, shape, found)
+    block = Block(alpha, 1.0, restitution)  # raises here, where values are known
+    model = current_model(model, block, shape, strength, duration)
+    scene = shape, block.alpha, block.given_restitution, model, engine
+    sensitivities = surface(_under_lobe, (strength, duration), scene, "sensitivity", progress)
+    return SensitivityMap(strength, duration, shape, sensitivities)
 
 
-@functools.lru_cache(maxsize=32)
-def _under_lobe(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
-    def one(strength, duration, scene):
-        shape, alpha, restitution = scene
-        block = Block(alpha, jnp.ones_like(alpha), restitution)
-        # Positive acceleration drives negative rotation; the size of the response is the same.
-        pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
-        return sensitivity(block, pulse, model, engine=engine)
-
-    return one
+def _under_lobe(strength, duration, scene) -> Sensitivity:
+    shape, alpha, restitution, model, engine = scene
+    block = Block(alpha, jnp.ones_like(alpha), restitution)
+    # Positive acceleration drives negative rotation; the size of the response is the same.
+    pulse = ExponentialPulse(model.moments(block).threshold / strength, duration, shape)
+    return sensitivity(block, pulse, model, engine=engine)

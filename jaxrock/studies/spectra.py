@@ -1,22 +1,24 @@
 """Whole surfaces: rocking spectra and overturning maps."""
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._checks import Values, as_real, positive
+from jaxrock._checks import Values, positive
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.sinusoidal import SinePulse
+from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
+from jaxrock.transforms.user_function import current_function
 
 
 class Spectrum(eqx.Module):
@@ -84,10 +86,11 @@ def rocking_spectrum(
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
     period = axis("period", period)
-    Block(alpha, 1.0, restitution)  # raises here, where values are known
+    block = Block(alpha, 1.0, restitution)  # raises here, where values are known
 
-    scene = (as_real("alpha", alpha), motion, None if restitution is None else as_real("restitution", restitution))
-    return Spectrum(period, **surface(_under_motion(model, engine), (period,), scene, "spectrum", progress))
+    alpha, restitution = block.alpha, block.given_restitution
+    scene = alpha, restitution, motion, current_model(model, block, motion, period), engine
+    return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress))
 
 
 def self_similar_spectrum(
@@ -108,7 +111,8 @@ def self_similar_spectrum(
     - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
     - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
     - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
-    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that).
+    - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that): a pulse of the
+      package, or any function that JAX can trace; what it reads may have changed since the last call.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Spectrum` with results of shape (rows, n).
@@ -117,10 +121,10 @@ def self_similar_spectrum(
 
     **Source:** Dimitrakopoulos & DeJong (2012), section 4.
     """
-    found, ratio, intensity = _over_pulses(
-        _peaks, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
+    results, ratio, intensity = _over_pulses(
+        _peaks_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
     )
-    return Spectrum(abscissa=ratio, intensity=intensity, **found)
+    return Spectrum(abscissa=ratio, intensity=intensity, **results)
 
 
 def overturning_map(
@@ -144,22 +148,23 @@ def overturning_map(
 
     **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
     """
-    found, ratio, intensity = _over_pulses(
-        _states, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
+    results, ratio, intensity = _over_pulses(
+        _states_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
     )
-    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **found)
+    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **results)
 
 
-def _over_pulses(quantities, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
+def _over_pulses(function, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
     """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
     ratio, intensity = axis("frequency_ratio", frequency_ratio), axis("intensity", intensity)
-    Block(alpha, 1.0, restitution)
+    block = Block(alpha, 1.0, restitution)
 
-    scene = (as_real("alpha", alpha), None if restitution is None else as_real("restitution", restitution))
+    number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, ratio, intensity))
+    pulse, model = current_function(pulse, number, number), current_model(model, block, ratio, intensity)
+    scene = block.alpha, block.given_restitution, pulse, model, engine
     # Neighbours in intensity share a chunk: they move alike.
-    function = _under_pulse(quantities, pulse, model, engine)
-    found = surface(function, (intensity, ratio), scene, label, progress, columns=True)
-    return found, ratio, intensity
+    results = surface(function, (intensity, ratio), scene, label, progress, columns=True)
+    return results, ratio, intensity
 
 
 def axis(name: str, values: Values) -> Float[Array, " n"]:
@@ -172,42 +177,41 @@ def axis(name: str, values: Values) -> Float[Array, " n"]:
 # What a surface keeps of an outcome: computed with it, point by point.
 
 
-def _peaks(found: Outcome, block: Block) -> dict:
+def _peaks(result: Outcome, block: Block) -> dict:
     """Of a spectrum."""
-    rest = {name: getattr(found, name) for name in ("impact_count", "overturned", "margin", "status")}
-    velocity = found.max_velocity / (block.p * block.alpha)
-    return {"max_rotation": found.max_rotation / block.alpha, "max_velocity": velocity, **rest}
+    rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
+    velocity = result.max_velocity / (block.p * block.alpha)
+    return {"max_rotation": result.max_rotation / block.alpha, "max_velocity": velocity, **rest}
 
 
-def _states(found: Outcome, block: Block) -> dict:
+def _states(result: Outcome, block: Block) -> dict:
     """Of a map."""
-    rest = {name: getattr(found, name) for name in ("impact_count", "margin", "status")}
-    state = jnp.where(found.overturned, jnp.where(found.impact_count > 0, 2, 1), 0)
-    state = jnp.where(found.status == Status.successful, state, -1)
-    return {"state": state, "max_rotation": found.max_rotation / block.alpha, **rest}
+    rest = {name: getattr(result, name) for name in ("impact_count", "margin", "status")}
+    state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
+    state = jnp.where(result.status == Status.successful, state, -1)
+    return {"state": state, "max_rotation": result.max_rotation / block.alpha, **rest}
 
 
-# One function for each kind of surface, so that a second surface of a kind is not compiled again.
+# The functions of surfaces. What is given for all points lies in the scene, a pytree, so that a second surface of a
+# kind is not compiled again.
 
 
-@functools.lru_cache(maxsize=32)
-def _under_motion(model: AbstractEquation, engine: AbstractEngine | None) -> Callable:
-    def one(period, scene):
-        alpha, motion, restitution = scene
-        block = Block(alpha, 2 * jnp.pi / period, restitution)
-        return _peaks(outcome(block, motion, model, engine=engine), block)
-
-    return one
+def _under_motion(period, scene):
+    alpha, restitution, motion, model, engine = scene
+    block = Block(alpha, 2 * jnp.pi / period, restitution)
+    return _peaks(outcome(block, motion, model, engine=engine), block)
 
 
-@functools.lru_cache(maxsize=32)
-def _under_pulse(
-    quantities: Callable, pulse: Callable, model: AbstractEquation, engine: AbstractEngine | None
-) -> Callable:
-    def one(intensity, ratio, scene):
-        alpha, restitution = scene
-        block = Block(alpha, jnp.ones_like(alpha), restitution)
-        motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio)
-        return quantities(outcome(block, motion, model, engine=engine), block)
+def _under_pulse(intensity, ratio, scene) -> tuple[Outcome, Block]:
+    alpha, restitution, pulse, model, engine = scene
+    block = Block(alpha, jnp.ones_like(alpha), restitution)
+    motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio)
+    return outcome(block, motion, model, engine=engine), block
 
-    return one
+
+def _peaks_under_pulse(intensity, ratio, scene) -> dict:
+    return _peaks(*_under_pulse(intensity, ratio, scene))
+
+
+def _states_under_pulse(intensity, ratio, scene) -> dict:
+    return _states(*_under_pulse(intensity, ratio, scene))

@@ -1,17 +1,13 @@
 """Results over labelled axes, and their way into files and xarray."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Num
-
-from jaxrock.responses.outcome import Outcome
-from jaxrock.status import Status
 
 POINT = "point"  # the one dimension of axes that go side by side
 
@@ -106,7 +102,7 @@ class Grid(eqx.Module):
                 data = data.drop_vars(FINISHED)
             axes = {str(name): np.asarray(values) for name, values in data.coords.items()}
             values = {str(name): np.asarray(values) for name, values in data.data_vars.items()}
-            return cls(axes, _tree(values), data.attrs["layout"] == layout_name(True))
+            return cls(axes, _rebuilt(values), data.attrs["layout"] == layout_name(True))
 
 
 FINISHED = "finished"  # the array of a store that tells which blocks are done
@@ -153,14 +149,24 @@ def _kind(path: str | Path) -> str:
     return kind
 
 
-def _tree(values: dict[str, np.ndarray]) -> Any:
-    """An `Outcome` again, if the names are its."""
-    number, count, verdict = jnp.zeros(()), jnp.zeros((), int), jnp.zeros((), bool)
-    like = Outcome(
-        max_rotation=number, max_velocity=number, time_of_max=number, impact_count=count, overturned=verdict,
-        margin=number, differentiable=verdict, clearance=number, error=number, status=Status.successful,
-    )  # fmt: skip
-    names = names_of(like)
-    if set(names) != set(values):
-        return values
-    return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in names])
+_examples: list[Callable[[], Any]] = []
+
+
+def known_again(example: Callable[[], Any]) -> None:
+    """Let `Grid.load` give results of a kind back as what they were: a file keeps their names only.
+
+    **Arguments:**
+
+    - `example`: makes one of this kind, with numbers of any values; called when something is loaded.
+    """
+    _examples.append(example)
+
+
+def _rebuilt(values: dict[str, np.ndarray]) -> Any:
+    """Results of a kind that is known, if the names are its; else the dictionary."""
+    for example in _examples:
+        like = example()
+        names = names_of(like)
+        if set(names) == set(values):
+            return jax.tree.unflatten(jax.tree.structure(like), [values[name] for name in names])
+    return values

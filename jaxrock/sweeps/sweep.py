@@ -76,7 +76,7 @@ def sweep(
     if store is not None:
         keeper = _keeper(store, plan, lists, traced)
         plan = plan._replace(block=keeper.block)
-    values, resumed = compute(traced, plan, traced.constants, "sweep", progress, store=keeper, load=load)
+    values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
     return Grid(lists, values, outer, resumed) if load else None
 
 
@@ -114,8 +114,8 @@ def surface(
     """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
     `columns`: neighbours along the last axis but one are computed together."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
-    found = compute(function, plan, scene, label, progress, columns=columns)[0]
-    return jax.tree.map(jnp.asarray, found)
+    results = compute(function, plan, scene, label, progress, columns=columns)[0]
+    return jax.tree.map(jnp.asarray, results)
 
 
 def compute(
@@ -150,14 +150,14 @@ def compute(
     for number in mine:
         place = plan.place(number)
         shape = tuple(p.stop - p.start for p in place)
-        found = run(plan.points(number), bar.add, tiles(shape, columns))
-        found = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in found]
+        leaves = run(plan.points(number), bar.add, tiles(shape, columns))
+        leaves = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in leaves]
         if store:
-            store.write(place, found)
+            store.write(place, leaves)
         elif whole:
-            results = found
+            results = leaves
         else:
-            for leaf, part in zip(results, found):
+            for leaf, part in zip(results, leaves):
                 leaf[place] = part
     if count > 1:
         meet()

@@ -68,8 +68,8 @@ def in_lanes(function: Callable, passes: Passes | None = None, alone: Callable |
 
     @one.def_vmap
     def _(size, batched, tree):
-        found = _Batch(function, passes, size, batched[0])(tree)
-        return found, jax.tree.map(lambda _: True, found)
+        results = _Batch(function, passes, size, batched[0])(tree)
+        return results, jax.tree.map(lambda _: True, results)
 
     return one
 
@@ -88,8 +88,8 @@ class _Batch:
 
         @run.def_vmap
         def _(size, batched, leaves):
-            found = self._one_more_axis(size, batched[0], leaves)
-            return found, jax.tree.map(lambda _: True, found)
+            results = self._one_more_axis(size, batched[0], leaves)
+            return results, jax.tree.map(lambda _: True, results)
 
         return run(self.structure.flatten_up_to(tree))
 
@@ -114,8 +114,8 @@ class _Batch:
 
         flags = [new or old for new, old in zip(batched, self.flags)]
         batch = _Batch(self.function, self.passes, size * self.size, self.structure.unflatten(flags))
-        found = batch(self.structure.unflatten([merged(*each) for each in zip(leaves, batched, self.flags)]))
-        return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), found)
+        results = batch(self.structure.unflatten([merged(*each) for each in zip(leaves, batched, self.flags)]))
+        return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), results)
 
     def _run(self, leaves):
         scenes = _Lanes(leaves, self.flags, self.structure)
@@ -201,12 +201,12 @@ class _Lanes:
         leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
 
         def flat(leaves):
-            found, structure = jax.tree.flatten(function(self.structure.unflatten(leaves)))
+            results, structure = jax.tree.flatten(function(self.structure.unflatten(leaves)))
             structures.append(structure)
-            return found
+            return results
 
-        found = native.run(flat, leaves, [not flag for flag in self.flags], refilled, count)
-        return structures[0].unflatten(found)
+        results = native.run(flat, leaves, [not flag for flag in self.flags], refilled, count)
+        return structures[0].unflatten(results)
 
     def begin(self, function: Callable) -> tuple["_Lanes", Any]:
         """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of
@@ -243,8 +243,8 @@ def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
         x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
         return x.reshape(chunks, lanes, *x.shape[1:])
 
-    found = jax.lax.map(function, jax.tree.map(cut, leaves))
-    return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], found)
+    results = jax.lax.map(function, jax.tree.map(cut, leaves))
+    return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], results)
 
 
 def _again(function: Callable, leaves, found, which, most: int = _LANES):

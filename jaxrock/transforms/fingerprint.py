@@ -3,7 +3,8 @@
 import functools
 import hashlib
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,49 +13,83 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 from jaxrock._checks import put_down
 
 
-class Traced:
-    """`function(**point)` of numbers, called as `traced(*point, constants)`.
+class Program:
+    """What a function traces to, but for the arrays that it captures: these are arguments, `program(*leaves, arrays)`.
 
-    Two of them are equal if they trace to the same program, whatever the constants (a record, say): these are
-    arguments. `shapes` is what the function returns, `fingerprint` tells program and constants in any process.
-    Checks of arguments do not raise: a call returns the results, and for each of `messages` whether it applies.
+    Two are equal if they have the same text, whatever made them, and are compiled once. Checks of arguments do not
+    raise: a call returns the results, and for each of `messages` whether it applies.
     """
 
-    def __init__(self, function: Callable, point: dict[str, jax.ShapeDtypeStruct]):
-        def checked(*values):
-            with put_down() as checks:
-                found = function(**dict(zip(point, values)))
-            messages.extend(message for message, _ in checks)
-            return found, tuple(failed for _, failed in checks)
-
-        messages = []
-        closed, shapes = jax.make_jaxpr(checked, return_shape=True)(*point.values())
-        self.shapes, self.messages, self.constants = shapes[0], tuple(messages), tuple(closed.consts)
-        self._jaxpr, self._tree = closed.jaxpr, jax.tree.structure(shapes)
+    def __init__(self, jaxpr: Jaxpr, structure, messages: tuple[str, ...], more: tuple = ()):
+        self.messages, self._jaxpr, self._structure = messages, jaxpr, structure
         # JAX prints no addresses and no arrays here: the arrays follow one by one.
-        told = hashlib.sha256(_text(closed.jaxpr).encode())
+        self._told = hashlib.sha256(_text(jaxpr).encode())
         callbacks = []
-        for part in _hidden(closed.jaxpr):
+        for part in _hidden(jaxpr):
             if callable(part):
                 callbacks.append(_same_callback(part))
             else:
-                _tell(told, part)
-        self._key = (told.hexdigest(), self._tree, self.messages, tuple(callbacks))
-        for constant in self.constants:
-            _tell(told, constant)
-        self.fingerprint = told.hexdigest()
+                _tell(self._told, part)
+        self._key = (self._told.hexdigest(), structure, messages, tuple(callbacks), *more)
 
     def __call__(self, *arguments):
-        """Evaluate at a point; the last argument are the constants."""
-        *point, constants = arguments
-        found = jaxpr_as_fun(ClosedJaxpr(self._jaxpr, list(constants)))(*point)
-        return jax.tree.unflatten(self._tree, found)
+        """Evaluate at leaves; the last argument are the arrays that were captured."""
+        *leaves, captured = arguments
+        found = jaxpr_as_fun(ClosedJaxpr(self._jaxpr, list(captured)))(*leaves)
+        return jax.tree.unflatten(self._structure, found)
+
+    def fingerprint(self, captured: Iterable) -> str:
+        """What tells the program with such arrays in any process."""
+        told = self._told.copy()
+        for array in captured:
+            _tell(told, array)
+        return told.hexdigest()
 
     def __hash__(self):
         return hash(self._key)
 
     def __eq__(self, other):
-        return isinstance(other, Traced) and self._key == other._key
+        return isinstance(other, Program) and self._key == other._key
+
+
+def traced(function: Callable, leaves: Sequence) -> tuple[ClosedJaxpr, Any, tuple[str, ...]]:
+    """The program of `function(*leaves)` with its checks put down: (jaxpr, shapes of (results, failures), messages)."""
+
+    def checked(*leaves):
+        with put_down() as checks:
+            found = function(*leaves)
+        messages.extend(message for message, _ in checks)
+        return found, tuple(failed for _, failed in checks)
+
+    messages = []
+    closed, shapes = jax.make_jaxpr(checked, return_shape=True)(*leaves)
+    return closed, shapes, tuple(messages)
+
+
+class Traced:
+    """`function(**point)` of numbers as a `program` with `constants`: `program(*point, constants)`.
+
+    Two of them are equal if they trace to the same program, whatever the constants (a record, say). `shapes` is what
+    the function returns, `fingerprint` tells program and constants in any process.
+    """
+
+    def __init__(self, function: Callable, point: dict[str, jax.ShapeDtypeStruct]):
+        closed, (self.shapes, failures), messages = traced(
+            lambda *values: function(**dict(zip(point, values))), point.values()
+        )
+        self.program = Program(closed.jaxpr, jax.tree.structure((self.shapes, failures)), messages)
+        self.messages, self.constants = messages, tuple(closed.consts)
+        self.fingerprint = self.program.fingerprint(self.constants)
+
+    def __call__(self, *arguments):
+        """Evaluate at a point; the last argument are the constants."""
+        return self.program(*arguments)
+
+    def __hash__(self):
+        return hash(self.program)
+
+    def __eq__(self, other):
+        return isinstance(other, Traced) and self.program == other.program
 
 
 def _is_compiled(equation) -> bool:

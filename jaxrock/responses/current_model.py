@@ -1,0 +1,56 @@
+"""Models whose functions are a user's own, as they are when they are asked for."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from jaxrock._checks import put_down
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block, Side
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.user_equation import Functions
+from jaxrock.transforms.user_function import UserFunction
+
+
+def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scene) -> AbstractEquation:
+    """A model whose functions are what they are now, wherever in it they are: a pytree for `jax.jit`.
+
+    A class of models of the user's own is known by what it is and by its fields, as any pytree: its methods are part of
+    all that the engine computes, and tracing that at every call would take a second. So methods should read nothing
+    that changes but fields. The same holds for classes of motions.
+
+    **Arguments:**
+
+    - `model`: any model.
+    - `block`, `scene`: what it will be asked for; their kind and precision count.
+
+    **Returns:** the model; the same object, where it holds no functions.
+    """
+    if not any(map(_is_functions, jax.tree.leaves(model, is_leaf=_is_functions))):
+        return model
+    kind = Side if isinstance(block, AsymmetricBlock) else Block
+    dtype = jnp.result_type(*jax.tree.leaves((block, scene)))
+    dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
+    number = jax.ShapeDtypeStruct((), dtype)
+    example = jax.tree.map(lambda leaf: number, _example(kind))
+
+    def current(node):
+        return UserFunction.of(node, number, number, number, example) if _is_functions(node) else node
+
+    return jax.tree.map(current, model, is_leaf=_is_functions)
+
+
+def _is_functions(node) -> bool:
+    return isinstance(node, Functions)
+
+
+@functools.cache
+def _example(kind: type) -> Block | Side:
+    """A block `as_functions_see` those of its kind."""
+
+    def made():
+        with put_down():
+            return kind(*(jnp.asarray(x) for x in (0.2, 1.0, 0.9)))
+
+    return jax.eval_shape(made)

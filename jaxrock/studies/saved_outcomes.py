@@ -1,0 +1,19 @@
+"""Outcomes in the files and stores of sweeps: `Grid.load` knows them again by the names of their results."""
+
+import jax.numpy as jnp
+
+from jaxrock.responses.rigid import Outcome
+from jaxrock.status import Status
+from jaxrock.sweeps.grid import known_again
+
+
+def an_outcome() -> Outcome:
+    """An outcome of any numbers."""
+    number, count, verdict = jnp.zeros(()), jnp.zeros((), int), jnp.zeros((), bool)
+    return Outcome(
+        max_rotation=number, max_velocity=number, time_of_max=number, impact_count=count, overturned=verdict,
+        margin=number, differentiable=verdict, clearance=number, error=number, status=Status.successful,
+    )  # fmt: skip
+
+
+known_again(an_outcome)
