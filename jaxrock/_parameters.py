@@ -29,13 +29,21 @@ class Parameter(NamedTuple):
     axes: int | None = 0  # of one owner; None: any
     follows: str = ""  # the property that tells its value where it is not given
     is_free: bool = True  # whether it is one of its own: what only repeats another is not
+    argument: str = ""  # of the owner's maker, where it has another name
 
 
 _UNDECLARED = Parameter(axes=None)
 
 
 def parameter(
-    unit: str, range: Range | str = finite, *, symbol: str = "", axes: int = 0, follows: str = "", is_free=True
+    unit: str,
+    range: Range | str = finite,
+    *,
+    symbol: str = "",
+    axes: int = 0,
+    follows: str = "",
+    is_free: bool = True,
+    argument: str = "",
 ):
     """Declare a field of a block, a motion or a model as a parameter.
 
@@ -48,12 +56,13 @@ def parameter(
     - `axes`: 0 for a number, 1 for a list that belongs to the whole (samples of a record).
     - `follows`: name of the property that tells its value where the field is None.
     - `is_free`: whether it can be varied by itself.
+    - `argument`: what the owner's maker calls it, if not by the name of the field.
 
     **Returns:** a field for an Equinox module.
     """
     if isinstance(range, str):
         range = RANGES[one_of("range", range, tuple(RANGES))]
-    return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free)})
+    return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free, argument)})
 
 
 def declared(kind: type) -> dict[str, Parameter]:
@@ -129,8 +138,10 @@ def check_single(**owners: Any) -> None:
     """Raise ValueError where a parameter of one scene is an array outside of `jax.vmap`."""
     for name, owner in owners.items():
         for leaf in leaves_of(owner):
-            if leaf.declared.axes is not None and jnp.ndim(leaf.value) > leaf.declared.axes:
+            known = leaf.declared
+            if known.axes is not None and jnp.ndim(leaf.value) > known.axes:
+                called = known.argument or leaf.name
                 raise ValueError(
-                    f"Argument `{name}` must hold one scene, but `{leaf.name}` has shape {jnp.shape(leaf.value)}. Use "
+                    f"Argument `{name}` must hold one scene, but `{called}` has shape {jnp.shape(leaf.value)}. Use "
                     "jax.vmap for many."
                 )

@@ -225,7 +225,7 @@ BAD = {
         lambda: rk.outcome(rk.Block(0.2, 1.0, TWO), SINE),
         "block",
         SCENE,
-        "`given_restitution` has shape (2,)",
+        "`restitution` has shape (2,)",
     ),
     "many alphas, history": (
         lambda: rk.simulate(rk.Block(TWO, 1.0), SINE),
@@ -268,7 +268,7 @@ BAD = {
         lambda: rk.overturning_map([1.0], [2.0], restitution=TWO),
         "block",
         SCENE,
-        "`given_restitution` has shape (2,)",
+        "`restitution` has shape (2,)",
     ),
     # Histories
     "time negative": (lambda: history()(-0.1), "time", HISTORY, "-0.1"),

@@ -45,7 +45,7 @@ class AsymmetricBlock(eqx.Module):
     alpha2: Real = parameter("rad", acute)
     p1: Real = parameter("rad/s", positive)
     inertia_ratio: Real = parameter("-", _ratio_of_inertia)
-    given_radius_ratio: Real | None = parameter("-", positive, follows="radius_ratio")
+    given_radius_ratio: Real | None = parameter("-", positive, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
 
     def __init__(

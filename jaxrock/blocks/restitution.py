@@ -84,7 +84,7 @@ class Constant(AbstractRestitution):
     **Raises:** ValueError for a value outside its range.
     """
 
-    value: Real = parameter("-", share, symbol="e")
+    value: Real = parameter("-", share, symbol="e", argument="restitution")
 
     def __init__(self, value: ArrayLike):
         self.value = share("restitution", value)
@@ -145,8 +145,8 @@ class PerSide(AbstractRestitution):
     about corners of unequal height it often does.)
     """
 
-    first: Real = parameter("-", not_negative, symbol="e1")
-    second: Real = parameter("-", not_negative, symbol="e2")
+    first: Real = parameter("-", not_negative, symbol="e1", argument="restitution")
+    second: Real = parameter("-", not_negative, symbol="e2", argument="restitution")
 
     def __init__(self, first: ArrayLike, second: ArrayLike):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))

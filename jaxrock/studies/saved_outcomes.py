@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jaxrock.responses.rigid import Outcome
+from jaxrock.responses.outcome import Outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.grid import known_again
 

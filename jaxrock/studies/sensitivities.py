@@ -18,7 +18,7 @@ from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.studies.parameters import named, rebuilt
-from jaxrock.studies.spectra import axis
+from jaxrock.studies.spectra import axis, scaled_law
 from jaxrock.sweeps.sweep import surface
 
 Scalar = Inexact[Array, "..."]
@@ -174,7 +174,7 @@ def sensitivity_map(
     shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
     block = Block(alpha, 1.0, restitution)  # raises here, where values are known
     model = current_model(model, block, shape, strength, duration)
-    scene = shape, block.alpha, block.given_restitution, model, engine
+    scene = shape, block.alpha, scaled_law(block), model, engine
     sensitivities = surface(_under_lobe, (strength, duration), scene, "sensitivity", progress)
     return SensitivityMap(strength, duration, shape, sensitivities)
 

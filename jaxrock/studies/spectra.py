@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._checks import Values, positive
+from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
@@ -63,7 +64,7 @@ def rocking_spectrum(
     alpha: ArrayLike,
     motion: AbstractMotion,
     period: Values,
-    restitution: ArrayLike | None = None,
+    restitution: Restitution | None = None,
     model: AbstractEquation = Housner(),
     *,
     engine: AbstractEngine | None = None,
@@ -88,8 +89,7 @@ def rocking_spectrum(
     period = axis("period", period)
     block = Block(alpha, 1.0, restitution)  # raises here, where values are known
 
-    alpha, restitution = block.alpha, block.given_restitution
-    scene = alpha, restitution, motion, current_model(model, block, motion, period), engine
+    scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
     return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress))
 
 
@@ -98,7 +98,7 @@ def self_similar_spectrum(
     intensity: Values,
     *,
     alpha: ArrayLike = 0.2,
-    restitution: ArrayLike | None = None,
+    restitution: Restitution | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
@@ -132,7 +132,7 @@ def overturning_map(
     intensity: Values,
     *,
     alpha: ArrayLike = 0.2,
-    restitution: ArrayLike | None = None,
+    restitution: Restitution | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
@@ -161,10 +161,17 @@ def _over_pulses(function, frequency_ratio, intensity, alpha, restitution, pulse
 
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, ratio, intensity))
     pulse, model = current_function(pulse, number, number), current_model(model, block, ratio, intensity)
-    scene = block.alpha, block.given_restitution, pulse, model, engine
+    scene = block.alpha, scaled_law(block), pulse, model, engine
     # Neighbours in intensity share a chunk: they move alike.
     results = surface(function, (intensity, ratio), scene, label, progress, columns=True)
     return results, ratio, intensity
+
+
+def scaled_law(block: Block) -> AbstractRestitution:
+    """The restitution of a block that stands for those of every size; ValueError, if it is not the same for all."""
+    if block.law.depends_on_speed:
+        raise ValueError("Argument `restitution` must not depend on the speed of impacts, where size plays no part.")
+    return block.law
 
 
 def axis(name: str, values: Values) -> Float[Array, " n"]:
