@@ -33,6 +33,7 @@ install_import_hook(list(checked_modules()), "beartype.beartype")
 # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
 gc.set_threshold(200_000, 10, 10)
 
+os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")

@@ -347,3 +347,33 @@ def test_folder_that_is_a_file(capsys, at2, tmp_path):
     assert main(["run", at2, *GIVEN, "--out", str(tmp_path / "out")]) == 2
     assert re.fullmatch(r"jaxrock: error: Argument `--out` must be a folder, .* is a file\.\n", capsys.readouterr().err)
     assert (tmp_path / "out").read_text() == "in the way"
+
+
+def test_compiled_programs_are_kept(tmp_path):
+    """A second call finds what the first has compiled, and answers the same to the last byte."""
+    environment = os.environ | {"JAXROCK_CACHE": str(tmp_path / "kept")}
+
+    def call(*words):
+        done = subprocess.run(
+            [sys.executable, "-m", "jaxrock", *words], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def kept():
+        return {path.name for path in (tmp_path / "kept").glob("*-cache")}
+
+    call("map", "--points", "4", "--out", str(tmp_path / "first"))
+    first = kept()
+    call("map", "--points", "4", "--out", str(tmp_path / "second"))
+    assert first and kept() == first
+    tables = [(tmp_path / folder / "map.csv").read_bytes() for folder in ("first", "second")]
+    assert tables[0] == tables[1]
+    assert f"{len(first)} compiled programs" in call("cache")
+    assert "deleted" in call("cache", "--clear")
+    assert not kept()
+
+
+def test_nothing_is_kept_where_that_is_off(capsys):
+    assert main(["cache"]) == 0
+    assert "off" in capsys.readouterr().out

@@ -9,12 +9,14 @@ class Command(NamedTuple):
     """One command.
 
     - `name`: its word; `purpose`: one line of help.
-    - `add_options`: adds to a parser what only this command has; all have `--model` and `--out`.
+    - `add_options`: adds to a parser what only this command has; all that compute have `--model` and `--out`.
     - `run`: does it and prints; the exit status, 0 good or 1 not computed. **Raises:** ValueError or OSError for
       input that is bad, before anything is written.
+    - `computes`: whether it computes scenes.
     """
 
     name: str
     purpose: str
     add_options: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
+    computes: bool = True

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 
+from jaxrock.command_line.cache import CACHE, keep_compiled
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
 from jaxrock.command_line.run import RUN
@@ -14,7 +15,7 @@ from jaxrock.command_line.spectrum import SPECTRUM
 from jaxrock.sweeps.devices import use_cpu_devices
 
 # Another command is a module like `run`, and its entry here.
-_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, INVERT)}
+_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, INVERT, CACHE)}
 
 
 _EPILOG = """examples:
@@ -24,6 +25,7 @@ _EPILOG = """examples:
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
+  jaxrock cache --clear                           forget what was compiled before
 """
 
 
@@ -34,8 +36,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():
         sub = commands.add_parser(command.name, help=command.purpose, description=command.purpose, **shared)
-        sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
-        sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
+        if command.computes:
+            sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
+            sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
         command.add_options(sub)
     return parser
 
@@ -50,6 +53,10 @@ def main(words: list[str] | None = None) -> int:
     **Returns:** the exit status: 0 good, 1 not computed, 2 bad input.
     """
     arguments = _parser().parse_args(words)
+    command = _COMMANDS[arguments.command]
+    if not command.computes:
+        return command.run(arguments)
+    keep_compiled()
     jax.config.update("jax_enable_x64", True)
     import matplotlib
 
@@ -59,7 +66,7 @@ def main(words: list[str] | None = None) -> int:
     try:
         if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
             raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
-        return _COMMANDS[arguments.command].run(arguments)
+        return command.run(arguments)
     except (ValueError, OSError) as error:
         print(f"jaxrock: error: {error}", file=sys.stderr)
         return 2
