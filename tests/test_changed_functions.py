@@ -182,7 +182,8 @@ def region(motion):
 
 
 def stripes(model):
-    found = rk.simulated_fragility(BLOCK, [PULSE], [0.25, 0.3, 0.35, 0.4, 0.5], model, engine=ENGINE, progress=False)
+    levels = np.linspace(0.2, 0.8, 61)
+    found = rk.simulated_fragility(BLOCK, [PULSE], levels, model, engine=ENGINE, progress=False)
     return found.verdict
 
 
@@ -212,7 +213,7 @@ SLOW = {
     ),
     "critical_amplitudes": of_model(
         lambda m: rk.critical_amplitudes(
-            BLOCK, PULSE, m, intensity=(1.0, 2.0), derivatives=False, engine=ENGINE, progress=False
+            BLOCK, PULSE, m, intensity=(1.3, 1.8), derivatives=False, engine=ENGINE, progress=False
         ).value
     ),
     "fit_history": of_model(
@@ -410,8 +411,8 @@ def soft_suite(model, engine):
 
 
 def soft_critical(model, engine):
-    found = rk.critical_amplitudes(BLOCK, PULSE, model, intensity=(1.0, 2.0), engine=engine, progress=False)
-    other = rk.critical_amplitudes(rk.Block(0.2, 2.0 * SOFT), PULSE, intensity=(1.0, 2.0), progress=False)
+    found = rk.critical_amplitudes(BLOCK, PULSE, model, intensity=(1.3, 1.8), engine=engine, progress=False)
+    other = rk.critical_amplitudes(rk.Block(0.2, 2.0 * SOFT), PULSE, intensity=(1.3, 1.8), progress=False)
     return found.value, other.value
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jax.extend.core import Literal
+from jax.extend.core import Literal, jaxpr_as_fun
 
 try:  # an extra
     from jaxrock.native import call as native
@@ -68,10 +68,30 @@ def in_lanes(function: Callable, passes: Passes | None = None, alone: Callable |
 
     @one.def_vmap
     def _(size, batched, tree):
-        results = _Batch(function, passes, size, batched[0])(tree)
+        results = _Batch(function if passes else _traced_apart(function), passes, size, batched[0])(tree)
         return results, jax.tree.map(lambda _: True, results)
 
     return one
+
+
+def _traced_apart(function: Callable) -> Callable:
+    """`function(tree)`, within a `shard_map` traced as if outside of it.
+
+    Equinox compares the types of arguments when it differentiates the solves of Diffrax, and takes those that tell of
+    the mesh of a `shard_map`, and those that do not, for different ones.
+    """
+
+    def run(tree):
+        if jax.sharding.get_abstract_mesh().empty:
+            return function(tree)
+        leaves, structure = jax.tree.flatten(tree)
+        leaves = [jnp.asarray(x) for x in leaves]
+        types = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in leaves]
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            program, shapes = jax.make_jaxpr(lambda *x: function(structure.unflatten(x)), return_shape=True)(*types)
+        return jax.tree.unflatten(jax.tree.structure(shapes), jaxpr_as_fun(program)(*leaves))
+
+    return run
 
 
 class _Batch:
