@@ -105,7 +105,7 @@ from jaxrock.responses.history import Response as Response, simulate as simulate
 from jaxrock.responses.outcome import Outcome as Outcome, outcome as outcome
 from jaxrock.status import Status as Status
 from jaxrock.studies import (
-    saved_outcomes as saved_outcomes,  # what `Grid.load` knows again
+    saved_outcomes as _saved_outcomes,  # noqa: F401  (what `Grid.load` knows again)
     similarity as similarity,
 )
 from jaxrock.studies.critical import (

@@ -12,8 +12,7 @@ import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import check_points, extent_of, model_of, other_parameters
 from jaxrock.inverse.observations import SEEN, TOPPLED
-from jaxrock.motions.pulses import PULSES
-from jaxrock.plot.regions import UNITS
+from jaxrock.motions.pulses import PULSES, UNITS
 
 # Of parameters without a default, which are estimated, too.
 _RANGES = {"shape": (-6.0, 6.0)}

@@ -4,9 +4,8 @@ import numpy as np
 
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
+from jaxrock.motions.pulses import UNITS
 from jaxrock.plot.style import RED
-
-UNITS = {"amplitude": "g", "period": "s", "duration": "s"}  # of parameters of motions
 
 
 def feasible_region(
@@ -43,8 +42,8 @@ def feasible_region(
             ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
             ticks.set_minor_formatter(NullFormatter())
     axis.set(xlim=(columns.min(), columns.max()), ylim=(rows.min(), rows.max()))
-    unit = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
-    axis.set(ylabel=unit[0], xlabel=unit[1])
+    labels = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
+    axis.set(ylabel=labels[0], xlabel=labels[1])
     if wall is not None or estimate is not None:
         axis.legend(frameon=False, fontsize=8)
     return axis

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import pkgutil
 
+from jaxrock._parameters import declared
 from jaxrock.motions.pulses.pulse import AbstractPulse
 
 
@@ -23,5 +24,7 @@ def _defined() -> dict[str, type[AbstractPulse]]:
 
 _KINDS = _defined()
 PULSES = {kind.word(): kind for kind in _KINDS.values()}  # by the word of the command line
+# Of the parameters that have one.
+UNITS = {name: known.unit for kind in _KINDS.values() for name, known in declared(kind).items() if known.unit != "-"}
 globals().update(_KINDS)
-__all__ = [*_KINDS, "PULSES"]
+__all__ = list(_KINDS)

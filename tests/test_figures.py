@@ -1,0 +1,97 @@
+"""Figures show what they are given: the data in the axes, of results that are made by hand."""
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.closed_form import sine_pulse, single_lobe
+from jaxrock.motions.pulses import PULSES, UNITS
+from jaxrock.studies.saved_outcomes import an_outcome
+from jaxrock.studies.sensitivities import Slopes
+
+
+@pytest.fixture(autouse=True)
+def closed_afterwards():
+    yield
+    plt.close("all")
+
+
+def sensitivity_of(elasticity):
+    """A sensitivity with these elasticities by two parameters."""
+    elasticity = jnp.asarray(elasticity)
+    number = elasticity[..., 0]
+    slopes = Slopes(number, elasticity, elasticity)
+    good = jnp.ones_like(number, bool)
+    return rk.Sensitivity(
+        ("alpha", "amplitude"), elasticity, slopes, slopes, slopes, an_outcome(), good, number, number, number
+    )
+
+
+def test_tornado():
+    axis = rk.plot.tornado(sensitivity_of([-2.0, 0.5]))
+    assert [bar.get_width() for bar in axis.patches] == [0.5, -2.0]  # the largest on top, which is last
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["amplitude", "alpha"]
+
+
+def test_sensitivity_map():
+    elasticity = np.random.default_rng(0).normal(size=(3, 4, 2))
+    elasticity[0, 0] = np.nan
+    surface = rk.SensitivityMap(
+        jnp.linspace(0.1, 0.9, 3), jnp.linspace(1, 4, 4), jnp.asarray(0.0), sensitivity_of(elasticity)
+    )
+    axis = rk.plot.sensitivity_map(surface, "amplitude", limit=2.0)
+    shown = axis.collections[0].get_array()
+    np.testing.assert_allclose(np.ma.filled(shown, np.nan).reshape(3, 4), elasticity[..., 1])
+    assert axis.collections[0].get_clim() == (-2.0, 2.0)
+
+
+def test_critical():
+    """Rising ends without and with impacts, falling ends; what is filled up is not shown."""
+    intensity = jnp.array([[1.5, 2.0, 3.0], [1.4, jnp.inf, jnp.inf]])
+    rising = jnp.array([[True, False, True], [True, False, False]])
+    impacts = jnp.array([[1, 1, 0], [0, 0, 0]])
+    ends = rk.Critical(
+        count=jnp.array([3, 1]), value=intensity, intensity=intensity, rising=rising, impacts=impacts,
+        balanced=rising, derivative=intensity[..., None], complete=jnp.array([True, True]), names=("alpha",),
+    )  # fmt: skip
+    axis = rk.plot.critical([0.5, 0.7], ends)
+    shown = {line.get_label(): line.get_xydata().tolist() for line in axis.lines}
+    assert shown == {
+        "overturns above: without impact": [[0.5, 3.0], [0.7, 1.4]],
+        "overturns above: after impacts": [[0.5, 1.5]],
+        "safe again above": [[0.5, 2.0]],
+    }
+
+
+def test_safety_regions():
+    axis = rk.plot.safety_regions(0.5, longest=4.0, points=8)
+    wall = axis.lines[0].get_xydata()
+    np.testing.assert_allclose(wall[:, 0], np.linspace(0.5, 4.0, 8))
+    np.testing.assert_allclose(wall[:, 1], single_lobe.safety_wall(wall[:, 0], 0.5))
+    assert len(axis.collections) == 5
+
+
+def test_sine_regions():
+    axis = rk.plot.sine_regions(0.9, frequency_ratio=[1.0, 2.0, 4.0])
+    (curve,) = (line for line in axis.lines if line.get_label() == "case 2: no impact")
+    np.testing.assert_allclose(curve.get_ydata(), sine_pulse.no_impact_limit(curve.get_xdata()))
+
+
+def test_feasible_region():
+    """The best is the top of the scale; axes are logarithmic and have the units of the parameters."""
+    rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
+    likelihood = -((jnp.log(rows / 0.4)[:, None]) ** 2) - jnp.log(columns / 0.7) ** 2
+    region = rk.FeasibleRegion(("amplitude", "period"), (rows, columns), likelihood, likelihood > -1)
+    wall = rk.Unexceeded(columns, jnp.full(5, 0.5), jnp.full((1, 5), 0.5), jnp.zeros(5, int), jnp.ones(5, bool))
+    axis = rk.plot.feasible_region(region, wall=wall)
+    assert (axis.get_ylabel(), axis.get_xlabel()) == ("amplitude [g]", "period [s]")
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
+    assert float(axis.collections[0].get_array().max()) == 0.0
+    np.testing.assert_allclose(axis.lines[0].get_ydata(), 0.5)
+
+
+def test_units_of_parameters_are_those_declared():
+    assert UNITS == {"amplitude": "g", "duration": "s", "period": "s", "center": "s", "phase": "rad"}
+    assert set(PULSES) >= {"sine", "half-sine", "rectangle", "mavroeidis-papageorgiou"}
