@@ -86,12 +86,12 @@ def test_many_blocks_in_an_earthquake_are_as_each_alone():
 def test_few_scenes_are_postponed(model):
     """Otherwise the quick pass would be right, and slow."""
     model = MODELS[model]
-    passes = _passes(rk.Series(), False)
+    passes = _passes(False)
 
     def one(alpha, p, restitution, intensity, ratio):
         block = rk.Block(alpha, p, restitution)
         pulse = rk.SinePulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p))
-        scene = block, pulse, model, tuple(jnp.asarray(x) for x in start_of((0.0, 0.0)))
+        scene = block, pulse, model, tuple(jnp.asarray(x) for x in start_of((0.0, 0.0))), rk.Series()
         stepper, state = passes.begin(scene)
         return passes.conclude(stepper, passes.quickly(stepper, state, 10_000))[1]
 

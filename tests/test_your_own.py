@@ -3,6 +3,7 @@
 Judges: the same motion as a record, the same model as one of the package.
 """
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -195,3 +196,17 @@ def test_any_arm_in_both_engines(arm):
     assert float(peak(at, None)) == pytest.approx(float(peak(at, engine)), rel=1e-7)
     slope = float(jax.jvp(lambda s: peak(s, None), (at,), (jnp.ones_like(at),))[1])
     assert slope == pytest.approx(float(peak(at + 1e-6, None) - peak(at - 1e-6, None)) / 2e-6, rel=1e-6)
+
+
+def test_a_controller_with_arrays():
+    """Settings of the diffrax engine may be arrays: as numbers, and one for each lane."""
+    motion = rk.SinePulse(0.35, 0.9)
+
+    def peak(rtol):
+        engine = rk.Diffrax(controller=diffrax.PIDController(rtol=rtol, atol=1e-14))
+        return rk.outcome(BLOCK, motion, engine=engine).max_rotation
+
+    exact = float(rk.outcome(BLOCK, motion).max_rotation)
+    found = jax.vmap(peak)(jnp.array([1e-4, 1e-9]))
+    assert float(found[1]) == pytest.approx(float(peak(1e-9)), rel=1e-12)
+    assert abs(float(found[1]) / exact - 1) < 1e-7 < abs(float(found[0]) / exact - 1)

@@ -49,6 +49,7 @@ class AbstractStepper(eqx.Module):
 
     scene: AbstractVar[Scene]
     stop: AbstractVar[Scalar]  # time at which to stop [s]; infinite: at the end of the motion
+    engine: AbstractVar[AbstractEngine]
     history: AbstractVar[bool]  # follow an overturning block down to the ground
     doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
 

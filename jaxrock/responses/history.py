@@ -191,13 +191,13 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     stop = motion.end + 10 / block.p if duration is None else jnp.asarray(duration)
 
     def run(scene):
-        return _steps(*scene, engine, taped=False)
+        return _steps(*scene, taped=False)
 
     def on_tape(scene):
-        return _steps(*scene, engine, taped=True)
+        return _steps(*scene, taped=True)
 
     run = run if engine.reverse else differentiable(run, on_tape)
-    state, nodes, final = run((block, motion, model, initial, stop))
+    state, nodes, final = run((block, motion, model, initial, stop, engine))
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, stop, history=True)
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)

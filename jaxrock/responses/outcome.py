@@ -110,24 +110,24 @@ def outcome(
 @jax.jit
 def _outcome(block, motion, model, initial, engine) -> Outcome:
     def run(scene):
-        return _to_outcome(*scene, engine, taped=False)
+        return _to_outcome(*scene, taped=False)
 
     def on_tape(scene):
-        return _to_outcome(*scene, engine, taped=True)
+        return _to_outcome(*scene, taped=True)
 
-    scene = block, motion, model, initial
+    scene = block, motion, model, initial, engine
     if engine.reverse:
         return run(scene)
     check_single(block=block, motion=motion)
-    passes = _passes(engine, POLICY.is_record(motion.knots.size - 1)) if isinstance(engine, Series) else None
+    passes = _passes(POLICY.is_record(motion.knots.size - 1)) if isinstance(engine, Series) else None
     return differentiable(run, on_tape, passes)(scene)
 
 
-def _passes(engine: Series, rounds: bool) -> Passes:
+def _passes(rounds: bool) -> Passes:
     """The outcome in parts; in rounds where some blocks are lost long before others."""
 
     def begin(scene):
-        block, motion, model, initial = scene
+        block, motion, model, initial, engine = scene
         scene = Scene.of(block, motion, model)
         stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
         return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
@@ -139,7 +139,7 @@ def _passes(engine: Series, rounds: bool) -> Passes:
     return Passes(
         begin=begin,
         quickly=follow,
-        carefully=lambda stepper, state: _to_the_end(engine, stepper, state),
+        carefully=_to_the_end,
         unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
         conclude=result_of,
         round=POLICY.round if rounds else None,
@@ -154,12 +154,13 @@ def _to_outcome(block, motion, model, initial, engine, taped: bool) -> Outcome:
         # A tape holds all steps, as a history does.
         state, _ = stepper.on_tape(state, engine.budget(scene, history=True))
     else:
-        state = _to_the_end(engine, stepper, state)
+        state = _to_the_end(stepper, state)
     return conclude(stepper, state)
 
 
-def _to_the_end(engine: AbstractEngine, stepper: AbstractStepper, state: State) -> State:
+def _to_the_end(stepper: AbstractStepper, state: State) -> State:
     """Follow a block to the end of the motion."""
+    engine = stepper.engine
     budget = engine.budget(stepper.scene, history=False)
     return engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
 

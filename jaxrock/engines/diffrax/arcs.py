@@ -39,6 +39,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.status import Status
 from jaxrock.transforms.branches import either
 from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.held import Held
 
 Scalar = Inexact[ArrayLike, ""]
 
@@ -77,12 +78,43 @@ class Diffrax(AbstractEngine):
     **Raises:** ValueError for a value outside its range, or an adjoint that events do not go with.
     """
 
-    solver: diffrax.AbstractSolver = eqx.field(static=True, default=diffrax.Tsit5())
-    rtol: float = eqx.field(static=True, default=1e-8)
-    atol: float | None = eqx.field(static=True, default=None)
-    controller: diffrax.AbstractStepSizeController | None = eqx.field(static=True, default=None)
-    adjoint: diffrax.AbstractAdjoint = eqx.field(static=True, default=diffrax.ForwardMode())
-    max_solves: int | None = eqx.field(static=True, default=None)
+    _solver: Held
+    _controller: Held
+    _adjoint: Held
+    rtol: float = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
+    max_solves: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        solver: diffrax.AbstractSolver = diffrax.Tsit5(),
+        rtol: float = 1e-8,
+        atol: float | None = None,
+        controller: diffrax.AbstractStepSizeController | None = None,
+        adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),
+        max_solves: int | None = None,
+    ):
+        self._solver, self._controller, self._adjoint = Held.of(solver), Held.of(controller), Held.of(adjoint)
+        self.rtol, self.atol, self.max_solves = rtol, atol, max_solves
+
+    def __repr__(self) -> str:
+        names = ("solver", "rtol", "atol", "controller", "adjoint", "max_solves")
+        return f"Diffrax({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
+
+    @property
+    def solver(self) -> diffrax.AbstractSolver:
+        """The solver."""
+        return self._solver.value
+
+    @property
+    def controller(self) -> diffrax.AbstractStepSizeController | None:
+        """The step-size controller that was given."""
+        return self._controller.value
+
+    @property
+    def adjoint(self) -> diffrax.AbstractAdjoint:
+        """The adjoint."""
+        return self._adjoint.value
 
     def __check_init__(self):
         if not 0 < self.rtol < 1:
@@ -208,10 +240,11 @@ class ArcStepper(AbstractStepper):
         arc = Arc.of(scene, node, Forcing.of(scene, node), self.history)
 
         def run(scene):
-            return self.engine.solve(*scene, event=None).ys[-1]
+            engine, *arc = scene
+            return engine.solve(*arc, event=None).ys[-1]
 
         run = run if self.engine.reverse else differentiable(run)
-        opening, velocity = run((arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
+        opening, velocity = run((self.engine, arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
         return opening, velocity * self.scene.p
 
     def _is_hop(self, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:

@@ -84,6 +84,7 @@ class Series(AbstractEngine):
         return TaylorStepper(
             scene=scene,
             stop=stop,
+            engine=self,
             order=self.order or (POLICY.record_order if POLICY.is_record(scene.pieces) else POLICY.pulse_order),
             tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
             history=history,
@@ -104,6 +105,7 @@ class TaylorStepper(AbstractStepper):
 
     scene: Scene
     stop: Scalar  # time at which to stop [s]; infinite: at the end of the motion
+    engine: Series
     order: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
     history: bool = eqx.field(static=True)
