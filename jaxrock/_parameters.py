@@ -5,8 +5,9 @@
         corners: jax.Array = rk.parameter("s", "positive", axes=1)
 
 A declared number is one for each scene: it is checked, fitted, differentiated by, and may differ from lane to lane. An
-array that is declared with axes belongs to the whole, and all scenes share it. What is not declared is the owner's own
-affair: numbers are parameters of unknown unit and range, arrays are shared.
+array that is declared with axes belongs to the whole, and all scenes share it. What is not declared all scenes share,
+too, where they lie in one object (a suite, critical amplitudes of many blocks); its numbers are parameters of unknown
+unit and range.
 """
 
 import dataclasses
@@ -96,7 +97,13 @@ class Leaf(NamedTuple):
     @property
     def is_shared(self) -> bool:
         """Whether it belongs to the whole, and not to one scene of many."""
-        return bool(self.declared.axes) or (self.declared.axes is None and jnp.ndim(self.value) > 0)
+        return self.declared.axes != 0
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is one number for a scene, by which derivatives may be taken."""
+        one = self.declared.axes == 0 or (self.declared.axes is None and jnp.ndim(self.value) == 0)
+        return one and self.declared.is_free and jnp.issubdtype(jnp.result_type(self.value), jnp.inexact)
 
 
 def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECLARED) -> Iterator[Leaf]:

@@ -28,7 +28,7 @@ if count > 1:
 rk.use_cpu_devices(1 + own % 2)
 import jax.numpy as jnp
 import numpy as np
-from jaxrock.store import Store
+from jaxrock.sweeps.store import Store
 
 def chaotic(alpha, p):
     x, steps = jax.lax.while_loop(

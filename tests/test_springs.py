@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
+from jaxrock.blocks.restitution import Reset
 from jaxrock.engines.free_stage import Visit, free_stage
 from jaxrock.models.equation import Angle
 from references.in_jaxrock import PULSES
@@ -169,7 +170,8 @@ def test_free_stage(spring):
     """A constant and a sinusoid: peak and its time by quadrature, from below the saddle and from beyond it."""
 
     def stage(alpha, e, x, v):
-        visit = Visit(rk.Spring(*spring).moments(rk.Block(alpha, 1.0, e)), e)
+        block = rk.Block(alpha, 1.0, e)
+        visit = Visit(rk.Spring(*spring).moments(block), Reset.of(block.law, block.corners, block.p))
         return free_stage((visit, visit), x, v, jnp.array(True), jnp.array(0.0))
 
     follow = jax.jit(stage)

@@ -53,7 +53,6 @@ class Trajectory(eqx.Module):
 
         Each of `values` comes with what fills it up.
         """
-        self.check_single()
         order = jnp.argsort(jnp.where(happened, order, jnp.inf), stable=True)
         found = []
         for value, filling in values:

@@ -88,12 +88,14 @@ class FlexibleResponse(eqx.Module):
     def impact_times(self) -> Inexact[Array, " impacts"]:
         """Times of the impacts [s]; under jit filled up with inf."""
         path = self.trajectory
+        path.check_single()
         return path.events(path.impacted, path.times, (path.times, jnp.inf))[0]
 
     @property
     def impact_modes(self) -> Inexact[Array, "impacts modes"]:
         """Share of each clamped mode of the column in the energy just after each impact [-]."""
         path = self.trajectory
+        path.check_single()
         q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)
         energies = v**2 + self.scene.numbers.squares * q**2
         total = energies.sum(1, keepdims=True)

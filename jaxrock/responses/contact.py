@@ -98,7 +98,7 @@ def _at_impacts(response: Response, side: float, here: tuple[Scalar, Scalar], th
     """
     scene, nodes = response.scene.on(side), response.trajectory.nodes
     # Of a law that does not depend on the speed all impacts need the same.
-    ours = response.trajectory.impacted & (jnp.sign(nodes.impact_velocity) == side)
+    ours = response.trajectory.impacted & (jnp.sign(nodes.impact_velocity) == -side)
     speeds = jnp.where(ours, jnp.abs(nodes.impact_velocity), 0.0)
     speeds = jnp.where(ours, speeds, speeds.max()) if scene.reset.depends_on_speed else speeds[:1]
     e = jax.vmap(scene.reset.ratio)(speeds)

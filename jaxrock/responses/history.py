@@ -117,12 +117,14 @@ class Response(eqx.Module):
 
     @property
     def _impacts(self) -> tuple:
+        self.trajectory.check_single()
         path, nodes = self.trajectory, self.trajectory.nodes
         values = (nodes.impact_time, jnp.inf), (nodes.impact_velocity * self.scene.p, 0.0)
         return path.events(path.impacted, nodes.impact_time, *values)
 
     @property
     def _peaks(self) -> tuple:
+        self.trajectory.check_single()
         path, nodes = self.trajectory, self.trajectory.nodes
         turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
         return path.events(turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0))

@@ -2,8 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
@@ -102,9 +100,7 @@ def _of_own(block: AnyBlock) -> list[Leaf]:
     if isinstance(block.law, (Constant, PerSide)):
         return []
     return [
-        Leaf(("restitution", *leaf.path), leaf.value, leaf.declared)
-        for leaf in leaves_of(block.law)
-        if _is_number(leaf)
+        Leaf(("restitution", *leaf.path), leaf.value, leaf.declared) for leaf in leaves_of(block.law) if leaf.is_number
     ]
 
 
@@ -118,13 +114,9 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
     return {name: getattr(block, name) for name in names}
 
 
-def _is_number(leaf: Leaf) -> bool:
-    return leaf.declared.is_free and not leaf.is_shared and np.issubdtype(jnp.result_type(leaf.value), np.inexact)
-
-
 def _numbers(motion: AbstractMotion) -> list[Leaf]:
     """The single numbers of a motion; the factor of a scaled one is left out, for its amplitude says the same."""
-    return [leaf for leaf in leaves_of(motion) if _is_number(leaf)]
+    return [leaf for leaf in leaves_of(motion) if leaf.is_number]
 
 
 def _at(owner, path: tuple[str, ...]):
