@@ -17,7 +17,6 @@ from jaxrock.sweeps.devices import use_cpu_devices
 # Another command is a module like `run`, and its entry here.
 _COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, INVERT, CACHE)}
 
-
 _EPILOG = """examples:
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
   jaxrock run motion.AT2 --width 0.5 --height 2   the same for your block and record

@@ -22,8 +22,6 @@ from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
 
 

@@ -16,8 +16,6 @@ from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 _FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
 
 

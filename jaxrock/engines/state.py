@@ -10,8 +10,6 @@ from jaxrock.models.equation import Angle
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
 
 

@@ -11,7 +11,6 @@ from jaxtyping import ArrayLike, Bool, Inexact
 
 Scalar = Inexact[ArrayLike, ""]
 
-
 # Standard errors of the angle within which a touch of the ground may be a miss, and a miss a touch.
 GRAZING = 32.0
 

@@ -24,17 +24,10 @@ from jaxrock.numerics.exponential_sums import Curve, powers
 
 Scalar = Inexact[ArrayLike, ""]
 
-
 # Damping ratio below which the base follows the column at once, and the least that is computed with.
 UNDAMPED, _LEAST = 1e-9, 1e-13
-
-
 _EASY = 1e-8  # damping ratio from which on eigenvalues are found as they are
-
-
 _TERMS = 21  # of the Taylor series of modes that hardly turn within a step
-
-
 _FACTORIALS = np.array([float(math.factorial(k)) for k in range(_TERMS)])
 
 

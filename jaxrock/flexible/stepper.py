@@ -18,8 +18,6 @@ from jaxrock.numerics.polynomial import step_length
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, "..."]
-
-
 _ORDER = 16  # of the motion's Taylor series
 
 

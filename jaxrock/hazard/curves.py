@@ -22,16 +22,9 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.roots import search_root
 
 Real = Inexact[Array, "..."]
-
-
 Number = Inexact[Array, ""]
-
-
 Fragilities = AbstractFragility | Sequence[AbstractFragility]
-
-
 _NODES, _WEIGHTS = gauss_legendre(20)
-
 
 # Where `allowed_scale` looks for its factor: 20 steps a decade.
 _FACTORS = np.geomspace(1e-4, 1e4, 161)

@@ -15,27 +15,16 @@ from jaxrock._text import file_error, text_lines
 from jaxrock.hazard.curves import HazardCurve
 
 _FRONT = {"custom_site_id", "lon", "lat", "depth"}
-
-
 _POE = "poe-"
-
-
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[Ee][-+]?\d+)?")
-
-
 _TIME = re.compile(r"\binvestigation_time=([^,\s\"']+)")
-
 
 # imt='SA(0.1)' today, imt="SA(0.1)" or imt=SA(0.1) in older files.
 _MEASURE = re.compile(r"\bimt=(?:'([^']*)'|\"+([^\"]*)\"+|([^\s,\"']+))")
-
-
 _KIND = re.compile(r"\bkind='([^']*)'")
-
 
 # Older files, without kind=: "# quantile-0.1, investigation_time=...", "# source_model_tree_path=('b1',), gsim_...".
 _OLD_KIND = re.compile(r"#[\s,\"]*(.*?)[\s,]*\binvestigation_time=")
-
 
 # Probabilities are computed in single precision from many sources, so that equal ones may differ by a little.
 _NOISE = 1e-5, 3e-7

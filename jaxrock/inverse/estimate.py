@@ -25,35 +25,15 @@ from jaxrock.models.rigid import Housner
 from jaxrock.numerics.climb import Summits, climb
 
 Real = Inexact[Array, "..."]
-
-
 _SCREENED = 4  # points for each start, of which the best are taken
-
-
 _LEAST_SCREENED = 64
-
-
 _AROUND = 0.15  # of the ranges
-
-
 _ROUNDS_BESIDE, _SCREENED_BESIDE, _BESIDE = 3, 64, 0.08  # rounds, points in each, and their extent in ranges
-
-
 _GAIN = 1e-6  # of a round that calls for another
-
-
 _RETRIES = 7  # starts with another scatter
-
-
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
-
-
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
-
-
 _COMPUTED = 0.5  # of the possible scenes at the maximum
-
-
 _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
 
 

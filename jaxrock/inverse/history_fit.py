@@ -24,8 +24,6 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
 
 _GROWTH = 1.6  # from window to window
-
-
 _WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
 
 

@@ -26,7 +26,6 @@ from jaxrock.studies.parameters import declarations, named, rebuilt
 
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
 
-
 _USUAL = {
     Block: ("alpha", "p", "restitution", "initial"),
     AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),

@@ -43,11 +43,7 @@ from jaxrock.status import Status
 from jaxrock.transforms.user_function import ByIdentity, current_function
 
 Real = Inexact[Array, "..."]
-
-
 _NO_STRENGTH = 1e-30  # [g]
-
-
 _FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
 
 

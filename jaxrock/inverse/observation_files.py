@@ -28,28 +28,23 @@ from jaxrock.inverse.observations import SEEN, Observations
 
 _DEGREE = np.pi / 180
 
-
 _FACTORS = {
     "alpha_rad": 1.0, "alpha_deg": _DEGREE, "p_rad_per_s": 1.0, "half_diagonal_m": 1.0, "width_m": 1.0, "height_m": 1.0,
     "restitution": 1.0, "rotation_rad": 1.0, "rotation_deg": _DEGREE, "alpha1_rad": 1.0, "alpha1_deg": _DEGREE,
     "p1_rad_per_s": 1.0, "radius1_m": 1.0,
 }  # fmt: skip
 
-
 _EXACT = {
     "alpha2_rad": 1.0, "alpha2_deg": _DEGREE, "p2_rad_per_s": 1.0, "radius2_m": 1.0, "inertia_ratio": 1.0, "facing": 1.0
 }  # fmt: skip
 
-
 _COLUMNS = {"name", "observed", *_FACTORS, *(f"{name}_sd" for name in _FACTORS), *_EXACT}
-
 
 # One column of each row must be there; and all or none of each pair.
 _WAYS = (
     ("alpha_rad", "alpha_deg", "width_m", "alpha1_rad", "alpha1_deg"),
     ("p_rad_per_s", "half_diagonal_m", "height_m", "p1_rad_per_s", "radius1_m"),
 )
-
 
 _PAIRS = (
     ("width_m", "height_m"), ("alpha1_rad", "alpha2_rad"), ("alpha1_deg", "alpha2_deg"),

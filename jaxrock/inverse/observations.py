@@ -15,11 +15,7 @@ from jaxrock.blocks.restitution import Corners, Housner, PerSide
 from jaxrock.blocks.rigid import Block
 
 SEEN = ("survived", "toppled", "rotation")
-
-
 SURVIVED, TOPPLED, ROTATION = range(3)
-
-
 Rocks = Inexact[Array, " rocks"]
 
 

@@ -25,29 +25,13 @@ from jaxrock.models.rigid import Housner
 from jaxrock.numerics.proposals import ROUNDS, around, begin, learn
 
 Real = Inexact[Array, "..."]
-
-
 _CHAINS = 8
-
-
 _ROUND = 512  # points of a round: those of all chains together
-
-
 _LANES = 64  # points in one call of the compiled program
-
-
 _PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
-
-
 _DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
-
-
 _AROUND, _EVENLY = 0.05, 0.85  # how far from them, in ranges; share of the first points that is spread over everything
-
-
 _ALIKE = 1.01  # R-hat
-
-
 _END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
 
 

@@ -8,11 +8,7 @@ from jaxrock.inverse.unknowns import Evaluator
 from jaxrock.numerics.climb import Summits, climb
 
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
-
-
 _ROOT = np.sqrt(2 * _RATIO)
-
-
 _AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
 

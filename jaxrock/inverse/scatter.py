@@ -30,39 +30,18 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock.inverse.observations import Observations
 
 Real, Flags = Inexact[Array, "..."], Bool[Array, "..."]
-
-
 _APART = 0.4  # distance of nodes, in standard deviations
-
-
 _EACH_SIDE = 9  # nodes on each side of the motion itself: 3.6 standard deviations
-
-
 NODES = 2 * _EACH_SIDE + 2  # scenes that are computed for each rock
-
-
 _SMEAR = 0.5  # of the difference between nodes
-
-
 _LEAST_WIDTH = 1e-3
-
-
 _SLOPE_OVER = 4  # nodes at each end from which y goes on
-
-
 _LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the last nodes
-
-
 _END_WIDTH = 0.1  # of y there, so that the probability is smooth
-
 
 # Turns of the patterns from node to node: far from none and from each other, and so are their doubles.
 _FAST, _FASTEST = 1.6, np.pi
-
-
 _BY_P = 0.5  # a higher p acts like so much of the amplitude: between none for long pulses and all for short ones
-
-
 _SPREAD = np.sqrt(1 + _APART**2 * (_SMEAR**2 - 1 / 48))  # of straight y through quarter points, with the smear
 
 

@@ -12,11 +12,7 @@ from jaxrock._checks import finite, positive, scalar
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
-
-
 _LANES = 4  # points in one call of the compiled program
-
-
 _FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
 
 

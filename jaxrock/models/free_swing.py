@@ -17,7 +17,6 @@ from jaxrock.numerics.roots import bracketed_root
 
 Scalar = Inexact[ArrayLike, ""]
 
-
 # As many as leave an error below that of rounding in the energy: with 24, 1e-15 up to lengths of 10 (a turn 1e-4 from
 # the balance), and 1e-11 at 35, where rounding decides whether it turns at all.
 _NODES, _WEIGHTS = gauss_legendre_of_unit(24)

@@ -9,11 +9,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 _NODES, _WEIGHTS = gauss_legendre(6)
-
-
 _PARTS = 256  # of every smooth piece, where there are few
-
-
 _FEW = 32
 
 

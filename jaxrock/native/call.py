@@ -24,11 +24,7 @@ from jaxrock.native.partition import ahead, around_loop, computed
 from jaxrock.numerics.xla_cpu import nothing_kept
 
 _ROOM, _WANTED, _THREADS = range(3)  # what the first input of a program tells
-
-
 _SHARE = 64  # lanes that are worth a thread
-
-
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
@@ -103,8 +99,6 @@ class _Machine:
 
 
 _HAS_THREADS = os.name == "posix"
-
-
 _one_at_a_time = threading.RLock()
 
 

@@ -18,14 +18,8 @@ from llvmlite import ir
 from jaxrock.native.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
-
-
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
-
-
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
-
-
 WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
 
 

@@ -26,8 +26,6 @@ from jaxrock.numerics.elementary import (
 )
 
 _BOOL = np.dtype(bool)
-
-
 _CONTRACT = ("contract",)  # a product and a sum may be rounded once
 
 
@@ -225,7 +223,6 @@ OPERATIONS: dict[str, Callable] = {
     "convert_element_type": _convert,
     "bitcast_convert_type": lambda e, q, x: e.b.bitcast(x, e.vector(q.params["new_dtype"])),
 }
-
 
 # What changes no value.
 NOTHING = ("stop_gradient", "copy", "reshard", "pvary", "pcast")

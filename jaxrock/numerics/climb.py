@@ -13,22 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 _LONGEST_STEP = 1.0  # in the units of the points
-
-
 _SUFFICIENT = 1e-4  # of the gain that the slope promises
-
-
 _SHORTEST_STEP = 1e-9  # below which there is a jump
-
 
 # Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
 # points, and finds a higher summit now and then; more starts do, too.
 _HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1))
-
-
 _SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
-
-
 _NOWHERE = -1e300  # the value where there is none
 
 

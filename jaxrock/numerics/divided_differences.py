@@ -9,11 +9,8 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 Real = Inexact[ArrayLike, "..."]
 
-
 # Nodes closer together than this are summed as a power series; others are divided.
 _CLOSE = 1.0
-
-
 _TERMS = 14
 
 

@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Inexact
 
 Real = Inexact[Array, "..."]
 
-
 # Coefficients in x^2 of sin(x)/x and cos(x): interpolation at Chebyshev points of x^2 in [0, 3.2], errors below 3e-17.
 _SINE = (
     1.0,
@@ -24,7 +23,6 @@ _SINE = (
     1.8903369640628947e-20,
 )
 
-
 _COSINE = (
     1.0,
     -0.5,
@@ -39,10 +37,8 @@ _COSINE = (
     3.95653834291857e-19,
 )
 
-
 # Of artanh(x)/x in x^2, |x| < 0.1716.
 _LOGARITHM = tuple(1 / (2 * k + 1) for k in range(11))
-
 
 # Of arctan(x)/x in x^2, |x| < tan(pi/8): interpolation as above, errors below 3e-18.
 _ARCTANGENT = (
@@ -59,7 +55,6 @@ _ARCTANGENT = (
     0.03795171422296338,
     -0.017790395523288063,
 )
-
 
 # Of exp(x), |x| < 0.347.
 _EXPONENTIAL = tuple(1 / math.factorial(k) for k in range(14))

@@ -11,14 +11,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
-
-
 Values = Inexact[ArrayLike, "*values"]
-
-
 _MOST_STRIDES = 10_000
 
 

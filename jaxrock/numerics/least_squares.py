@@ -10,14 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 _MOST_STEPS, _FEW_STEPS = 60, 8  # of the last window, and of one on the way
-
-
 _TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain in a step, below which it is the last one there
-
-
 _UNDETERMINED = 1e10  # variance of what the data do not tell, in squares of its natural size
-
-
 _TO_THE_BOUND = 0.9  # share of the way to a bound that one step may go
 
 

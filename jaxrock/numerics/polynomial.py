@@ -15,8 +15,6 @@ from jaxtyping import ArrayLike, Bool, Inexact
 from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
 
 

@@ -14,32 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 ROUNDS = 12  # of learning, at most
-
-
 _ENOUGH = 0.5  # independent points for each that is drawn, with which it has learned enough
-
-
 _RISE = 1.1  # of that from round to round, below which it learns no more
-
-
 _FREEDOM = 5.0  # degrees, of Student's t: tails that are heavier than those of most distributions
-
-
 _KERNELS = 400  # at most
-
-
 _NEIGHBOURS = 25  # kernels by whose distances one is as wide as it is; at least six for each dimension
-
-
 _WIDER = 0.03  # than that, of the width of all
-
-
 _EVENLY = 0.05
-
-
 _FEWEST = 50  # points that weights must leave; otherwise they are made more alike
-
-
 _TRIED = 256  # places of each kernel, to see how much of it is in the box
 
 

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 Real = Inexact[Array, "..."]
-
-
 _MOST_STEPS = 100
 
 

@@ -14,8 +14,6 @@ from jaxrock.motions.motion import Shaking
 from jaxrock.responses.history import Response
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 _WITHIN = 8  # parts of each step at whose ends the extremes are looked for
 
 

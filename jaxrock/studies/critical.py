@@ -30,11 +30,7 @@ from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.sweeps.sweep import surface
 
 _FIRST = 256  # intervals of the first sampling
-
-
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
-
-
 _TIGHT = 4e-15  # width of a bracket, relative
 
 

@@ -17,8 +17,6 @@ from jaxrock._checks import one_of, positive
 from jaxrock.blocks.rigid import Block
 
 Real = Inexact[Array, "..."]
-
-
 KINDS = ("slender", "rigid")
 
 

@@ -20,7 +20,6 @@ _CPU_OPTIONS = {
     "xla_cpu_fast_math_honor_functions": True,
 }
 
-
 _PATIENCE = 7 * 24 * 3600  # seconds a process waits for the others: shares of a sweep may take long
 
 

@@ -9,20 +9,10 @@ import numpy as np
 from jaxrock.sweeps.grid import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
-
-
 _TILE = 8  # and their extent along each of the last two axes of a grid
-
-
 _ROWS = 4  # vmapped functions of up to 16,384 lanes (65,536 on a GPU) in one compiled call
-
-
 _SMALLEST_BLOCK = 65536
-
-
 _LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
-
-
 _BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
 
 

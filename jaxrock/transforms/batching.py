@@ -20,17 +20,9 @@ except (ImportError, OSError):
 
 
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
-
-
 _NATIVE_LANES = 256  # of a chunk of the postponed in machine code, which leaves out what is not wanted
-
-
 _WIDE = 1 << 16  # on accelerators
-
-
 _FEW = 64  # scenes for which it is not worth compiling the quick version
-
-
 _ENDLESS = jnp.iinfo(jnp.int32).max
 
 

@@ -12,8 +12,6 @@ except ImportError:  # a release of JAX without them
 
 
 _deferred_p = Primitive("deferred")
-
-
 _deferred_p.multiple_results = True
 
 

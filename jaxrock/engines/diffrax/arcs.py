@@ -42,16 +42,9 @@ from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.held import Held
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
-
-
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
-
-
 _GAUSS = gauss_legendre_of_unit(12)
-
 
 _ADJOINTS = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",

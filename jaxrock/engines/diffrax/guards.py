@@ -15,11 +15,7 @@ from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion, Shaking
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
-
-
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 

@@ -47,8 +47,6 @@ from jaxrock.transforms.branches import either, when
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
 
 

@@ -15,8 +15,6 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.policy import POLICY
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 _BETWEEN = POLICY.between_checkpoints
 
 

@@ -19,8 +19,6 @@ from jaxrock.motions.motion import Shaking
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
 
 

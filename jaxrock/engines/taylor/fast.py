@@ -28,10 +28,7 @@ from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, ""]
-
-
 Flag = Bool[ArrayLike, ""]
-
 
 # Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
 # proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.

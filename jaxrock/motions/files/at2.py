@@ -7,16 +7,9 @@ from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
 
 _UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)", re.IGNORECASE)
-
-
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
-
-
 _STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})", re.IGNORECASE)
-
-
 _BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
-
 
 # Printed numbers may touch, but only a sign tells where the next begins: 1.234562.34567 is refused.
 _NUMBERS = re.compile(rf"\s*{NUMBER}(?:(?:\s+|(?=[-+])){NUMBER})*\s*")

@@ -11,16 +11,9 @@ import numpy as np
 from jaxrock._text import file_error
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `rigid.GRAVITY`, the g of the papers)
-
-
 PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY}
-
-
 _SPELLINGS = {"g": "g", "m/s2": "m/s2", "m/s/s": "m/s2"} | dict.fromkeys(["cm/s2", "cm/s/s", "gal", "gals"], "cm/s2")
-
-
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
-
 
 # A broken first line of data must not pass for a line of the header.
 LIKE_DATA = re.compile(r"\s*[-+]?(?:\.?\d|nan\b|inf\b)", re.IGNORECASE)

@@ -26,10 +26,7 @@ _WITH_HEADERS = (
     CSMIP(),
 )
 
-
 _COLUMNS = Columns(_WITH_HEADERS)
-
-
 FORMATS = {each.name: each for each in (*_WITH_HEADERS, _COLUMNS)}
 
 
