@@ -450,7 +450,7 @@ def test_even_spacing_is_demanded_to_a_thousandth(file, jitter, fine):
         ),
         ({"column": 1}, "Argument `column` must be (None|0 to 0), .* file `motion.txt`.*, but is 1"),
         ({"unit": "ft"}, r"^Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft'\.$"),
-        ({"format": "smc"}, r"^Argument `format` must be one of 'at2', 'v2', 'csv', but is 'smc'\.$"),
+        ({"format": "smc"}, r"^Argument `format` must be one of 'at2', 'v2', 'esm', 'csv', but is 'smc'\.$"),
         ({"dt": 0.0}, r"Argument `dt` must be positive and finite, but is 0\.0"),
         ({"dt": float("nan")}, "Argument `dt` must be positive and finite, but is nan"),
         ({"dt": np.array([0.01, 0.01])}, r"Argument `dt` must be one number, but has shape \(2,\)"),
@@ -534,7 +534,9 @@ def test_another_format_is_a_line_in_the_table(file, monkeypatch):
         record = read_record(file(text, path), format=given)
         np.testing.assert_array_equal(record.samples, [1, 2])
         assert (record.dt, record.name) == (0.1, "a")
-    with pytest.raises(ValueError, match="^Argument `format` must be one of 'at2', 'v2', 'csv', 'counted', but is"):
+    with pytest.raises(
+        ValueError, match="^Argument `format` must be one of 'at2', 'v2', 'esm', 'csv', 'counted', but is"
+    ):
         read_record(file("1"), format="smc")
 
 
@@ -643,3 +645,65 @@ def test_real_records_in_other_formats_raise(path):
         pytest.skip("the real records lie beside the repository, which has no licence to hold them")
     with pytest.raises(ValueError, match=Path(path).name):
         read_record(SHARED / path, dt=0.02, unit="cm/s2")
+
+
+# -------------------------------------------------------------------------------------------------------- ESM
+
+ESM_HEADER = """EVENT_NAME: GREECE
+MAGNITUDE_W:
+STATION_NAME: Town Hall,Argos
+DATE_TIME_FIRST_SAMPLE_YYYYMMDD_HHMMSS: 20190728_160919.870
+SAMPLING_INTERVAL_S: 0.005000
+NDATA: 5
+STREAM: HNE
+UNITS: cm/s^2
+PGA_CM/S^2: -2.500000
+DATA_TYPE: ACCELERATION
+USER5:
+"""
+ESM_SAMPLES = [0.0, 1.25, -2.5, 0.000001, -0.75]
+ESM = ESM_HEADER + "".join(f"{x:.6f}\n" for x in ESM_SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "content", [ESM, ESM.rstrip(), ESM.replace("\n", "\r\n"), ESM.replace("PGA_CM/S^2: -2.500000\n", "")],
+    ids=["as it is", "no end of line", "CRLF", "no peak"],
+)  # fmt: skip
+def test_esm(file, content):
+    record = read_record(file(content, "motion.ASC"))
+    np.testing.assert_allclose(record.samples, np.array(ESM_SAMPLES) / (100 * STANDARD_GRAVITY), rtol=1e-15)
+    assert float(record.dt) == 0.005
+    assert record.name == "GREECE, Town Hall,Argos, HNE"
+
+
+@pytest.mark.parametrize(
+    "content, given, message",
+    [
+        (ESM.replace("NDATA: 5", "NDATA: 6"), {}, "announces 6 samples, but 5 follow"),
+        (ESM.replace("NDATA: 5", "NDATA:"), {}, "must state a number as NDATA, but states ''"),
+        (ESM.replace("0.005000", "0"), {}, "which is not positive"),
+        (ESM.replace("ACCELERATION", "VELOCITY"), {}, "line 10 states velocity"),
+        (ESM.replace("cm/s^2", "cm/s"), {}, "line 8 states the unit 'cm/s'"),
+        (ESM.replace("1.250000", "1.25OOOO"), {}, "line 13 should hold samples"),
+        (ESM.replace("PGA_CM/S^2: -2.5", "PGA_CM/S^2: -2500.0"), {}, "line 9 states a peak of 2500"),
+        (ESM, {"column": 0}, "`column` must be None"),
+        (ESM, {"dt": 0.01}, "`dt` must agree"),
+        (ESM, {"unit": "g"}, "`unit` must agree"),
+        (TITLES + UNIT + COUNTS + BODY, {"format": "esm"}, "must state a number as SAMPLING_INTERVAL_S"),
+    ],
+)
+def test_esm_that_is_wrong(file, content, given, message):
+    with pytest.raises(ValueError, match=message):
+        read_record(file(content, "motion.ASC"), **given)
+
+
+def test_esm_that_is_cut_anywhere(file):
+    """Nowhere a wrong record: refused, or nothing is missing but the end of the last line."""
+    whole = read_record(file(ESM, "whole.ASC"), format="esm")
+    for end in range(len(ESM) - 1):
+        try:
+            record = read_record(file(ESM[:end], "cut.ASC"), format="esm")
+        except ValueError:
+            continue
+        np.testing.assert_array_equal(record.samples, whole.samples)
+        assert end == len(ESM) - 1

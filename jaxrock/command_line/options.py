@@ -23,7 +23,9 @@ def add_restitution(parser: argparse.ArgumentParser) -> None:
 
 def add_record(parser: argparse.ArgumentParser) -> None:
     """A record, and options for files that do not say all."""
-    parser.add_argument("record", nargs="?", help="PEER AT2, CSMIP V2, CSV or text file (default: the built-in record)")
+    parser.add_argument(
+        "record", nargs="?", help="PEER AT2, CSMIP V2, ESM, CSV or text file (default: the built-in record)"
+    )
     parser.add_argument("--dt", type=float, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")

@@ -15,6 +15,7 @@ from jaxrock._text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
 from jaxrock.motions.files.csmip import CSMIP
+from jaxrock.motions.files.esm import ESM
 from jaxrock.motions.files.format import AbstractFormat
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.record import Record
@@ -24,6 +25,7 @@ from jaxrock.motions.record import Record
 _WITH_HEADERS = (
     AT2(),
     CSMIP(),
+    ESM(),
 )
 
 _COLUMNS = Columns(_WITH_HEADERS)
@@ -43,16 +45,16 @@ def read_record(
     **Arguments:**
 
     - `path`: the file.
-    - `format`: "at2" (PEER), "v2" (CSMIP, also USC: corrected acceleration), or "csv" (columns of text
-      separated by commas, semicolons, tabs or blanks). None recognises it from the content, then from
-      the suffix.
+    - `format`: "at2" (PEER), "v2" (CSMIP, also USC: corrected acceleration), "esm" (ASCII of the
+      Engineering Strong-Motion database), or "csv" (columns of text separated by commas, semicolons, tabs or blanks).
+      None recognises it from the content, then from the suffix.
     - `dt`: time between samples [s], positive. Needed for text without times; elsewhere it must agree
       with the file to 1e-3.
     - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls.
-      V2: the channel (None: the first). Not for AT2.
+      V2: the channel (None: the first). Not for AT2 and ESM.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file). Its first
     sample is at time 0, whatever the times in the file.

@@ -1,0 +1,81 @@
+"""ESM, the ASCII format of the Engineering Strong-Motion database: lines `KEY: value`, then a sample a line."""
+
+import re
+
+import numpy as np
+
+from jaxrock._text import file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
+
+_KEY = re.compile(r"([A-Z][A-Z0-9_/^]*):\s*(.*)")
+_STEP, _COUNT, _KIND, _UNIT, _PEAK = "SAMPLING_INTERVAL_S", "NDATA", "DATA_TYPE", "UNITS", "PGA_CM/S^2"
+
+
+class ESM(AbstractFormat):
+    """ESM ASCII."""
+
+    name = "esm"
+
+    def recognises(self, lines):
+        return {_STEP, _COUNT} <= set(_header(lines))
+
+    def read(self, name, lines, dt, unit, column):
+        if column is not None:
+            one = f"ESM file `{name}` has one record"
+            raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+        header = _header(lines)
+        step, count = (_stated(name, header, key) for key in (_STEP, _COUNT))
+        kind = header.get(_KIND, (0, ""))[1].upper()
+        if kind not in ("", "ACCELERATION"):
+            raise file_error(name, f"line {header[_KIND][0]} states {kind.lower()}, but samples must be accelerations.")
+        at, written = header.get(_UNIT, (0, ""))
+        dt, unit = agreed_step(name, dt, step), agreed_unit(name, at, unit, written)
+        start = max(line for line, _ in header.values())
+        samples = announced_samples(name, lines, start, int(count), _number)
+        _check_last(name, lines)
+        _check_peak(name, header, samples, unit)
+        told = (header.get(key, (0, ""))[1] for key in ("EVENT_NAME", "STATION_NAME", "STREAM"))
+        return Accelerogram(samples, dt, unit, ", ".join(word for word in told if word))
+
+
+def _header(lines: list[str]) -> dict[str, tuple[int, str]]:
+    """Number of the line, and value, of every key; it ends with the first line that has none."""
+    header = {}
+    for number, line in enumerate(lines, 1):
+        found = _KEY.fullmatch(line.strip())
+        if not found:
+            break
+        header.setdefault(found[1], (number, found[2].strip()))
+    return header
+
+
+def _stated(name: str, header: dict, key: str) -> float:
+    """A number that the header must state."""
+    line, value = header.get(key, (0, ""))
+    if not re.fullmatch(NUMBER, value):
+        raise file_error(name, f"header must state a number as {key}, but states {value!r}.")
+    return to_float(value)
+
+
+def _number(line: str) -> list[float] | None:
+    return [to_float(line.strip())] if re.fullmatch(NUMBER, line.strip()) else None
+
+
+def _check_last(name: str, lines: list[str]) -> None:
+    """All samples have the same number of decimals: a last one with fewer was cut."""
+    numbers = [(number, line.strip()) for number, line in enumerate(lines, 1) if _number(line) is not None]
+    decimals = [len(text.partition(".")[2]) for _, text in numbers]
+    if decimals[-1] != decimals[0]:
+        number, text = numbers[-1]
+        raise file_error(name, f"line {number} ends early: {text!r} has {decimals[-1]} decimals and not {decimals[0]}.")
+
+
+def _check_peak(name: str, header: dict, samples: np.ndarray, unit: str) -> None:
+    """The largest sample is the peak that the header states."""
+    line, value = header.get(_PEAK, (0, ""))
+    if unit != "cm/s2" or not re.fullmatch(NUMBER, value):
+        return
+    stated, largest = abs(to_float(value)), float(np.abs(samples).max())
+    if abs(largest - stated) > 1e-3 * stated + 1e-6:
+        raise file_error(name, f"line {line} states a peak of {stated:g} cm/s2, but the largest sample is {largest:g}.")
