@@ -1,6 +1,7 @@
 """Argument checks: one message template, for values that are known and for values under jit."""
 
 import contextlib
+import contextvars
 import functools
 import inspect
 from collections.abc import Callable, Sequence
@@ -56,13 +57,15 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
 
 def watched(values, message: str, failed: Bool[ArrayLike, ""]):
     """Return `values`, which are traced, with a check: it is put down, or made where they are computed."""
-    if _put_down is not None and _put_down[0] == get_opaque_trace_state():
-        _put_down[1].append((message, failed))
+    state, checks = _put_down.get()
+    if state is not None and state == get_opaque_trace_state():
+        checks.append((message, failed))
         return values
     return eqx.error_if(values, failed, message + ".")
 
 
-_put_down: tuple | None = None
+# What is traced where checks are put down, and these; every thread has its own.
+_put_down = contextvars.ContextVar("put_down", default=(None, None))
 
 
 @contextlib.contextmanager
@@ -72,13 +75,12 @@ def put_down():
     A program that may raise is not kept by JAX's cache of compiled programs; one that returns what was put down is.
     Checks within transformations of the function that is traced here are still made.
     """
-    global _put_down
-    before, found = _put_down, []
-    _put_down = get_opaque_trace_state(), found
+    checks = []
+    before = _put_down.set((get_opaque_trace_state(), checks))
     try:
-        yield found
+        yield checks
     finally:
-        _put_down = before
+        _put_down.reset(before)
 
 
 class Range(NamedTuple):

@@ -1,5 +1,6 @@
 """Sweeps: every point in its place, whatever the shape of the grid, the size of a block and the number of devices."""
 
+import concurrent.futures
 import math
 import subprocess
 import sys
@@ -250,3 +251,27 @@ def test_cpu_devices_come_too_late():
         rk.use_cpu_devices(3)
     with pytest.raises(ValueError, match="`count` must be at least 1, but is 0"):
         rk.use_cpu_devices(0)
+
+
+def test_sweeps_in_threads_keep_their_checks():
+    """What one thread traces does not lose another's checks of arguments."""
+
+    def swept(restitution):
+        return rk.sweep(
+            lambda restitution, p: rk.Block(0.2, p, restitution).restitution * p,
+            restitution=[restitution, 0.5], p=[1.0, 2.0], progress=False,
+        )  # fmt: skip
+
+    def tried(number):
+        try:
+            return np.asarray(swept(0.9 if number % 2 else 1.5).values)
+        except ValueError as error:
+            return str(error)
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(tried, range(24)))
+    for number, answer in enumerate(answers):
+        if number % 2:
+            np.testing.assert_allclose(answer, np.outer([0.9, 0.5], [1.0, 2.0]))
+        else:
+            assert "Argument `restitution` must be in [0, 1], but is not at the point (1.5, 1)" in answer
