@@ -261,7 +261,7 @@ def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool,
     ends = _roots(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
-    names = tuple(name for name in named(scenes.block, scenes.motion) if kind.keeps(name))
+    names = tuple(name for name in named(*one_of_many(scene, 0)) if kind.keeps(name))
     units = np.asarray(jax.vmap(lambda index: kind.unit(*one_of_many(scene, index)))(jnp.arange(grid.shape[0])))
     value = np.exp(ends["z"]) * units[ends["index"]]
     derivative = np.full((order.size, len(names)), np.nan)
