@@ -1,44 +1,72 @@
-"""Keeping XLA's CPU backend from computing the same thing again."""
+"""Keeping XLA's CPU backend from computing the same thing again.
+
+On CPUs, XLA computes a cheap value again in every loop that uses it, so that a series, whose terms each use all before,
+would be computed dozens of times a step. A division is never repeated: what many use is divided by a one that the
+compiler cannot see. Both are primitives of JAX, which become operations where XLA lowers them for a CPU; everywhere
+else, and in machine code of our own, they are the value itself.
+"""
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
-_kept = jax.make_user_context(True)  # each thread's own, and what JAX traced in one is not used in the other
-
-
-def nothing_kept():
-    """A context for programs that XLA does not compile: what is traced meanwhile keeps nothing."""
-    return _kept(False)
-
-
-def _needed() -> bool:
-    return _kept.value and jax.default_backend() == "cpu"
+_one_p, _keep_p = Primitive("unseen_one"), Primitive("keep")
 
 
 def unseen_one(witness):
     """The number one, in a way that the compiler cannot see; `witness`: a number that is known at run time only and
     never negative."""
-    if not _needed():
-        return jnp.ones_like(witness)
-    # An exponential is never repeated either, and its underflow is exact.
-    return 1 + jnp.exp(jnp.where(witness < 0, 0.0, -2000.0).astype(jnp.asarray(witness).dtype))
+    return _one_p.bind(jax.lax.stop_gradient(jnp.asarray(witness)))
 
 
 def keep_by(value, one):
-    """Mark a value that many others use: it is computed once.
-
-    On CPUs, XLA computes a cheap value again in every loop that uses it, so that a series, whose terms each use
-    all before, would be computed dozens of times a step. A division is never repeated: this one is by an
-    `unseen_one`.
-    """
-    return value / one if _needed() else value
+    """Mark a value that many others use, so that it is computed once; `one`: an `unseen_one`."""
+    return _marked(value, one, by_one=True)
 
 
 def keep(value, witness):
     """As `keep_by`, from a witness of the one."""
-    return value / jnp.where(witness < 0, 2.0, 1.0).astype(jnp.asarray(value).dtype) if _needed() else value
+    return _marked(value, witness, by_one=False)
 
 
 def keep_flag(flag, witness):
     """As `keep`, of a condition."""
-    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5 if _needed() else flag
+    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5
+
+
+def _marked(value, witness, by_one: bool):
+    value, witness = jnp.asarray(value), jax.lax.stop_gradient(jnp.asarray(witness))
+    witness = jnp.broadcast_to(witness.astype(value.dtype), value.shape)
+    return _keep_p.bind(value, witness, by_one=by_one)
+
+
+def _one_on_cpu(witness):
+    # An exponential is never repeated either, and its underflow is exact.
+    return 1 + jnp.exp(jnp.where(witness < 0, 0.0, -2000.0).astype(witness.dtype))
+
+
+def _kept_on_cpu(value, witness, by_one: bool):
+    return value / (witness if by_one else jnp.where(witness < 0, 2.0, 1.0).astype(value.dtype))
+
+
+_one_p.def_impl(jnp.ones_like)
+_one_p.def_abstract_eval(lambda witness: witness)
+batching.defvectorized(_one_p)
+ad.defjvp(_one_p, None)
+mlir.register_lowering(_one_p, mlir.lower_fun(jnp.ones_like, multiple_results=False))
+mlir.register_lowering(_one_p, mlir.lower_fun(_one_on_cpu, multiple_results=False), platform="cpu")
+
+_keep_p.def_impl(lambda value, witness, by_one: value)
+_keep_p.def_abstract_eval(lambda value, witness, by_one: value)
+batching.defbroadcasting(_keep_p)
+ad.defjvp(_keep_p, lambda change, value, witness, by_one: _keep_p.bind(change, witness, by_one=by_one), None)
+mlir.register_lowering(_keep_p, lambda context, value, witness, by_one: [value])
+mlir.register_lowering(_keep_p, mlir.lower_fun(_kept_on_cpu, multiple_results=False), platform="cpu")
+
+
+def _transposed(cotangent, value, witness, by_one):
+    return cotangent if type(cotangent) is ad.Zero else _keep_p.bind(cotangent, witness, by_one=by_one), None
+
+
+ad.primitive_transposes[_keep_p] = _transposed

@@ -198,7 +198,7 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     def on_tape(scene):
         return _steps(*scene, taped=True)
 
-    run = run if engine.reverse else differentiable(run, on_tape)
+    run = run if engine.reverse else differentiable(run, on_tape, name="history")
     state, nodes, final = run((block, motion, model, initial, stop, engine))
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, stop, history=True)

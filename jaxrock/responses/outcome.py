@@ -21,8 +21,8 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status
-from jaxrock.transforms.batching import Passes
 from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.recipe import Passes
 
 Scalar = Inexact[ArrayLike, "..."]
 
@@ -109,18 +109,30 @@ def outcome(
 
 @jax.jit
 def _outcome(block, motion, model, initial, engine) -> Outcome:
-    def run(scene):
-        return _to_outcome(*scene, taped=False)
-
-    def on_tape(scene):
-        return _to_outcome(*scene, taped=True)
-
     scene = block, motion, model, initial, engine
     if engine.reverse:
-        return run(scene)
+        return _by_steps(scene)
     check_single(block=block, motion=motion)
-    passes = _passes(POLICY.is_record(motion.knots.size - 1)) if isinstance(engine, Series) else None
-    return differentiable(run, on_tape, passes)(scene)
+    if not isinstance(engine, Series):
+        return differentiable(_by_steps, _on_tape, name="outcome")(scene)
+    passes = _passes(POLICY.is_record(motion.knots.size - 1))
+    return differentiable(passes.whole, _on_tape, passes, "outcome", _like)(scene)
+
+
+def _by_steps(scene) -> Outcome:
+    return _to_outcome(*scene, taped=False)
+
+
+def _on_tape(scene) -> Outcome:
+    return _to_outcome(*scene, taped=True)
+
+
+def _like(scene) -> Outcome:
+    """What an outcome looks like."""
+    real = jax.ShapeDtypeStruct((), jnp.result_type(*jax.tree.leaves(scene[:2])))
+    count, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), bool)
+    status = jax.eval_shape(lambda: Status.successful)
+    return Outcome(real, real, real, count, flag, real, flag, real, real, status)
 
 
 def _passes(rounds: bool) -> Passes:

@@ -1,16 +1,20 @@
-"""Many scenes at once: under `jax.vmap` a function of one scene runs in chunks of lanes that step together.
+"""Many scenes at once: in machine code of our own, or in chunks of lanes that XLA steps together.
 
 A quick version of the function, where there is one, goes first; the scenes that it postpones are gathered and done
 by the careful one, again in chunks.
 """
 
+import functools
+import logging
+import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
-from jax.extend.core import Literal, jaxpr_as_fun
+from jax.extend.core import Literal
+
+from jaxrock.transforms.recipe import Recipe
 
 try:  # an extra
     from jaxrock.native import call as native
@@ -18,7 +22,7 @@ try:  # an extra
 except (ImportError, OSError):
     native, Unsupported = None, ()
 
-
+_LOG = logging.getLogger("jaxrock")
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
 _NATIVE_LANES = 256  # of a chunk of the postponed in machine code, which leaves out what is not wanted
 _WIDE = 1 << 16  # on accelerators
@@ -26,172 +30,159 @@ _FEW = 64  # scenes for which it is not worth compiling the quick version
 _ENDLESS = jnp.iinfo(jnp.int32).max
 
 
-class Passes(NamedTuple):
-    """A function of one scene in parts.
+class Lanes:
+    """A recipe at `size` scenes (None: one, without an axis), of which some leaves are their `own`.
 
-    - `begin(tree)`: the scene as the other parts take it, and a first state.
-    - `quickly(scene, state, limit)`: the state where it is finished or given up, or after `limit` steps in all; None:
-      there is no quick pass.
-    - `carefully(scene, state)`: the state where it is finished.
-    - `unfinished(scene, state)`: whether the quick pass has to go on.
-    - `conclude(scene, state)`: the result, and whether the quick pass has postponed it to the careful one.
-    - `round`: steps after which chunks are made up anew of the scenes that are unfinished; None: never.
+    Called with leaves it returns leaves. `on_cpu`: what it is compiled for; `devices`: that run it at the same time.
     """
 
-    begin: Callable
-    quickly: Callable | None
-    carefully: Callable
-    unfinished: Callable | None
-    conclude: Callable
-    round: int | None
+    def __init__(self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1):
+        self.recipe, self.own, self.size, self.on_cpu = recipe, own, size, on_cpu
+        self.threads = native.threads(devices) if native is not None else 1
 
+    def __call__(self, *leaves) -> list:
+        if self.in_machine_code:
+            if self.size is None:
+                return [x[0] for x in self._alone(*(jnp.asarray(x)[None] for x in leaves))]
+            return self._natively(leaves)
+        return list(self.recipe(leaves)) if self.size is None else self._by_xla(leaves)
 
-def _lanes(most: int, size: int) -> int:
-    return min(most if jax.default_backend() == "cpu" else _WIDE, size)
+    @functools.cached_property
+    def in_machine_code(self) -> bool:
+        """Whether machine code of our own runs it."""
+        if not self.on_cpu or native is None or not self.recipe.in_lanes:
+            return False
+        try:
+            self._plans()
+        except Unsupported as reason:
+            _LOG.debug("%s is left to XLA: %s", self.recipe, reason)
+            return False
+        return True
 
+    @property
+    def machine(self) -> str:
+        """What machine code is made for."""
+        return native.machine() if native is not None else ""
 
-def in_lanes(function: Callable, passes: Passes | None = None, alone: Callable | None = None) -> Callable:
-    """`function(tree)`, which under `jax.vmap` runs in chunks of lanes, quickly where it can; `alone`: the same for one
-    scene without `jax.vmap`."""
+    def codes(self) -> list[str]:
+        """Names of the machine code that it calls."""
+        return [name for plan in self._plans() for name in plan.names] if self.in_machine_code else []
 
-    @custom_vmap
-    def one(tree):
-        return (alone or function)(tree)
+    def found(self, code: str) -> bool:
+        """Whether such machine code is there, or kept."""
+        return native is not None and native.is_there(code)
 
-    @one.def_vmap
-    def _(size, batched, tree):
-        results = _Batch(function if passes else _traced_apart(function), passes, size, batched[0])(tree)
-        return results, jax.tree.map(lambda _: True, results)
+    @property
+    def _alone(self) -> "Lanes":
+        return Lanes(self.recipe, (True,) * len(self.own), 1, self.on_cpu)
 
-    return one
+    @property
+    def _is_quick(self) -> bool:
+        return bool(self.recipe.passes and self.recipe.passes.quickly) and (self.size or 0) > _FEW
 
+    def _plans(self) -> list:
+        own = self.own if self.size is not None else (True,) * len(self.own)
+        return [self._plan(quick, own) for quick in ([True, False] if self._is_quick else [False])]
 
-def _traced_apart(function: Callable) -> Callable:
-    """`function(tree)`, within a `shard_map` traced as if outside of it.
+    def _plan(self, quick: bool, own: tuple[bool, ...]):
+        key = quick, own
+        if key not in self.recipe.plans:
+            program = self.recipe.quick if quick else self.recipe.program
+            self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled)
+        return self.recipe.plans[key]
 
-    Equinox compares the types of arguments when it differentiates the solves of Diffrax, and takes those that tell of
-    the mesh of a `shard_map`, and those that do not, for different ones.
-    """
+    def _natively(self, leaves) -> list:
+        """From beginning to end in machine code of our own."""
+        plans, threads = self._plans(), self.threads
+        if len(plans) == 1:
+            return plans[0](leaves, threads)
+        *found, which = plans[0](leaves, threads)
 
-    def run(tree):
-        if jax.sharding.get_abstract_mesh().empty:
-            return function(tree)
-        leaves, structure = jax.tree.flatten(tree)
-        leaves = [jnp.asarray(x) for x in leaves]
-        types = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in leaves]
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            program, shapes = jax.make_jaxpr(lambda *x: function(structure.unflatten(x)), return_shape=True)(*types)
-        return jax.tree.unflatten(jax.tree.structure(shapes), jaxpr_as_fun(program)(*leaves))
+        def carefully(part, count):
+            rest = iter(part)
+            return plans[1]([next(rest) if mine else x for x, mine in zip(leaves, self.own)], threads, count)
 
-    return run
+        own = [x for x, mine in zip(leaves, self.own) if mine]
+        return self._again(carefully, own, found, which, _NATIVE_LANES)
 
+    def _by_xla(self, leaves) -> list:
+        """In chunks of lanes."""
+        passes, scenes = self.recipe.passes, _Scenes(leaves, self.own, self.recipe.structure)
 
-class _Batch:
-    """A function of one scene at `size` scenes: leaves that are `batched` have a leading axis."""
+        def function(own, _=None):
+            return scenes.each(lambda tree: self.recipe(jax.tree.leaves(tree)), own)
 
-    def __init__(self, function, passes, size, batched):
-        self.function, self.passes, self.size = function, passes, size
-        self.flags, self.structure = jax.tree.flatten(batched)
-
-    def __call__(self, tree):
-        @custom_vmap
-        def run(leaves):
-            return self._run(leaves)
-
-        @run.def_vmap
-        def _(size, batched, leaves):
-            results = self._one_more_axis(size, batched[0], leaves)
-            return results, jax.tree.map(lambda _: True, results)
-
-        return run(self.structure.flatten_up_to(tree))
-
-    def _one_more_axis(self, size, batched, leaves):
-        """One more axis: both become one, unless arrays that all scenes share would be copied for each."""
-        shared = any(new and not old and jnp.ndim(x) > 1 for new, old, x in zip(batched, self.flags, leaves))
-        if shared:
-            moving = [x for x, new in zip(leaves, batched) if new]
-
-            def one(moving):
-                rest = iter(moving)
-                return self(self.structure.unflatten([next(rest) if new else x for x, new in zip(leaves, batched)]))
-
-            return jax.lax.map(one, moving)
-
-        def merged(x, new, old):
-            if not (new or old):
-                return x
-            x = x if new else x[None]
-            x = x if old else x[:, None]
-            return jnp.broadcast_to(x, (size, self.size, *x.shape[2:])).reshape(size * self.size, *x.shape[2:])
-
-        flags = [new or old for new, old in zip(batched, self.flags)]
-        batch = _Batch(self.function, self.passes, size * self.size, self.structure.unflatten(flags))
-        results = batch(self.structure.unflatten([merged(*each) for each in zip(leaves, batched, self.flags)]))
-        return jax.tree.map(lambda x: x.reshape(size, self.size, *x.shape[1:]), results)
-
-    def _run(self, leaves):
-        scenes = _Lanes(leaves, self.flags, self.structure)
-        if self.passes is not None and native is not None and jax.default_backend() == "cpu":
-            try:
-                return self._natively(scenes)
-            except Unsupported:
-                pass
-
-        def function(own):
-            return scenes.each(self.function, own)
-
-        if self.passes is None or self.passes.quickly is None or self.size <= _FEW:
-            return _chunked(function, scenes.own, self.size)
-        ready, begun = scenes.begin(self.passes.begin)
+        if not self._is_quick:
+            return self._chunked(function, scenes.own)
+        ready, begun = scenes.begin(passes.begin)
 
         def quickly(limit, own, states):
-            return ready.each(lambda scene, state: self.passes.quickly(scene, state, limit), own, states)
+            return ready.each(lambda scene, state: passes.quickly(scene, state, limit), own, states)
 
-        if self.passes.round is not None:
+        if passes.round is not None:
             followed = self._in_rounds(quickly, ready, begun)
         else:
-            followed = _chunked(lambda part: quickly(_ENDLESS, *part), (ready.own, begun), self.size, _QUICK_LANES)
+            followed = self._chunked(lambda part: quickly(_ENDLESS, *part), (ready.own, begun), _QUICK_LANES)
         # Outside the chunks, so that what nobody asks for is not computed.
-        return _again(lambda own, _: function(own), scenes.own, *ready.each(self.passes.conclude, ready.own, followed))
+        found, which = ready.each(passes.conclude, ready.own, followed)
+        return self._again(function, scenes.own, jax.tree.leaves(found), which)
 
-    def _natively(self, scenes: "_Lanes"):
-        """From beginning to end in machine code of our own."""
-        passes, refilled = self.passes, self.passes.round is not None
-
-        def with_all(follow):
-            def function(tree):
-                scene, state = passes.begin(tree)
-                return passes.conclude(scene, follow(scene, state))
-
-            return function
-
-        def carefully(own, count=None):
-            return scenes.each_natively(with_all(passes.carefully), own, refilled, count)[0]
-
-        if passes.quickly is None or self.size <= _FEW:
-            return carefully(scenes.own)
-        quickly = with_all(lambda scene, state: passes.quickly(scene, state, _ENDLESS))
-        return _again(carefully, scenes.own, *scenes.each_natively(quickly, scenes.own, refilled), _NATIVE_LANES)
-
-    def _in_rounds(self, quickly: Callable, ready: "_Lanes", states):
+    def _in_rounds(self, quickly: Callable, ready: "_Scenes", states):
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
 
         def unfinished(states):
-            return ready.each(self.passes.unfinished, ready.own, states)
+            return ready.each(self.recipe.passes.unfinished, ready.own, states)
 
         def body(carry):
             limit, states, left = carry
-            states = _again(lambda part, _: quickly(limit, *part), (ready.own, states), states, left)
-            return limit + self.passes.round, states, unfinished(states)
+            states = self._again(lambda part, _: quickly(limit, *part), (ready.own, states), states, left)
+            return limit + self.recipe.passes.round, states, unfinished(states)
 
-        carry = jnp.int32(self.passes.round), states, unfinished(states)
+        carry = jnp.int32(self.recipe.passes.round), states, unfinished(states)
         return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
 
+    def _width(self, most: int, size: int) -> int:
+        return min(most if self.on_cpu else _WIDE, size)
 
-class _Lanes:
+    def _chunked(self, function: Callable, leaves, most: int = _LANES):
+        """`function` of leaves with a leading axis of all scenes, in chunks; the last is filled up with its last scene."""
+        lanes = self._width(most, self.size)
+        chunks = -(-self.size // lanes)
+
+        def cut(x):
+            x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - self.size, axis=0)])
+            return x.reshape(chunks, lanes, *x.shape[1:])
+
+        results = jax.lax.map(function, jax.tree.map(cut, leaves))
+        return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:self.size], results)
+
+    def _again(self, function: Callable, leaves, found, which, most: int = _LANES):
+        """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first
+        `count` are wanted."""
+        lanes = self._width(most, which.size)
+
+        def some(found):
+            count = which.sum()
+            order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
+            order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
+
+            def body(carry):
+                done, found = carry
+                places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
+                wanted = done + jnp.arange(lanes) < count
+                more = function(jax.tree.map(lambda x: x[places], leaves), jnp.minimum(count - done, lanes))
+                targets = jnp.where(wanted, places, which.size)  # nowhere
+                return done + lanes, jax.tree.map(lambda x, new: x.at[targets].set(new, mode="drop"), found, more)
+
+            return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
+
+        return jax.lax.cond(which.any(), some, lambda found: found, found)
+
+
+class _Scenes:
     """Pytrees, one for each lane: leaves that are a lane's `own` have a leading axis, the others are shared."""
 
-    def __init__(self, leaves: list, flags: list[bool], structure):
+    def __init__(self, leaves: list, flags: tuple[bool, ...] | list[bool], structure):
         self.leaves, self.flags, self.structure = leaves, flags, structure
 
     @property
@@ -207,20 +198,7 @@ class _Lanes:
         """`function(tree, *more)` of lanes with these leaves of their own."""
         return jax.vmap(lambda own, *more: function(self._tree(own), *more))(own, *more)
 
-    def each_natively(self, function: Callable, own: list, refilled: bool, count=None):
-        """`function(tree)` in machine code of our own; `refilled` and `count`: see `native.run`."""
-        rest, structures = iter(own), []
-        leaves = [next(rest) if flag else x for x, flag in zip(self.leaves, self.flags)]
-
-        def flat(leaves):
-            results, structure = jax.tree.flatten(function(self.structure.unflatten(leaves)))
-            structures.append(structure)
-            return results
-
-        results = native.run(flat, leaves, [not flag for flag in self.flags], refilled, count)
-        return structures[0].unflatten(results)
-
-    def begin(self, function: Callable) -> tuple["_Lanes", Any]:
+    def begin(self, function: Callable) -> tuple["_Scenes", Any]:
         """Two results of `function(tree)`: the first as lanes, of which what all share is made once; the second of
         every lane."""
 
@@ -233,7 +211,7 @@ class _Lanes:
         flags = _follow_from(flat, first)[:count]
         every = jax.vmap(flat)(self.own)
         leaves = [many if flag else one for many, one, flag in zip(every, flat(first), flags)]
-        return _Lanes(leaves, flags, structure), jax.tree.unflatten(jax.tree.structure(shapes[1]), every[count:])
+        return _Scenes(leaves, flags, structure), jax.tree.unflatten(jax.tree.structure(shapes[1]), every[count:])
 
 
 def _follow_from(function: Callable, inputs: list) -> list[bool]:
@@ -244,39 +222,3 @@ def _follow_from(function: Callable, inputs: list) -> list[bool]:
         if any(not isinstance(x, Literal) and x in moved for x in equation.invars):
             moved.update(equation.outvars)
     return [not isinstance(x, Literal) and x in moved for x in program.outvars]
-
-
-def _chunked(function: Callable, leaves, size: int, most: int = _LANES):
-    """`function` of leaves with a leading axis of `size`, in chunks; the last is filled up with its last scene."""
-    lanes = _lanes(most, size)
-    chunks = -(-size // lanes)
-
-    def cut(x):
-        x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - size, axis=0)])
-        return x.reshape(chunks, lanes, *x.shape[1:])
-
-    results = jax.lax.map(function, jax.tree.map(cut, leaves))
-    return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], results)
-
-
-def _again(function: Callable, leaves, found, which, most: int = _LANES):
-    """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first
-    `count` are wanted."""
-    lanes = _lanes(most, which.size)
-
-    def some(found):
-        count = which.sum()
-        order = jnp.nonzero(which, size=which.size, fill_value=0)[0]
-        order = jnp.concatenate([order, jnp.zeros(lanes, order.dtype)])
-
-        def body(carry):
-            done, found = carry
-            places = jax.lax.dynamic_slice_in_dim(order, done, lanes)
-            wanted = done + jnp.arange(lanes) < count
-            more = function(jax.tree.map(lambda x: x[places], leaves), jnp.minimum(count - done, lanes))
-            targets = jnp.where(wanted, places, which.size)  # nowhere
-            return done + lanes, jax.tree.map(lambda x, new: x.at[targets].set(new, mode="drop"), found, more)
-
-        return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros_like(count), found))[1]
-
-    return jax.lax.cond(which.any(), some, lambda found: found, found)

@@ -1,0 +1,167 @@
+"""How long the first answer takes: every question in a fresh process, with nothing kept (cold) and once more (warm).
+
+    python benchmarks/first_answer.py [--only WORDS] [--package FOLDER] [--rounds 2]
+
+Times are processor seconds of all threads, from after the imports of the package to the answer; of the command line,
+the whole process. Every question starts with an empty folder of kept programs. `--package` measures another copy.
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+HERE = pathlib.Path(__file__).resolve().parent
+
+_BEGIN = """
+import json, resource, time
+def spent():
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used), time.perf_counter()
+begun = spent()
+import jax, numpy as np, jax.numpy as jnp
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_enable_x64", True)
+jax.block_until_ready(jnp.ones(3) + 1)
+of_jax = spent()
+import jaxrock as rk
+block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
+imported = spent()
+"""
+_END = """
+jax.block_until_ready([x for x in jax.tree.leaves(answer) if isinstance(x, jax.Array)])
+done = spent()
+found = {"jax": of_jax[0] - begun[0], "import": imported[0] - of_jax[0], "answer": done[0] - imported[0],
+         "wall": done[1] - imported[1], "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+print(json.dumps(found))
+"""
+
+# Question: (the table's words, code, bars cold and warm [s], whether llvmlite is there).
+QUESTIONS = {
+    "import": ("import beyond JAX", "answer = 0", None, 0.3),
+    "pulse": ("`outcome`, sine pulse", "answer = rk.outcome(block, pulse)", 2.5, 0.4),
+    "record": ("`outcome`, record", "answer = rk.outcome(block, 1.5 * rk.example_record())", 2.5, 0.4),
+    "simulate": (
+        "`simulate`, 2,001 samples, picture",
+        "import matplotlib; matplotlib.use('Agg')\n"
+        "answer = rk.simulate(block, pulse); rk.plot.history(answer)[0].figure.savefig('/dev/null', format='png')",
+        5.0, 1.2,
+    ),
+    "vmap": (
+        "`vmap` of 1,000",
+        "answer = jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a, 0.8)))(jnp.linspace(0.25, 0.9, 1000))",
+        4.0, 0.6,
+    ),
+    "scaled": (
+        "`vmap` of 1,000 scales of a record",
+        "record = rk.example_record()\n"
+        "answer = jax.vmap(lambda a: rk.outcome(block, a * record))(jnp.linspace(0.5, 2.0, 1000))",
+        4.0, 0.6,
+    ),
+    "map": (
+        "map of 128 x 128",
+        "answer = rk.overturning_map(np.linspace(1, 8, 128), np.linspace(1, 10, 128), progress=False)",
+        4.0, 0.6,
+    ),
+    "grad": (
+        "`jax.grad` by one number",
+        "answer = jax.grad(lambda a: rk.outcome(block, rk.SinePulse(a, 0.8)).max_rotation)(0.3)",
+        6.0, 1.0,
+    ),
+    "slopes": (
+        "value and 5 derivatives of 1,000",
+        "def peak(x): return rk.outcome(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4])).max_rotation\n"
+        "x = jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]) * jnp.linspace(0.99, 1.01, 1000)[:, None]\n"
+        "answer = jax.vmap(jax.value_and_grad(peak))(x)",
+        6.0, 1.0,
+    ),
+    "hessian": (
+        "Hessian of 5 under `vmap`",
+        "def peak(x): return rk.outcome(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4])).max_rotation\n"
+        "x = jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]) * jnp.linspace(0.99, 1.01, 100)[:, None]\n"
+        "answer = jax.vmap(jax.hessian(peak))(x)",
+        30.0, 1.5,
+    ),
+    "asymmetric": (
+        "asymmetric rock, vertical shaking, `vmap`",
+        "rock = rk.AsymmetricBlock(0.15, 0.25, 2.0)\n"
+        "motion = rk.with_vertical(rk.SinePulse(0.3, 0.8), rk.SinePulse(0.1, 0.3))\n"
+        "answer = jax.vmap(lambda a: rk.outcome(rock, a * motion))(jnp.linspace(0.5, 2.0, 1000))",
+        6.0, 0.8,
+    ),
+    "diffrax": ("Diffrax engine, `outcome`", "answer = rk.outcome(block, pulse, engine=rk.Diffrax())", 5.0, 1.0),
+    "closed": (
+        "gradient of a closed form",
+        "from jaxrock.closed_form import sine_pulse\n"
+        "answer = jax.grad(lambda w: sine_pulse.during_pulse_limit(w, 0.9))(2.0)",
+        2.0, 0.5,
+    ),
+    "closed2": (
+        "its Hessian",
+        "from jaxrock.closed_form import sine_pulse\n"
+        "answer = jax.hessian(lambda w: sine_pulse.during_pulse_limit(w, 0.9))(2.0)",
+        8.0, 0.5,
+    ),
+    "bare": (
+        "map of 128 x 128 without llvmlite",
+        "answer = rk.overturning_map(np.linspace(1, 8, 128), np.linspace(1, 10, 128), progress=False)",
+        15.0, 3.0,
+    ),
+    "run": ("`jaxrock run`, whole process", ["run"], 8.0, 3.0),
+    "invert": ("`jaxrock invert`, whole process", ["invert", "rocks.csv"], 20.0, 8.0),
+}  # fmt: skip
+_ROCKS = "alpha_rad,p_rad_per_s,observed\n0.15,2.0,survived\n0.2,2.5,survived\n0.1,3.0,toppled\n0.25,1.8,survived\n"
+
+
+def measure(question: str, package: pathlib.Path, kept: str, folder: str) -> dict:
+    """Times of one process."""
+    code = QUESTIONS[question][1]
+    environment = os.environ | {"JAXROCK_CACHE": kept, "PYTHONPATH": str(package), "MPLBACKEND": "Agg"}
+    if isinstance(code, list):
+        pathlib.Path(folder, "rocks.csv").write_text(_ROCKS)
+        words = [sys.executable, "-c", _COMMAND, *code, "--out", str(pathlib.Path(folder, "out"))]
+    else:
+        without = "import sys\nsys.modules['llvmlite'] = None\n" if question == "bare" else ""
+        words = [sys.executable, "-c", without + _BEGIN + code + _END]
+    done = subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{question}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+_COMMAND = """
+import json, resource, sys, time
+start = time.perf_counter()
+from jaxrock.command_line.main import main
+status = main(sys.argv[1:])
+used = resource.getrusage(resource.RUSAGE_SELF)
+print(json.dumps({"answer": used.ru_utime + used.ru_stime, "wall": time.perf_counter() - start,
+                  "memory": used.ru_maxrss / 1024}))
+sys.exit(status)
+"""
+
+
+def main():
+    """Print a table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", nargs="*", default=list(QUESTIONS))
+    parser.add_argument("--package", type=pathlib.Path, default=HERE.parent)
+    parser.add_argument("--rounds", type=int, default=2, help="1: cold only")
+    arguments = parser.parse_args()
+    print("| question | cold [s] | bar | warm [s] | bar | warm, wall [s] | memory [MB] |\n|---|---|---|---|---|---|---|")
+    for question in arguments.only:
+        words, _, cold, warm = QUESTIONS[question]
+        with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryDirectory() as folder:
+            found = [measure(question, arguments.package, kept, folder) for _ in range(arguments.rounds)]
+        first, last = found[0], found[-1]
+        key = "import" if question == "import" else "answer"
+        cells = [words, f"{first[key]:.2f}", f"{cold or ''}", f"{last[key]:.2f}", f"{warm}", f"{last['wall']:.2f}",
+                 f"{first['memory']:.0f}"]  # fmt: skip
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""The folder of what is kept: any number of processes may read and write it, and what is damaged is made again.
+
+A file begins with the digest of the rest, is written aside, and renamed: a reader finds all of it or nothing. When the
+folder has grown too large, what has not been used for longest goes first.
+"""
+
+import contextlib
+import hashlib
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import platformdirs
+
+LARGEST = 2**30  # bytes
+_DIGEST = hashlib.sha256().digest_size
+_PATIENCE = 600  # seconds after which a file that was never finished is nobody's
+
+
+def folder() -> Path | None:
+    """Where things are kept: the user's cache folder, or what JAXROCK_CACHE says; None if that is `off`."""
+    said = os.environ.get("JAXROCK_CACHE", "")
+    if said == "off":
+        return None
+    return Path(said) if said else platformdirs.user_cache_path("jaxrock") / "compiled"
+
+
+def name_of(*parts: object) -> str:
+    """A name for what is told by some texts."""
+    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:40]
+
+
+def read(kind: str, name: str) -> bytes | None:
+    """What is kept under a name; None if it is not there, or damaged."""
+    place = folder()
+    if place is None:
+        return None
+    path = place / kind / name
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if content[:_DIGEST] != hashlib.sha256(content[_DIGEST:]).digest():
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    with contextlib.suppress(OSError):  # it may be read-only
+        os.utime(path)
+    return content[_DIGEST:]
+
+
+def write(kind: str, name: str, content: bytes) -> None:
+    """Keep something under a name, if that can be done: nothing depends on it."""
+    place = folder()
+    if place is None:
+        return
+    aside = None
+    try:
+        (place / kind).mkdir(parents=True, exist_ok=True)
+        handle, aside = tempfile.mkstemp(prefix=".", dir=place / kind)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(content).digest() + content)
+        os.replace(aside, place / kind / name)
+    except OSError:
+        if aside is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(aside)
+        return
+    prune(LARGEST)
+
+
+def prune(largest: int) -> None:
+    """Delete what has not been used for longest, until the rest has `largest` bytes at most."""
+    found = []
+    for path in kept():
+        with contextlib.suppress(OSError):  # another process may have been faster
+            about = path.stat()
+            if not path.name.startswith("."):
+                found.append((about.st_mtime, about.st_size, path))
+            elif time.time() - about.st_mtime > _PATIENCE:
+                path.unlink()
+    size = sum(each for _, each, _ in found)
+    for _, each, path in sorted(found):
+        if size <= largest:
+            return
+        size -= each
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def kept() -> list[Path]:
+    """All files of the folder."""
+    place = folder()
+    if place is None or not place.is_dir():
+        return []
+    return [path for path in place.rglob("*") if path.is_file()]

@@ -1,0 +1,170 @@
+"""The function that XLA calls, by the structures of its C interface for foreign functions. Needs llvmlite.
+
+`ctypes` lays the structures out as the compiler of XLA does; their fields stand as in the header that jaxlib ships.
+"""
+
+import ctypes
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import jaxlib
+from llvmlite import ir
+
+HAS_THREADS = os.name == "posix"
+_KNOWN = 0  # the major version of the interface; minor ones only add to its ends
+_WANTED, _THREADS = 1, 2  # what the first input of a program tells
+_SHARE = 64  # lanes that are worth a thread
+_EXECUTE, _METADATA = 3, 1  # the stage that computes; the kind of extension that asks for the version
+_POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
+
+
+class _Extension(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("type", ctypes.c_int), ("next", ctypes.c_void_p)]
+
+
+class _Version(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p),
+                ("major_version", ctypes.c_int), ("minor_version", ctypes.c_int)]  # fmt: skip
+
+
+class _Metadata(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("api_version", _Version), ("traits", ctypes.c_uint32)]
+
+
+class _MetadataExtension(ctypes.Structure):
+    _fields_ = [("base", _Extension), ("metadata", ctypes.c_void_p)]
+
+
+class _Interface(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api_version", _Version)]
+
+
+class _Buffer(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("dtype", ctypes.c_int),
+                ("data", ctypes.c_void_p)]  # fmt: skip
+
+
+class _Buffers(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("size", ctypes.c_int64),
+                ("types", ctypes.c_void_p), ("buffers", ctypes.c_void_p)]  # fmt: skip
+
+
+class _Frame(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api", ctypes.c_void_p),
+                ("ctx", ctypes.c_void_p), ("stage", ctypes.c_int), ("args", _Buffers), ("rets", _Buffers)]  # fmt: skip
+
+
+def is_known() -> bool:
+    """Whether XLA's interface is the one that is written down here, by the header of the jaxlib that is installed."""
+    header = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
+    if not header.exists():
+        return True  # nothing says otherwise, and XLA asks for the version itself
+    found = re.search(r"define XLA_FFI_API_MAJOR (\d+)", header.read_text())
+    return found is not None and int(found[1]) == _KNOWN
+
+
+def add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
+    """Add the function that XLA calls, `jaxrock_handler(frame)`, for the program of a module.
+
+    In order to learn of its version XLA calls it with an extension, to which the version has to be written.
+    """
+    handler = ir.Function(module, ir.FunctionType(_POINTER, [_POINTER]), "jaxrock_handler")
+    program = module.globals["program"]
+    program.linkage = "internal"
+    b = ir.IRBuilder(handler.append_basic_block("entry"))
+    (frame,) = handler.args
+    done = ir.Constant(_POINTER, None)
+
+    def at(pointer, offset, kind=_POINTER):
+        return b.load(b.bitcast(b.gep(pointer, [_I64(offset)]), kind.as_pointer()))
+
+    version = _Metadata.api_version.offset + _Version.major_version.offset
+    extension = at(frame, _Frame.extension_start.offset)
+    with b.if_then(b.icmp_unsigned("!=", extension, done)):
+        with b.if_then(b.icmp_signed("==", at(extension, _Extension.type.offset, _I32), _I32(_METADATA))):
+            interface = at(frame, _Frame.api.offset)
+            known = at(interface, _Interface.api_version.offset + _Version.major_version.offset, _I64)  # both numbers
+            about = at(extension, _MetadataExtension.metadata.offset)
+            b.store(known, b.bitcast(b.gep(about, [_I64(version)]), _I64.as_pointer()))
+            b.ret(done)
+    with b.if_then(b.icmp_signed("==", at(frame, _Frame.stage.offset, _I32), _I32(_EXECUTE))):
+        tables = []
+        for where, count in ((_Frame.rets, outputs), (_Frame.args, inputs)):
+            table, buffers = b.alloca(_POINTER, count), at(frame, where.offset + _Buffers.buffers.offset)
+            for i in range(count):
+                buffer = at(buffers, ctypes.sizeof(ctypes.c_void_p) * i)
+                b.store(at(buffer, _Buffer.data.offset), b.gep(table, [_I32(i)]))
+            tables.append(table)
+        _in_threads(b, program, *tables)
+    b.ret(done)
+
+
+def _in_threads(b: ir.IRBuilder, program: ir.Function, outputs, inputs) -> None:
+    """Call a program in this thread and, where there are many lanes, at the same time in others."""
+    module = b.module
+    worker = ir.Function(module, ir.FunctionType(_POINTER, [_POINTER]), "worker")
+    worker.linkage = "internal"
+    inner = ir.IRBuilder(worker.append_basic_block("entry"))
+    passed = inner.bitcast(worker.args[0], _POINTER.as_pointer())
+    given = [inner.load(inner.gep(passed, [_I32(i)])) for i in range(3)]
+    inner.call(program, [inner.bitcast(x, kind) for x, kind in zip(given, program.ftype.args)])
+    inner.ret(ir.Constant(_POINTER, None))
+
+    message, following = b.alloca(_POINTER, 3), b.alloca(_I64)
+    b.store(_I64(0), following)
+    for i, x in enumerate((outputs, inputs, following)):
+        b.store(b.bitcast(x, _POINTER), b.gep(message, [_I32(i)]))
+    message = b.bitcast(message, _POINTER)
+    if not HAS_THREADS:
+        b.call(worker, [message])
+        return
+    sizes = b.bitcast(b.load(inputs), _I32.as_pointer())
+    wanted, threads = (b.sext(b.load(b.gep(sizes, [_I32(i)])), _I64) for i in (_WANTED, _THREADS))
+    most = b.sdiv(b.sub(wanted, _I64(1)), _I64(_SHARE))
+    threads = b.sub(threads, _I64(1))
+    helpers = b.select(b.icmp_signed("<", most, threads), most, threads)
+    handles = b.alloca(_I64, helpers)
+    create = _outside(module, "pthread_create", _I64.as_pointer(), _POINTER, worker.type, _POINTER)
+    join = _outside(module, "pthread_join", _I64, _POINTER.as_pointer())
+    nothing = ir.Constant(_POINTER, None)
+
+    def begin(number):
+        # If there is no thread to be had, the others do its work.
+        failed = b.call(create, [b.gep(handles, [number]), nothing, worker, message])
+        return b.icmp_signed("==", failed, _I32(0))
+
+    def end(number):
+        b.call(join, [b.load(b.gep(handles, [number])), ir.Constant(_POINTER.as_pointer(), None)])
+        return ir.Constant(ir.IntType(1), True)
+
+    begun = _count_up(b, helpers, begin)
+    b.call(worker, [message])
+    _count_up(b, begun, end)
+
+
+def _outside(module: ir.Module, name: str, *kinds) -> ir.Function:
+    """A function of the system that returns an int."""
+    return ir.Function(module, ir.FunctionType(_I32, kinds), name)
+
+
+def _count_up(b: ir.IRBuilder, size, act: Callable):
+    """`act(number)` from 0 to `size`, or until it is false; the number where it ends."""
+    before, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("next", "act", "done"))
+    b.branch(head)
+    b.position_at_end(head)
+    number = b.phi(_I64)
+    b.cbranch(b.icmp_signed("<", number, size), inside, after)
+    b.position_at_end(inside)
+    goes_on = act(number)
+    following = b.add(number, _I64(1))
+    number.add_incoming(_I64(0), before)
+    number.add_incoming(following, b.block)
+    last = b.block
+    b.cbranch(goes_on, head, after)
+    b.position_at_end(after)
+    end = b.phi(_I64)
+    end.add_incoming(number, head)
+    end.add_incoming(number, last)
+    return end

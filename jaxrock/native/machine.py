@@ -1,0 +1,107 @@
+"""LLVM for this machine: it compiles modules, once for all sessions, and tells XLA where the code is. Needs llvmlite."""
+
+import ctypes
+import functools
+import hashlib
+import threading
+from collections.abc import Callable
+
+import jax
+from llvmlite import binding
+
+from jaxrock.keeping import folder
+from jaxrock.native.interface import add_handler, is_known
+from jaxrock.native.kernels import emit
+from jaxrock.native.operations import Unsupported
+
+
+class _Machine:
+    """A target of LLVM, and an engine that links what is compiled for it."""
+
+    def __init__(self):
+        binding.initialize_native_target()
+        binding.initialize_native_asmprinter()
+        features = binding.get_host_cpu_features()
+        self.lanes = 16 if features.get("avx512f") else 8  # two registers: one computes while the other waits
+        self.told = f"{binding.llvm_version_info} {binding.get_host_cpu_name()} {features.flatten()}"
+        self._target = binding.Target.from_default_triple().create_target_machine(
+            cpu=binding.get_host_cpu_name(), features=features.flatten(), opt=3, jit=True, codemodel="jitdefault"
+        )
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), self._target)
+
+    def object_of(self, text: str) -> bytes:
+        """The machine code of a module."""
+        code = binding.parse_assembly(text)
+        code.verify()
+        options = binding.create_pipeline_tuning_options(speed_level=2)
+        builder = binding.create_pass_builder(self._target, options)
+        builder.getModulePassManager().run(code, builder)
+        return self._target.emit_object(code)
+
+    def address(self, code: bytes, name: str) -> int:
+        """Where a function of some machine code is, from now on."""
+        self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+        return self._engine.get_function_address(name)
+
+
+_one_at_a_time = threading.RLock()
+_registered = set()
+
+
+def _machine() -> _Machine:
+    with _one_at_a_time:  # of two machines one would be freed, with all that it has compiled
+        return _made()
+
+
+@functools.cache
+def _made() -> _Machine:
+    return _Machine()
+
+
+def lanes_of() -> int:
+    """Lanes of a vector."""
+    return _machine().lanes
+
+
+def machine() -> str:
+    """What machine code is made for: LLVM, the processor and what it can do."""
+    return _machine().told
+
+
+def registered(program, shared: list[bool], emit: Callable = emit) -> str:
+    """The name under which XLA finds the machine code of a program: made of its text, so that compiled programs that a
+    cache keeps find it again."""
+    if not is_known():
+        raise Unsupported("XLA's interface of this version")
+    module = emit(program, shared, lanes_of(), "program")
+    add_handler(module, len(program.jaxpr.outvars), 1 + len(shared))
+    text = str(module)
+    name = "jaxrock_" + hashlib.sha256(f"{machine()}\n{text}".encode()).hexdigest()[:20]
+    if not is_there(name):
+        code = _machine().object_of(text.replace("jaxrock_handler", name))
+        folder.write("machine", name, code)
+        _register(name, code)
+    return name
+
+
+def is_there(name: str) -> bool:
+    """Whether XLA finds machine code under a name; what is kept from another session it does, too."""
+    with _one_at_a_time:
+        if name in _registered:
+            return True
+        code = folder.read("machine", name)
+        if code is not None:
+            _register(name, code)
+        return code is not None
+
+
+def _register(name: str, code: bytes) -> None:
+    with _one_at_a_time:
+        if name in _registered:
+            return
+        new = ctypes.pythonapi.PyCapsule_New
+        new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+        capsule = new(_machine().address(code, name), b"xla._CUSTOM_CALL_TARGET", None)
+        jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+        _registered.add(name)

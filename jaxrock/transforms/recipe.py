@@ -1,0 +1,119 @@
+"""What is computed of one scene: a function as a whole, in parts, and with its derivatives, as a thing with a name."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from jaxrock.keeping.folder import name_of
+from jaxrock.transforms.fingerprint import Program
+
+
+class Passes(NamedTuple):
+    """A function of one scene in parts.
+
+    - `begin(tree)`: the scene as the other parts take it, and a first state.
+    - `quickly(scene, state, limit)`: the state where it is finished or given up, or after `limit` steps in all; None:
+      there is no quick pass.
+    - `carefully(scene, state)`: the state where it is finished.
+    - `unfinished(scene, state)`: whether the quick pass has to go on.
+    - `conclude(scene, state)`: the result, and whether the quick pass has postponed it to the careful one.
+    - `round`: steps after which chunks are made up anew of the scenes that are unfinished; None: never.
+    """
+
+    begin: Callable
+    quickly: Callable | None
+    carefully: Callable
+    unfinished: Callable | None
+    conclude: Callable
+    round: int | None
+
+    def whole(self, tree):
+        """The function, by the careful pass."""
+        scene, state = self.begin(tree)
+        return self.conclude(scene, self.carefully(scene, state))[0]
+
+    def at_once(self, tree):
+        """The result of the quick pass, and whether it is postponed."""
+        scene, state = self.begin(tree)
+        return self.conclude(scene, self.quickly(scene, state, jnp.iinfo(jnp.int32).max))
+
+
+class Recipe:
+    """A function of one scene: `function(tree)`, of a tree with leaves `like` these (`jax.ShapeDtypeStruct`).
+
+    - `passes`: the same in parts, where machine code of our own may run it.
+    - `on_tape`: the same, through whose own code reverse mode goes; for derivatives by very many numbers.
+    - `facts`: what tells it, with its leaves' shapes, from all others in any process; None: only its program does.
+    - `results`: what it returns, a tree of `jax.ShapeDtypeStruct`; None: tracing tells.
+    - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
+    """
+
+    def __init__(
+        self,
+        function: Callable,
+        structure: Any,
+        like: Sequence[jax.ShapeDtypeStruct],
+        passes: Passes | None = None,
+        on_tape: Callable | None = None,
+        facts: str | None = None,
+        results: Any = None,
+        in_lanes: bool = False,
+        refilled: bool = False,
+    ):
+        self.function, self.structure, self.like = function, structure, tuple(like)
+        self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
+        self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
+        self.plans, self._derivatives = {}, {}  # what has been made of it
+
+    @functools.cached_property
+    def _traced(self) -> tuple[ClosedJaxpr, Any]:
+        return self._trace(self.function)
+
+    def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
+        # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
+        # takes those that tell of the mesh of a `shard_map`, and those that do not, for different ones.
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            return jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)(*self.like)
+
+    @property
+    def program(self) -> ClosedJaxpr:
+        """The function as JAX traces it, from leaves to leaves."""
+        return self._traced[0]
+
+    @functools.cached_property
+    def quick(self) -> ClosedJaxpr | None:
+        """The quick pass, from leaves to leaves; the last tells whether it is postponed."""
+        return self._trace(self.passes.at_once)[0] if self.passes and self.passes.quickly else None
+
+    @property
+    def results(self) -> Any:
+        """What it returns, a tree of `jax.ShapeDtypeStruct`."""
+        return self._traced[1] if self._results is None else self._results
+
+    def __call__(self, leaves: Sequence) -> list:
+        """Compute it for one scene."""
+        return jaxpr_as_fun(self.program)(*leaves)
+
+    def taped(self, leaves: Sequence) -> list:
+        """The same on a tape."""
+        return jax.tree.leaves(self.on_tape(self.structure.unflatten(leaves)))
+
+    def derivative(self, moves: tuple[bool, ...], make: Callable) -> "Recipe":
+        """The recipe of value and derivatives by some leaves, which `make` makes once."""
+        if moves not in self._derivatives:
+            self._derivatives[moves] = make()
+        return self._derivatives[moves]
+
+    @functools.cached_property
+    def name(self) -> str:
+        """What tells it from others in the text of programs."""
+        if self.facts is not None:
+            return name_of(self.facts)
+        return Program(self.program.jaxpr, None, ()).fingerprint(self.program.consts)
+
+    def __repr__(self) -> str:
+        return f"recipe {self.name}"

@@ -1,0 +1,143 @@
+"""One primitive of JAX: a program of one scene, at one scene or at many. All its rules stand here.
+
+- Under `jax.vmap` one scene becomes many, and one more axis of many becomes more of them.
+- The derivative is a small Jacobian times the change of the inputs; value and Jacobian are one program of the same
+  kind, so derivatives of every order follow, and reverse mode.
+- It is lowered where JAX compiles, for the platform that it compiles for (`lowering`).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jaxrock.transforms.along import value_and_jacobian
+from jaxrock.transforms.lowering import lowered
+from jaxrock.transforms.recipe import Recipe
+
+_MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
+
+scenes_p = Primitive("scenes")
+scenes_p.multiple_results = True
+
+
+def computed(recipe: Recipe, leaves: list):
+    """What a recipe makes of the leaves of one scene."""
+    found = scenes_p.bind(*leaves, recipe=recipe, own=(False,) * len(leaves), size=None)
+    return jax.tree.unflatten(jax.tree.structure(recipe.results), found)
+
+
+# Parameters: the recipe; which leaves are a scene's `own`, with a leading axis; how many scenes (None: one, no axis).
+
+
+@functools.partial(jax.jit, static_argnames=("recipe", "own", "size"))
+def _compiled(*leaves, recipe, own, size):
+    return scenes_p.bind(*leaves, recipe=recipe, own=own, size=size)
+
+
+@scenes_p.def_impl
+def _(*leaves, recipe, own, size):
+    with jax.disable_jit(False):
+        return _compiled(*leaves, recipe=recipe, own=own, size=size)
+
+
+@scenes_p.def_abstract_eval
+def _(*leaves, recipe, own, size):
+    axis = () if size is None else (size,)
+    return [jax.core.ShapedArray((*axis, *x.shape), x.dtype) for x in jax.tree.leaves(recipe.results)]
+
+
+def _batched(leaves, axes, *, recipe, own, size):
+    new = [axis is not None for axis in axes]  # what is not mapped has none
+    leaves = [jnp.moveaxis(x, axis, 0) if moved else x for x, axis, moved in zip(leaves, axes, new)]
+    more = next(x.shape[0] for x, moved in zip(leaves, new) if moved)
+    if size is None:
+        found = scenes_p.bind(*leaves, recipe=recipe, own=tuple(new), size=more)
+    else:
+        found = _one_more_axis(leaves, new, more, recipe, own, size)
+    return found, [0] * len(found)
+
+
+batching.primitive_batchers[scenes_p] = _batched
+
+
+def _one_more_axis(leaves, new, more, recipe, own, size):
+    """Both axes become one, unless arrays that all scenes share would be copied for each."""
+    if any(moved and not old and jnp.ndim(x) > 1 for moved, old, x in zip(new, own, leaves)):
+        moving = [x for x, moved in zip(leaves, new) if moved]
+
+        def one(moving):
+            rest = iter(moving)
+            given = [next(rest) if moved else x for x, moved in zip(leaves, new)]
+            return scenes_p.bind(*given, recipe=recipe, own=own, size=size)
+
+        return jax.lax.map(one, moving)
+
+    def merged(x, moved, old):
+        if not (moved or old):
+            return x
+        x = x if moved else x[None]
+        x = x if old else x[:, None]
+        return jnp.broadcast_to(x, (more, size, *x.shape[2:])).reshape(more * size, *x.shape[2:])
+
+    leaves = [merged(*each) for each in zip(leaves, new, own)]
+    flags = tuple(moved or old for moved, old in zip(new, own))
+    found = scenes_p.bind(*leaves, recipe=recipe, own=flags, size=more * size)
+    return [x.reshape(more, size, *x.shape[1:]) for x in found]
+
+
+def _unmoved(x):
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def _pushed(leaves, changes, *, recipe, own, size):
+    moves = tuple(type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes)
+    if not any(moves):
+        found = scenes_p.bind(*leaves, recipe=recipe, own=own, size=size)
+        return found, [_unmoved(x) for x in found]
+    moving = [d for d, move in zip(changes, moves) if move]
+    axes = [0 if mine else None for mine, move in zip(own, moves) if move]
+    numbers = sum(x.size for x, move in zip(recipe.like, moves) if move)
+    if recipe.on_tape is not None and numbers > _MANY:
+        return _pushed_on_tape(leaves, moves, moving, axes, recipe, own, size)
+    along = value_and_jacobian(recipe, moves)
+    found = scenes_p.bind(*leaves, recipe=along, own=own, size=size)
+    value, jacobian = jax.tree.unflatten(jax.tree.structure(along.results), found)
+    value = jax.tree.leaves(value)
+
+    def contracted(columns, *moving):
+        return sum(jnp.tensordot(column, d, axes=d.ndim) for column, d in zip(columns, moving))
+
+    def moved(x, columns):
+        if columns is None:
+            return _unmoved(x)
+        if size is None:
+            return contracted(columns, *moving)
+        return jax.vmap(contracted, in_axes=(0, *axes))(columns, *moving)
+
+    return value, [moved(*each) for each in zip(value, jacobian)]
+
+
+def _pushed_on_tape(leaves, moves, moving, axes, recipe, own, size):
+    """Value and change by the recipe's own code, through which reverse mode goes."""
+
+    def one(leaves, moving):
+        def function(moving):
+            rest = iter(moving)
+            return recipe.taped([next(rest) if move else x for x, move in zip(leaves, moves)])
+
+        return jax.jvp(function, ([x for x, move in zip(leaves, moves) if move],), (moving,))
+
+    if size is not None:
+        one = jax.vmap(one, in_axes=([0 if mine else None for mine in own], axes))
+    value, changed = one(list(leaves), moving)
+    changed = [_unmoved(x) if d.dtype == jax.dtypes.float0 else d for x, d in zip(value, changed)]
+    return value, changed
+
+
+ad.primitive_jvps[scenes_p] = _pushed
+
+mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=False))
+mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=True), platform="cpu")
