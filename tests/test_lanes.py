@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxrock.transforms import batching
-from jaxrock.transforms.batching import Passes, in_lanes
 from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.recipe import Passes
 
 
 @pytest.fixture(autouse=True, params=["machine code", "XLA"])
@@ -52,7 +52,7 @@ def passes(round):
 @pytest.mark.parametrize("fast", [None, passes(None), passes(2)], ids=["alone", "two passes", "in rounds"])
 def test_one_axis(count, fast):
     x, samples = jnp.arange(float(count)) % 7, jnp.array([1.0, 2.0])
-    run = in_lanes(alone, fast)
+    run = differentiable(alone, passes=fast)
     found = jax.jit(jax.vmap(lambda x: run({"x": x, "samples": samples})))(x)
     np.testing.assert_array_equal(found["y"], 3 * x)
     np.testing.assert_array_equal(found["n"], x)
@@ -62,7 +62,7 @@ def test_one_axis(count, fast):
 def test_more_axes(fast):
     """Both axes of numbers; an axis of what all share is taken one by one; an axis that only others have."""
     x, samples = jnp.arange(15.0).reshape(3, 5) % 7, jnp.arange(8.0).reshape(4, 2)
-    run = in_lanes(alone, fast)
+    run = differentiable(alone, passes=fast)
 
     def over(x, samples):
         return run({"x": x, "samples": samples})["y"]

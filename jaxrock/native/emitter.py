@@ -24,11 +24,17 @@ WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call
 
 
 class Memory(NamedTuple):
-    """A list of numbers in memory, of which single ones are looked up."""
+    """A list of numbers in memory, of which single ones are looked up; or a few such lists, row by row."""
 
     pointer: Any
     size: int
     starts: list | None  # where each lane's own begins; None: all look up the same
+    rows: int | None = None  # None: one list, and not a table of one
+    stride: int = 0  # from row to row
+
+    def row(self, b: ir.IRBuilder, number: int) -> "Memory":
+        """One of the lists."""
+        return Memory(b.gep(self.pointer, [_I64(number * self.stride)]), self.size, self.starts)
 
 
 class Emitter:
@@ -158,7 +164,7 @@ class Emitter:
         if name in WITH_PROGRAMS:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
-            return [self._of_memory(name, parameters, *inputs)]
+            return [unboxed(self._of_memory(name, parameters, *inputs))]
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
@@ -175,16 +181,26 @@ class Emitter:
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
 
     def _of_memory(self, name: str, parameters: dict, memory, *more):
+        sizes = parameters.get("slice_sizes", ())
         if name == "slice" and not parameters["strides"]:
-            (start,), (stop,) = parameters["start_indices"], parameters["limit_indices"]
-            return Memory(self.b.gep(memory.pointer, [_I64(start)]), stop - start, memory.starts)
-        if name == "squeeze":
-            return self._look_up(memory, self.constant(0, np.int32))
-        if name == "dynamic_slice" and parameters["slice_sizes"] == (1,):
-            return boxed([self._look_up(memory, *more)])
+            (*first, start), (*last, stop) = parameters["start_indices"], parameters["limit_indices"]
+            if memory.rows is None or (first, last) == ([0], [memory.rows]):
+                return memory._replace(pointer=self.b.gep(memory.pointer, [_I64(start)]), size=stop - start)
+        if name == "squeeze" and memory.size == 1:
+            return self._looked_up(memory, self.constant(0, np.int32)).reshape(() if memory.rows is None else -1)
+        if name == "dynamic_slice" and sizes[-1] == 1 and sizes[:-1] in ((), (memory.rows,)):
+            return self._looked_up(memory, more[-1])
+        if name == "gather" and _is_column(parameters, memory):
+            return self._looked_up(memory, boxed(more[0])[0])
         if name in NOTHING:
             return memory
         raise Unsupported(f"{name} of a long list")
+
+    def _looked_up(self, memory: Memory, index) -> np.ndarray:
+        """One number of each list."""
+        if memory.rows is None:
+            return boxed([self._look_up(memory, index)])
+        return boxed([self._look_up(memory.row(self.b, k), index) for k in range(memory.rows)]).reshape(-1, 1)
 
     def _look_up(self, memory: Memory, index):
         # An index outside is moved to the nearest inside, as `dynamic_slice` does.
@@ -262,6 +278,14 @@ class Emitter:
             phi.add_incoming(old, before)
         self.remember(joined, len(self.before))
         return like(results, joined)
+
+
+def _is_column(parameters: dict, memory: Memory) -> bool:
+    """Whether a gather takes one number of each of some lists: what `jax.vmap` makes of a look-up."""
+    told = parameters["dimension_numbers"]
+    maps = tuple(told.offset_dims), tuple(told.collapsed_slice_dims), tuple(told.start_index_map)
+    inside = parameters["mode"] == jax.lax.GatherScatterMode.CLIP
+    return inside and maps == ((0, 1), (), (1,)) and parameters["slice_sizes"] == (memory.rows, 1)
 
 
 def boxed(x) -> np.ndarray:

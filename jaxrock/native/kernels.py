@@ -17,7 +17,9 @@ _I8, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 
 
 def is_long(shape: tuple[int, ...]) -> bool:
-    """Whether an array stays in memory, where single numbers of it are looked up."""
+    """Whether an array stays in memory, where single numbers of it are looked up: a long list, or a few of them."""
+    if len(shape) == 2 and shape[0] <= SMALL and math.prod(shape) > SMALL**2:
+        return True
     if len(shape) > 1 and math.prod(shape) > SMALL**2:
         raise Unsupported(f"an array of shape {shape}")
     return len(shape) == 1 and shape[0] > SMALL
@@ -85,7 +87,8 @@ class _Frame:
         tells where its long list begins."""
         shape = variable.aval.shape
         if is_long(shape):
-            return Memory(source, shape[0], None if shared else starts(shape[0]))
+            rows = shape[0] if len(shape) == 2 else None
+            return Memory(source, shape[-1], None if shared else starts(math.prod(shape)), rows, shape[-1])
         load = self.load_shared if shared else load
         numbers = boxed([load(source, k) for k in range(math.prod(shape))])
         return unboxed(numbers.reshape(shape))

@@ -50,15 +50,15 @@ def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long:
     jaxpr = program.jaxpr
     needed = set()
     for equation in reversed(jaxpr.eqns):
-        if equation.primitive.name != "while" and (not is_known(equation) or needed.intersection(equation.outvars)):
+        before = not is_known(equation) or needed.intersection(equation.outvars) or any(map(is_long, equation.outvars))
+        if equation.primitive.name != "while" and before:
             needed.update(equation.outvars)
             needed.update(v for v in equation.invars if not isinstance(v, Literal))
     own = {v for v, same in zip(jaxpr.invars, shared, strict=True) if not same}
     parts, later = ([], [], []), set()
     for equation in jaxpr.eqns:
         inputs = {v for v in equation.invars if not isinstance(v, Literal)}
-        before = needed.intersection(equation.outvars) or any(map(is_long, equation.outvars))
-        if inputs & later or (inputs & own and not before):
+        if inputs & later or (inputs & own and not needed.intersection(equation.outvars)):
             later |= set(equation.outvars)
             parts[2].append(equation)
         elif inputs & own:

@@ -57,9 +57,18 @@ ad.defjvp(_one_p, None)
 mlir.register_lowering(_one_p, mlir.lower_fun(jnp.ones_like, multiple_results=False))
 mlir.register_lowering(_one_p, mlir.lower_fun(_one_on_cpu, multiple_results=False), platform="cpu")
 
+def _of_many(operands, axes, by_one):
+    size = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    value, witness = (
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes)
+    )
+    return _keep_p.bind(value, witness, by_one=by_one), 0
+
+
 _keep_p.def_impl(lambda value, witness, by_one: value)
 _keep_p.def_abstract_eval(lambda value, witness, by_one: value)
-batching.defbroadcasting(_keep_p)
+batching.primitive_batchers[_keep_p] = _of_many
 ad.defjvp(_keep_p, lambda change, value, witness, by_one: _keep_p.bind(change, witness, by_one=by_one), None)
 mlir.register_lowering(_keep_p, lambda context, value, witness, by_one: [value])
 mlir.register_lowering(_keep_p, mlir.lower_fun(_kept_on_cpu, multiple_results=False), platform="cpu")

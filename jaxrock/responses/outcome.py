@@ -129,10 +129,13 @@ def _on_tape(scene) -> Outcome:
 
 def _like(scene) -> Outcome:
     """What an outcome looks like."""
-    real = jax.ShapeDtypeStruct((), jnp.result_type(*jax.tree.leaves(scene[:2])))
-    count, flag = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), bool)
-    status = jax.eval_shape(lambda: Status.successful)
-    return Outcome(real, real, real, count, flag, real, flag, real, real, status)
+
+    def made():
+        real, count = jnp.zeros((), jnp.result_type(*jax.tree.leaves(scene[:2]))), jnp.zeros((), jnp.int32)
+        flag = count == 0
+        return Outcome(real, real, real, count, flag, real, flag, real, real, Status.successful)
+
+    return jax.eval_shape(made)
 
 
 def _passes(rounds: bool) -> Passes:
