@@ -30,6 +30,11 @@ class AbstractEngine(eqx.Module):
         """Whether reverse mode goes through this engine's own loops."""
         return False
 
+    @property
+    def in_lanes(self) -> bool:
+        """Whether its steps consist of what machine code can do."""
+        return False
+
     @abc.abstractmethod
     def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "AbstractStepper":
         """This engine at work on a scene, up to the time `stop` [s] (infinite: the end of the motion); `taped`: so that

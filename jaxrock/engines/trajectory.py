@@ -42,11 +42,15 @@ class Trajectory(eqx.Module):
         """`follow(node, elapsed)` from the node before each time; results have the shape of `time`."""
 
         def at(t):
-            index = jnp.clip(jnp.searchsorted(self.times, t, side="right") - 1, 0, self.times.size - 1)
-            node = jax.tree.map(lambda x: x[index], self.nodes)
-            return follow(node, jnp.minimum(t, self.duration) - self.times[index])
+            return follow(*self.before(t))
 
         return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(at)(time.ravel()))
+
+    def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
+        """The node before a time, and how long after it that is [s]."""
+        index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
+        node = jax.tree.map(lambda x: x[index], self.nodes)
+        return node, jnp.minimum(time, self.duration) - self.times[index]
 
     def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
         """The values where something happened, in this order; under jit filled up: infinite times, zeros beside them.

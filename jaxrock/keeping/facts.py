@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock._label import Label
 from jaxrock.keeping.folder import name_of
 
 _OWN = __name__.split(".")[0]
@@ -64,6 +65,8 @@ def _told(value: Any) -> str:
     if isinstance(value, (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct)):
         weak = getattr(jax.typeof(value), "weak_type", False)
         return f"{jnp.result_type(value)}{list(np.shape(value))}{'w' * weak}"
+    if isinstance(value, Label):  # which compiled functions do not see
+        return "label"
     if type(value) in (tuple, list):
         return f"{type(value).__name__}({', '.join(map(_told, value))})"
     if type(value) is dict:

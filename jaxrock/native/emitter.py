@@ -213,7 +213,9 @@ class Emitter:
             place = self.b.sext(place, _I64) if place.type != _I64 else place
             place = place if memory.starts is None else self.b.add(place, memory.starts[i])
             numbers.append(self.b.load(self.b.gep(memory.pointer, [place])))
-        return self.gather(numbers)
+        found = self.gather(numbers)
+        is_flag = memory.pointer.type.pointee == ir.IntType(8)  # a byte in memory
+        return self.b.icmp_unsigned("!=", found, self.constant_of(0, found.type)) if is_flag else found
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
         """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""

@@ -11,14 +11,14 @@ from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state, surpasses
-from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
-from jaxrock.responses.outcome import Outcome, conclude
+from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import differentiable
 
@@ -192,13 +192,7 @@ def simulate(
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
     stop = motion.end + 10 / block.p if duration is None else jnp.asarray(duration)
 
-    def run(scene):
-        return _steps(*scene, taped=False)
-
-    def on_tape(scene):
-        return _steps(*scene, taped=True)
-
-    run = run if engine.reverse else differentiable(run, on_tape, name="history")
+    run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like, plain=_plainly)
     state, nodes, final = run((block, motion, model, initial, stop, engine))
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, stop, history=True)
@@ -218,8 +212,36 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
 
 
-def _steps(block, motion, model, initial, stop, engine, taped: bool) -> tuple[State, State, Outcome]:
-    """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
+def _like(given) -> tuple[State, State, Outcome]:
+    """What these look like."""
+    *_, engine = given
+
+    def made(block, motion, model, initial, stop):
+        scene = Scene.of(block, motion, model)
+        state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+        budget = engine.budget(scene, history=True)
+        return state, jax.tree.map(lambda x: jnp.zeros((budget + 1, *x.shape), x.dtype), state)
+
+    return *jax.eval_shape(made, *given[:-1]), outcome_like(given)
+
+
+def _followed(given) -> tuple[State, State, Outcome]:
+    return _steps(*given)
+
+
+def _plainly(given) -> tuple[State, State, Outcome]:
+    return _steps(*given, plain=True)
+
+
+def _on_tape(given) -> tuple[State, State, Outcome]:
+    return _steps(*given, taped=True)
+
+
+def _steps(block, motion, model, initial, stop, engine, taped: bool = False, plain: bool = False):
+    """The state at the end of a history, the states before all steps (and after the last), and what came of it.
+
+    `plain`: a step is not a thing of its own, which would have derivatives by all that it starts from.
+    """
     scene = Scene.of(block, motion, model)
     stop = stop.astype(scene.p.dtype)
     stepper, budget = engine.stepper(scene, stop, history=True, taped=taped), engine.budget(scene, history=True)
@@ -227,22 +249,47 @@ def _steps(block, motion, model, initial, stop, engine, taped: bool) -> tuple[St
     if taped:
         state, nodes = stepper.on_tape(state, budget)
         nodes = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]])[: budget + 1], nodes, state)
-    else:
+    elif plain or not engine.in_lanes:
         state, nodes = followed(lambda s: stepper.advance(s), state, budget, engine.loop)
-    return state, nodes, conclude(stepper, state)
+    else:
+        step = differentiable(_step, name="step", results=lambda given: given[1], in_lanes=True)
+        state, nodes = followed(lambda s: step((stepper, s)), state, budget, engine.loop)
+    return state, nodes, _concluded(stepper, state, plain or taped)
+
+
+def _step(given) -> State:
+    stepper, state = given
+    return stepper.advance(state)
+
+
+def _concluded(stepper: AbstractStepper, state: State, plain: bool) -> Outcome:
+    if plain or not stepper.engine.in_lanes:
+        return conclude(stepper, state)
+    return differentiable(_end, name="end", in_lanes=True)((stepper, state))
+
+
+def _end(given) -> Outcome:
+    return conclude(*given)
 
 
 @jax.jit
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    stepper = path.stepper
+    engine = path.stepper.engine
+    at = _at
+    if not engine.reverse:
+        at = differentiable(_at, _at, None, "evaluation", lambda given: (given[1], given[1]), engine.in_lanes)
+    found = jax.vmap(lambda t: at((path, t)))(time.ravel())
+    return jax.tree.map(lambda x: x.reshape(time.shape), found)
 
-    def follow(node, elapsed):
-        opening, speed = stepper.evaluate(node, elapsed)
-        # The last node is the end of the history: the block lies, rests, or is caught in motion there.
-        lies = node.done & (node.opening >= jnp.pi / 2)
-        velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed)
-        velocity = jnp.where(lies, 0.0, velocity)
-        return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity
 
-    return path.along(time, follow)
+def _at(given) -> tuple[Scalar, Scalar]:
+    """The same at one time."""
+    path, time = given
+    (node, elapsed), stepper = path.before(time), path.stepper
+    opening, speed = stepper.evaluate(node, elapsed)
+    # The last node is the end of the history: the block lies, rests, or is caught in motion there.
+    lies = node.done & (node.opening >= jnp.pi / 2)
+    velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed)
+    velocity = jnp.where(lies, 0.0, velocity)
+    return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity

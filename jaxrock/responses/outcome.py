@@ -114,9 +114,9 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
         return _by_steps(scene)
     check_single(block=block, motion=motion)
     if not isinstance(engine, Series):
-        return differentiable(_by_steps, _on_tape, name="outcome")(scene)
+        return differentiable(_by_steps, _on_tape, None, "outcome", outcome_like)(scene)
     passes = _passes(POLICY.is_record(motion.knots.size - 1))
-    return differentiable(passes.whole, _on_tape, passes, "outcome", _like)(scene)
+    return differentiable(passes.whole, _on_tape, passes, "outcome", outcome_like)(scene)
 
 
 def _by_steps(scene) -> Outcome:
@@ -127,8 +127,8 @@ def _on_tape(scene) -> Outcome:
     return _to_outcome(*scene, taped=True)
 
 
-def _like(scene) -> Outcome:
-    """What an outcome looks like."""
+def outcome_like(scene) -> Outcome:
+    """What the outcome of a block, a motion and more looks like."""
 
     def made():
         real, count = jnp.zeros((), jnp.result_type(*jax.tree.leaves(scene[:2]))), jnp.zeros((), jnp.int32)

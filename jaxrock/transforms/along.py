@@ -45,7 +45,7 @@ def _both(recipe: Recipe, moves: tuple[bool, ...]) -> Callable:
 
         def function(moving):
             rest = iter(moving)
-            return recipe([next(rest) if move else x for x, move in zip(leaves, moves)])
+            return recipe.forward([next(rest) if move else x for x, move in zip(leaves, moves)])
 
         def along(*directions):
             return jax.jvp(function, (moving,), (list(directions),))

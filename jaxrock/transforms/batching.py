@@ -42,9 +42,10 @@ class Lanes:
 
     def __call__(self, *leaves) -> list:
         if self.in_machine_code:
-            if self.size is None:
-                return [x[0] for x in self._alone(*(jnp.asarray(x)[None] for x in leaves))]
-            return self._natively(leaves)
+            if self.size is not None:
+                return self._natively(leaves)
+            leaves = [jnp.asarray(x)[None] if mine else x for x, mine in zip(leaves, self._own_of_one)]
+            return [x[0] for x in self._plan(False, self._own_of_one)(leaves, 1)]
         return list(self.recipe(leaves)) if self.size is None else self._by_xla(leaves)
 
     @functools.cached_property
@@ -73,15 +74,17 @@ class Lanes:
         return native is not None and native.is_there(code)
 
     @property
-    def _alone(self) -> "Lanes":
-        return Lanes(self.recipe, (True,) * len(self.own), 1, self.on_cpu)
+    def _own_of_one(self) -> tuple[bool, ...]:
+        """What is a lane's own where there is one scene: its numbers, as if there were many; not its lists."""
+        numbers = tuple(not x.shape for x in self.recipe.like)
+        return numbers if any(numbers) else (True,) * len(numbers)
 
     @property
     def _is_quick(self) -> bool:
         return bool(self.recipe.passes and self.recipe.passes.quickly) and (self.size or 0) > _FEW
 
     def _plans(self) -> list:
-        own = self.own if self.size is not None else (True,) * len(self.own)
+        own = self.own if self.size is not None else self._own_of_one
         return [self._plan(quick, own) for quick in ([True, False] if self._is_quick else [False])]
 
     def _plan(self, quick: bool, own: tuple[bool, ...]):

@@ -50,6 +50,7 @@ class Recipe:
     - `facts`: what tells it, with its leaves' shapes, from all others in any process; None: only its program does.
     - `results`: what it returns, a tree of `jax.ShapeDtypeStruct`; None: tracing tells.
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
+    - `plain`: the same function as forward mode goes through it best; None: as it is.
     """
 
     def __init__(
@@ -63,11 +64,12 @@ class Recipe:
         results: Any = None,
         in_lanes: bool = False,
         refilled: bool = False,
+        plain: Callable | None = None,
     ):
         self.function, self.structure, self.like = function, structure, tuple(like)
         self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
         self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
-        self.plans, self._derivatives = {}, {}  # what has been made of it
+        self.plain, self.plans, self._derivatives = plain, {}, {}  # the last two: what has been made of it
 
     @functools.cached_property
     def _traced(self) -> tuple[ClosedJaxpr, Any]:
@@ -97,6 +99,12 @@ class Recipe:
     def __call__(self, leaves: Sequence) -> list:
         """Compute it for one scene."""
         return jaxpr_as_fun(self.program)(*leaves)
+
+    def forward(self, leaves: Sequence) -> list:
+        """The same, for derivatives."""
+        if self.plain is None:
+            return self(leaves)
+        return jax.tree.leaves(self.plain(self.structure.unflatten(leaves)))
 
     def taped(self, leaves: Sequence) -> list:
         """The same on a tape."""

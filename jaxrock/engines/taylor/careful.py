@@ -93,6 +93,10 @@ class Series(AbstractEngine):
         """Largest number of steps."""
         return self.max_steps or (POLICY.history_steps + 2 * scene.pieces if history else POLICY.outcome_steps)
 
+    @property
+    def in_lanes(self) -> bool:
+        return True
+
     def loop(self, unfinished, step, carry, budget: int):
         """A loop that stops at the last lane."""
         return jax.lax.while_loop(unfinished, step, carry)
