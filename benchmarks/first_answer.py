@@ -25,9 +25,10 @@ begun = spent()
 import jax, numpy as np, jax.numpy as jnp
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_enable_x64", True)
-jax.block_until_ready(jnp.ones(3) + 1)
+jax.block_until_ready(jax.device_put(np.ones(3)))
 of_jax = spent()
 import jaxrock as rk
+rk.keep_compiled()
 block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
 imported = spent()
 """

@@ -76,6 +76,7 @@ from jaxrock.inverse.posterior import (
     sample_motion as sample_motion,
 )
 from jaxrock.inverse.unknowns import Unknown as Unknown
+from jaxrock.keeping.compiled import keep_compiled as keep_compiled
 from jaxrock.models.coefficients import Coefficients as Coefficients, Terms as Terms
 from jaxrock.models.equation import AbstractEquation as AbstractEquation
 from jaxrock.models.rigid import Housner as Housner, Linear as Linear

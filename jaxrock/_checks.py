@@ -46,13 +46,27 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     """
     array = as_real(name, value)
     message = f"Argument `{name}` must {allowed}"
-    good = holds(array if isinstance(array, jax.core.Tracer) else np.asarray(array))
-    if isinstance(array, jax.core.Tracer) or isinstance(good, jax.core.Tracer):
+    if isinstance(array, jax.core.Tracer):
+        return watched(array, message, _failed(holds)(array))
+    good = holds(np.asarray(array))
+    if isinstance(good, jax.core.Tracer):
         return watched(array, message, ~jnp.all(good))
     known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
     if not good.all():
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
+
+
+def _failed(holds: Callable) -> Callable:
+    """Whether it does not hold somewhere. Under `jax.vmap` outside of `jax.jit` every operation is compiled by itself:
+    what is there once and for all is one operation."""
+    is_constant = getattr(holds, "__closure__", None) is None and "<locals>" not in holds.__qualname__
+    return _compiled_failed(holds) if is_constant else lambda array: ~jnp.all(holds(array))
+
+
+@functools.cache
+def _compiled_failed(holds: Callable) -> Callable:
+    return jax.jit(lambda array: ~jnp.all(holds(array)), inline=True)
 
 
 def watched(values, message: str, failed: Bool[ArrayLike, ""]):

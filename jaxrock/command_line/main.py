@@ -7,11 +7,12 @@ from pathlib import Path
 
 import jax
 
-from jaxrock.command_line.cache import CACHE, keep_compiled
+from jaxrock.command_line.cache import CACHE
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
+from jaxrock.keeping.compiled import keep_compiled
 from jaxrock.sweeps.devices import use_cpu_devices
 
 # Another command is a module like `run`, and its entry here.

@@ -3,9 +3,10 @@
 What is known by its facts is exported, and kept: in another session it need not be traced again.
 """
 
+import contextvars
 import logging
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 from jax.interpreters import mlir
@@ -15,17 +16,22 @@ from jaxrock.transforms.batching import Lanes
 from jaxrock.transforms.recipe import Recipe
 
 _LOG = logging.getLogger("jaxrock")
+_called = contextvars.ContextVar("called", default=None)  # names of machine code that what is lowered now calls
 
 
 def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool):
     """The rule of JAX for the primitive of `scenes`."""
     mesh = getattr(context.module_context.axis_context, "mesh", None)
     lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1)
-    return mlir.lower_fun(_kept(lanes, context.avals_in) or lanes)(context, *leaves)
+    function, codes = _kept(lanes, context.avals_in) or (lanes, lanes.codes())
+    if _called.get() is not None:
+        _called.get().extend(codes)
+    return mlir.lower_fun(function)(context, *leaves)
 
 
-def _kept(lanes: Lanes, leaves) -> Callable | None:
-    """The same, as it was exported in this session or another; None where that cannot be."""
+def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
+    """The same as it was exported, in this session or another, and the machine code that it calls; None where that
+    cannot be."""
     if lanes.recipe.facts is None or not lanes.on_cpu or folder.folder() is None:
         return None
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
@@ -37,14 +43,33 @@ def _kept(lanes: Lanes, leaves) -> Callable | None:
     if content is not None:
         program, codes = pickle.loads(content)
         if all(map(lanes.found, codes)):
-            return jax.export.deserialize(bytearray(program)).call
+            return jax.export.deserialize(bytearray(program)).call, codes
     try:
-        codes = lanes.codes()
-        allowed = [jax.export.DisabledSafetyCheck.custom_call(code) for code in codes]
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            exported = jax.export.export(jax.jit(lanes), platforms=["cpu"], disabled_checks=allowed)(*shapes)
+        exported, codes = _exported(lanes, shapes)
         folder.write("lowered", name, pickle.dumps((bytes(exported.serialize()), codes)))
     except Exception as error:  # such as a callback in it, which no other process has
-        _LOG.debug("%s is not kept: %s", lanes.recipe, error)
+        _LOG.debug("%s is not kept: %.300s", lanes.recipe, error)
         return None
-    return exported.call
+    return exported.call, codes
+
+
+def _exported(lanes: Lanes, shapes: list) -> tuple[jax.export.Exported, list[str]]:
+    """A program with all that it is made of, and the names of the machine code that it calls."""
+    before = _called.set(lanes.codes())
+    allowed = _Called()
+    try:
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            exported = jax.export.export(jax.jit(lanes), platforms=["cpu"], disabled_checks=allowed)(*shapes)
+        return exported, sorted(set(_called.get()))
+    finally:
+        _called.reset(before)
+
+
+class _Called(Sequence):
+    """What `jax.export` is told to let pass: the machine code that has been called by the time it looks."""
+
+    def __len__(self):
+        return len(_called.get())
+
+    def __getitem__(self, index):
+        return jax.export.DisabledSafetyCheck.custom_call(_called.get()[index])

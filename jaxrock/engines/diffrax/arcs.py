@@ -23,6 +23,7 @@ from jaxrock.engines.diffrax.guards import (
     Arc,
     Forcing,
     Illinois,
+    StepControl,
     field,
     first_guard,
     first_step,
@@ -154,15 +155,17 @@ class Diffrax(AbstractEngine):
         # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
         # do so: of two equal times, derivatives go with each by one half.
         first = first_step(arc, self.rtol)
+        first = jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0))
+        controller = self.controller or StepControl(self.rtol, limits[0], dtmax=limits[1], first=first)
         return diffrax.diffeqsolve(
             diffrax.ODETerm(field),
             self.solver,
             t0=jnp.zeros_like(length),
             t1=length,
-            dt0=jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0)),
+            dt0=None if isinstance(controller, StepControl) else first,
             y0=jnp.stack([arc.opening, arc.velocity]),
             args=arc,
-            stepsize_controller=self.controller or diffrax.PIDController(self.rtol, limits[0], dtmax=limits[1]),
+            stepsize_controller=controller,
             event=event,
             adjoint=self.adjoint,
             max_steps=POLICY.solve_steps,

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -191,6 +192,17 @@ def first_guard(t, y, args: Arc, **kwargs):
 def usual_step(rtol: float) -> float:
     """Step (p t) that methods of order five take at this tolerance."""
     return min(0.1 * (rtol / 1e-8) ** 0.2, POLICY.longest)
+
+
+class StepControl(diffrax.PIDController):
+    """A controller that knows its first step. Diffrax would check one that it is given by calling back to Python, and
+    what calls back cannot be kept or exported."""
+
+    first: Scalar | None = None
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The first step's end, and the controller's state."""
+        return super().init(terms, t0, t1, y0, self.first, args, func, error_order)
 
 
 def first_step(arc: Arc, rtol: float) -> Scalar:

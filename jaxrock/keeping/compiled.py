@@ -1,0 +1,30 @@
+"""What XLA compiles is kept by JAX itself, in the same folder, if it is asked to."""
+
+import os
+
+import jax
+
+from jaxrock.keeping.folder import LARGEST, folder
+
+
+def keep_compiled() -> None:
+    """Let JAX keep on disk what it compiles, so that it need not compile it again in another session.
+
+    Call it before the first computation; it does nothing where JAX keeps that already, where the folder cannot be
+    written, and where the environment says `JAXROCK_CACHE=off`. Machine code and programs of the package's own are kept
+    without it. It sets options of JAX (`jax_compilation_cache_dir` and its limits), for all that this process compiles.
+    """
+    place = folder()
+    if place is None or jax.config.jax_compilation_cache_dir:
+        return
+    place = place / "xla"
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(place, os.W_OK):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update("jax_compilation_cache_max_size", LARGEST)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
