@@ -57,12 +57,17 @@ class FreeStage(eqx.Module):
         )
 
 
+@jax.jit
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""
-    for _ in range(14):
+
+    def doubled(carry):
+        left, x, y, z = carry
         roots = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
         shift = roots[0] * roots[1] + roots[1] * roots[2] + roots[2] * roots[0]
-        x, y, z = (x + shift) / 4, (y + shift) / 4, (z + shift) / 4
+        return left - 1, (x + shift) / 4, (y + shift) / 4, (z + shift) / 4
+
+    _, x, y, z = jax.lax.while_loop(lambda carry: carry[0] > 0, doubled, (14, x, y, z))
     mean = (x + y + z) / 3
     dx, dy = 1 - x / mean, 1 - y / mean
     dz = -(dx + dy)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, PyTree
 
 from jaxrock._checks import Values, checked
+from jaxrock.numerics.lookup import count_up_to
 
 
 class Trajectory(eqx.Module):
@@ -48,7 +49,7 @@ class Trajectory(eqx.Module):
 
     def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
         """The node before a time, and how long after it that is [s]."""
-        index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
+        index = jnp.clip(count_up_to(self.times, time) - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
         return node, jnp.minimum(time, self.duration) - self.times[index]
 

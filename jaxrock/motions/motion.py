@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._checks import Values, finite, not_negative
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock.numerics.lookup import count_up_to
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
 
 Scalar = Inexact[ArrayLike, ""]
@@ -111,7 +112,7 @@ class AbstractMotion(eqx.Module):
         knots = self.knots
 
         def at(t):
-            piece = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+            piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
             value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
             return jnp.where((t >= 0) & (t < knots[-1]), value, 0.0)
 
@@ -226,7 +227,9 @@ class _Pieces(NamedTuple):
 
     def inside(self, middle: Inexact[Array, "..."]):
         """Piece of the motion at a time strictly between knots, and whether it moves then."""
-        piece = jnp.searchsorted(self.motion.knots, middle, side="right") - 1
+        knots = self.motion.knots
+        found = count_up_to(knots, middle) if jnp.ndim(middle) == 0 else jnp.searchsorted(knots, middle, side="right")
+        piece = found.astype(jnp.int32) - 1
         last = self.motion.knots.size - 2
         return jnp.clip(piece, 0, last), (piece >= 0) & (piece <= last)
 

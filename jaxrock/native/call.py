@@ -17,7 +17,7 @@ from jaxrock.native.emitter import SMALL, is_known
 from jaxrock.native.interface import HAS_THREADS
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
-from jaxrock.native.partition import Part, ahead, around_loop, computed
+from jaxrock.native.partition import Part, ahead, around_loop, computed, hoisted
 
 
 class _Piece(NamedTuple):
@@ -35,10 +35,9 @@ class Plan:
     """
 
     def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False):
+        program = hoisted(program, lambda equation: not is_known(equation) or any(map(_is_large, equation.outvars)))
         self._program, self._shared = program, shared
-        self._once, self._each, self._rest = ahead(
-            program, shared, is_known, lambda v: math.prod(v.aval.shape) > SMALL
-        )
+        self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)
         own = self._first_own()
         self._pieces = []
         for part in around_loop(self._rest) if refilled else [self._rest]:
@@ -78,6 +77,10 @@ class Plan:
             arrays = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
             values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
         return [jnp.moveaxis(x, -1, 0)[:size] for x in arrays]
+
+
+def _is_large(variable) -> bool:
+    return math.prod(variable.aval.shape) > SMALL
 
 
 def threads(devices: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported
+from jaxrock.native.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported, is_float
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
@@ -176,9 +176,39 @@ class Emitter:
                 parts = list(np.moveaxis(array, axis, 0))
                 array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)
             return [unboxed(array)]
+        if name == "dynamic_slice":
+            return [self._picked(parameters["slice_sizes"], *inputs)]
+        if name == "sort":
+            return [self._sorted(equation, *inputs)]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
+
+    def _picked(self, sizes: tuple[int, ...], numbers, index, *more) -> np.ndarray:
+        """One number of a few; an index outside is moved to the nearest inside."""
+        if sizes != (1,) or more:
+            raise Unsupported(f"a slice of {sizes}")
+        found, *others = boxed(numbers)
+        for place, number in enumerate(others, 1):
+            found = self.b.select(self.b.icmp_signed(">=", index, self.constant_of(place, index.type)), number, found)
+        return boxed([found])
+
+    def _sorted(self, equation, *arrays) -> np.ndarray:
+        """The few numbers of a list in order, by exchanging neighbours."""
+        if len(arrays) > 1 or boxed(arrays[0]).ndim != 1:
+            raise Unsupported("a sort of more than one list")
+        numbers = list(boxed(arrays[0]))
+        less, chosen = (OPERATIONS[name] for name in ("lt", "select_n"))
+        for last in range(len(numbers) - 1, 0, -1):
+            for i in range(last):
+                one, other = numbers[i : i + 2]
+                swapped = less(self, equation, other, one)
+                if is_float(one):  # what is not a number comes last
+                    ordered = self.b.fcmp_ordered("ord", other, other)
+                    swapped = self.b.or_(swapped, self.b.and_(ordered, self.b.fcmp_unordered("uno", one, one)))
+                numbers[i] = chosen(self, equation, swapped, one, other)
+                numbers[i + 1] = chosen(self, equation, swapped, other, one)
+        return boxed(numbers)
 
     def _of_memory(self, name: str, parameters: dict, memory, *more):
         sizes = parameters.get("slice_sizes", ())
@@ -334,10 +364,15 @@ def like(values: list, vectors: list) -> list:
     return alike
 
 
+_LISTS = [(n,) for n in range(SMALL + 1)]
+
+
 def is_known(equation) -> bool:
     """Whether an operation may be written; in the end only writing it tells."""
     if equation.primitive.name not in WITH_PROGRAMS:
-        return equation.primitive.name in OPERATIONS | MOVES | SUMS or equation.primitive.name == "dynamic_slice"
+        name = equation.primitive.name
+        small = name == "sort" and len(equation.invars) == 1 and equation.invars[0].aval.shape in _LISTS
+        return name in OPERATIONS | MOVES | SUMS or name == "dynamic_slice" or small
     programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
     return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
 

@@ -67,22 +67,26 @@ def _horner(coefficients: tuple[float, ...], x: Real) -> Real:
     return total
 
 
+@jax.jit
 def sine_cosine(x: Real) -> tuple[Real, Real]:
     """Sine and cosine to rounding for |x| <= 1.78; beyond, the error grows (1e-11 at 3)."""
     square = x * x
     return x * _horner(_SINE, square), _horner(_COSINE, square)
 
 
+@jax.jit
 def sine_ratio(x: Real) -> Real:
     """sin(x)/x to rounding for |x| <= 1.78."""
     return _horner(_SINE, x * x)
 
 
+@jax.jit
 def sine_lag(x: Real) -> Real:
     """(x - sin(x))/x^3 to rounding for |x| <= 1.78."""
     return -_horner(_SINE[1:], x * x)
 
 
+@jax.jit
 def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     """Sine and cosine of any angle, as exact as the angle itself is rounded."""
     half_turns = jnp.round(x * (1 / math.pi))
@@ -91,6 +95,7 @@ def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     return sign * sine, sign * cosine
 
 
+@jax.jit
 def logarithm(x: Real) -> Real:
     """Natural logarithm of a positive normal number, to a few units of rounding."""
     x = jnp.asarray(x)
@@ -105,6 +110,7 @@ def logarithm(x: Real) -> Real:
     return power.astype(x.dtype) * math.log(2) + 2 * ratio * _horner(_LOGARITHM, square)
 
 
+@jax.jit
 def exponential(x: Real) -> Real:
     """exp(x), to a few units of rounding; zero where it is no normal number."""
     x = jnp.asarray(x)
@@ -123,6 +129,7 @@ def exponential(x: Real) -> Real:
     return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))
 
 
+@jax.jit
 def exponential_less_one(x: Real) -> Real:
     """exp(x) - 1, to a few units of rounding of the result."""
     x = jnp.asarray(x)
@@ -130,17 +137,20 @@ def exponential_less_one(x: Real) -> Real:
     return jnp.where(jnp.abs(x) < 0.346, near, exponential(x) - 1)
 
 
+@jax.jit
 def tangent(x: Real) -> Real:
     """tan(x), to a few units of rounding."""
     sine, cosine = sine_cosine_of_any(x)
     return sine / cosine
 
 
+@jax.jit
 def _is_negative(x: Real) -> Bool[Array, "..."]:
     """Whether the sign is minus, of zeros too."""
     return (x < 0) | ((x == 0) & (1 / x < 0))
 
 
+@jax.jit
 def arctangent_of(y: Real, x: Real) -> Real:
     """The angle of the point (x, y), in [-pi, pi], to a few units of rounding; zeros have signs, as in C."""
     high, wide = jnp.abs(y), jnp.abs(x)
@@ -158,11 +168,13 @@ def arctangent_of(y: Real, x: Real) -> Real:
     return jnp.where(_is_negative(y), -angle, angle)
 
 
+@jax.jit
 def arcsine(x: Real) -> Real:
     """arcsin(x), to a few units of rounding."""
     return arctangent_of(x, jnp.sqrt((1 - x) * (1 + x)))
 
 
+@jax.jit
 def hyperbolic_arctangent(x: Real) -> Real:
     """artanh(x), to a few units of rounding; infinite at the ends."""
     size = jnp.abs(x)
@@ -173,6 +185,7 @@ def hyperbolic_arctangent(x: Real) -> Real:
     return jnp.where(x < 0, -value, value)
 
 
+@jax.jit
 def hyperbolic_arcsine(x: Real) -> Real:
     """arsinh(x), to a few units of rounding."""
     size = jnp.abs(x)
@@ -187,6 +200,7 @@ def hyperbolic_arcsine(x: Real) -> Real:
     return jnp.where(x == x, value, jnp.nan)
 
 
+@jax.jit
 def hyperbolic_tangent(x: Real) -> Real:
     """tanh(x), to a few units of rounding."""
     grown = exponential_less_one(2 * jnp.minimum(jnp.abs(x), 30.0))

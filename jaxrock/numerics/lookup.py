@@ -1,5 +1,6 @@
 """Looking up a value by a number that differs from lane to lane."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Int, Shaped
 
@@ -14,3 +15,19 @@ def pick(values: Shaped[Array, " n"], index: Int[ArrayLike, ""]) -> Shaped[Array
     for i in range(1, values.shape[0]):
         value = jnp.where(index >= i, values[i], value)
     return value
+
+
+def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Array, ""]:
+    """How many of some sorted values are not larger than x; without derivatives."""
+    values, x = jax.lax.stop_gradient((values, jnp.asarray(x)))
+    if values.shape[0] <= _FEW:
+        return jnp.sum(values <= x, dtype=jnp.int32)
+
+    def halved(carry):
+        low, high = carry
+        middle = (low + high) >> 1
+        below = values[middle] <= x
+        return jnp.where(below, middle + 1, low), jnp.where(below, high, middle)
+
+    ends = jnp.int32(0), jnp.int32(values.shape[0])
+    return jax.lax.while_loop(lambda carry: carry[0] < carry[1], halved, ends)[0]

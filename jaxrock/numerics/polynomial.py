@@ -27,6 +27,7 @@ def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
     return scaled
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
     """Value and the first derivatives of a polynomial at x."""
     values = [jnp.zeros_like(x)] * (derivatives + 1)
@@ -64,6 +65,7 @@ def derivative(coefficients: list[Scalar]) -> list[Scalar]:
     return [k * c for k, c in enumerate(coefficients)][1:]
 
 
+@jax.jit
 def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
     """Value of a polynomial at x."""
     total = coefficients[-1]
@@ -72,6 +74,7 @@ def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
     return total
 
 
+@jax.jit
 def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scalar:
     """Positive only if sign times the polynomial is certainly positive on (0, length].
 
@@ -86,6 +89,7 @@ def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scal
     return horner(kept, length)
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def _falls(coefficients: list[Scalar], sign: Scalar, order: int) -> list[Scalar]:
     """Coefficients of a bound of how negative this derivative of sign times the polynomial can be from 0 on."""
     falls = []
@@ -97,6 +101,7 @@ def _falls(coefficients: list[Scalar], sign: Scalar, order: int) -> list[Scalar]
     return falls or [jnp.zeros_like(sign)]
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
     """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
     return horner(_falls(coefficients, sign, order), length)
@@ -153,6 +158,7 @@ class Landing(NamedTuple):
     hits: list[Flag]
 
 
+@jax.jit
 def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
     """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
     root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
