@@ -12,6 +12,7 @@ machine = pytest.importorskip("jaxrock.native.machine", reason="needs llvmlite")
 
 import jaxrock as rk  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
+from jaxrock.transforms import batching  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
 OTHERS = np.roll(NUMBERS, 5)
@@ -41,6 +42,16 @@ def agree(function, *values, shared=(), rtol=0.0):
         if rtol == 0 and found.dtype.kind == "f":
             zero = found == 0
             np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
+
+
+def test_lists_in_order():
+    values = np.stack([np.roll(np.array([0.5, -np.inf, np.nan, 3.0, -2.0, np.inf, 3.0]), k) for k in range(7)])
+    agree(lambda x: [jnp.sort(x)], values)
+    agree(lambda x: [jnp.sort(x)], np.arange(24, dtype=np.int32).reshape(6, 4)[:, ::-1] % 7)
+
+
+def test_a_number_of_a_few():
+    agree(lambda i, x: [x[i], jax.lax.clamp(-0.5, x[0], 0.5)], np.array([-9, 0, 1, 2, 9]), np.eye(5, 3) - 0.7)
 
 
 REAL = {
@@ -350,6 +361,7 @@ def test_programs_have_names_of_their_own():
     assert len({machine.registered(*each) for each in ((program, [False]), (program, [True]), (other, [False]))}) == 3
 
 
+PULSE, SHORT = rk.SinePulse(0.4, 0.8), rk.Record(rk.example_record().samples[500:2500], 0.005)
 SCENES = {
     "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
     "derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin, (0, 1)),
@@ -358,6 +370,11 @@ SCENES = {
     ),
     "a scaled record": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin,
     "its derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin, (0, 1)),
+    "two records": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3)).margin,
+    "vertical records": lambda a, u: rk.outcome(rk.Block(a, 2.0), (u * SHORT).with_vertical(0.3 * SHORT)).margin,
+    "two sides, vertical": lambda a, u: (
+        rk.outcome(rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3))).margin
+    ),
     "spring": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear")).margin,
 }
 
@@ -368,3 +385,13 @@ def test_scenes_do_not_fall_back(name, caplog):
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         jax.jit(jax.vmap(SCENES[name])).lower(jnp.full(333, 0.2), jnp.full(333, 0.5))
     assert "left to XLA" not in caplog.text
+
+
+@pytest.mark.parametrize("name", ["two records", "vertical records", "two sides, vertical"])
+def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
+    """The knots of two motions are sorted once, and the blocks do the same as where XLA runs all of it."""
+    a, u = jnp.full(20, 0.2), jnp.linspace(0.8, 2.0, 20)
+    found = jax.vmap(SCENES[name])(a, u)
+    jax.clear_caches()
+    monkeypatch.setattr(batching, "native", None)
+    np.testing.assert_allclose(found, jax.vmap(SCENES[name])(a, u), rtol=1e-9)

@@ -183,6 +183,7 @@ OPERATIONS: dict[str, Callable] = {
     "rem": _quotient(of_rest=True),
     "min": _extremum("<"),
     "max": _extremum(">"),
+    "clamp": lambda e, q, low, x, high: _extremum("<")(e, q, _extremum(">")(e, q, x, low), high),
     "neg": _negative,
     "abs": _size,
     "sign": _sign,
