@@ -7,12 +7,13 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Bool, Inexact
+
+from jaxrock._guard import guarded
 
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
@@ -41,8 +42,8 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
     """Return `value` as an array for which `holds` is true everywhere.
 
-    A known value that fails raises ValueError at once, within `jax.jit` too; one that is traced carries an
-    `equinox.error_if`, which raises when the compiled function meets it.
+    A known value that fails raises ValueError at once, within `jax.jit` too; one that is traced carries a check, which
+    raises when the compiled function meets it (see `_guard`).
     """
     array = as_real(name, value)
     message = f"Argument `{name}` must {allowed}"
@@ -75,7 +76,7 @@ def watched(values, message: str, failed: Bool[ArrayLike, ""]):
     if state is not None and state == get_opaque_trace_state():
         checks.append((message, failed))
         return values
-    return eqx.error_if(values, failed, message + ".")
+    return guarded(values, failed, message + ".")
 
 
 # What is traced where checks are put down, and these; every thread has its own.

@@ -60,6 +60,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     unlifted = jnp.maximum(2 - scene.drives[0] / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
     finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
+    # A block whose threshold is not a number would seem to stand for ever.
+    finite = finite & ~jnp.isnan(scene.threshold + scene.p + scene.drives[0] + scene.knots[-1])
     return State(
         piece=count,
         local=zero,

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxrock._guard import guarded
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar
@@ -109,10 +110,10 @@ class FunctionMoments(AbstractMoments):
     def __init__(self, function: Callable, block: Block | Side, factor: Scalar | None = None):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
         zero = Angle.of(jnp.zeros_like(block.alpha))
-        self.restoring_at_rest = eqx.error_if(
+        self.restoring_at_rest = guarded(
             self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."
         )
-        self.arm_at_rest = eqx.error_if(
+        self.arm_at_rest = guarded(
             self.arm(zero), self.arm(zero) <= 0, "The overturning arm must be positive at rotation 0."
         )
         self.saddle = self._first_zero()

@@ -33,11 +33,12 @@ _ENDLESS = jnp.iinfo(jnp.int32).max
 class Lanes:
     """A recipe at `size` scenes (None: one, without an axis), of which some leaves are their `own`.
 
-    Called with leaves it returns leaves. `on_cpu`: what it is compiled for; `devices`: that run it at the same time.
+    Called with leaves it returns leaves. `on_cpu`: what it is compiled for; `devices`: that run it at the same time;
+    `portable`: whether it has to go without machine code of our own.
     """
 
-    def __init__(self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1):
-        self.recipe, self.own, self.size, self.on_cpu = recipe, own, size, on_cpu
+    def __init__(self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1, portable=False):
+        self.recipe, self.own, self.size, self.on_cpu, self.portable = recipe, own, size, on_cpu, portable
         self.threads = native.threads(devices) if native is not None else 1
 
     def __call__(self, *leaves) -> list:
@@ -51,7 +52,7 @@ class Lanes:
     @functools.cached_property
     def in_machine_code(self) -> bool:
         """Whether machine code of our own runs it."""
-        if not self.on_cpu or native is None or not self.recipe.in_lanes:
+        if not self.on_cpu or self.portable or native is None or not self.recipe.in_lanes:
             return False
         try:
             self._plans()

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import jax
 from jax.interpreters import mlir
 
+from jaxrock._abstract import without_mesh
 from jaxrock.keeping import facts, folder
 from jaxrock.transforms.batching import Lanes
 from jaxrock.transforms.recipe import Recipe
@@ -22,17 +23,19 @@ _called = contextvars.ContextVar("called", default=None)  # names of machine cod
 def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool):
     """The rule of JAX for the primitive of `scenes`."""
     mesh = getattr(context.module_context.axis_context, "mesh", None)
-    lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1)
+    exported = getattr(context.module_context.lowering_parameters, "for_export", False)
+    portable = exported and _called.get() is None  # by the user, for machines that may not have our machine code
+    lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1, portable)
     function, codes = _kept(lanes, context.avals_in) or (lanes, lanes.codes())
     if _called.get() is not None:
         _called.get().extend(codes)
-    return mlir.lower_fun(function)(context, *leaves)
+    return mlir.lower_fun(function)(without_mesh(context), *leaves)
 
 
 def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
     """The same as it was exported, in this session or another, and the machine code that it calls; None where that
     cannot be."""
-    if lanes.recipe.facts is None or not lanes.on_cpu or folder.folder() is None:
+    if lanes.recipe.facts is None or not lanes.on_cpu or lanes.portable or folder.folder() is None:
         return None
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     name = folder.name_of(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jaxrock._abstract import typed_like
 from jaxrock.transforms.along import value_and_jacobian
 from jaxrock.transforms.lowering import lowered
 from jaxrock.transforms.recipe import Recipe
@@ -46,7 +47,7 @@ def _(*leaves, recipe, own, size):
 @scenes_p.def_abstract_eval
 def _(*leaves, recipe, own, size):
     axis = () if size is None else (size,)
-    return [jax.core.ShapedArray((*axis, *x.shape), x.dtype) for x in jax.tree.leaves(recipe.results)]
+    return typed_like(leaves, [((*axis, *x.shape), x.dtype) for x in jax.tree.leaves(recipe.results)])
 
 
 def _batched(leaves, axes, *, recipe, own, size):

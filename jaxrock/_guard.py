@@ -1,0 +1,83 @@
+"""Checks of values that are known when a program runs, as a primitive of JAX.
+
+Where JAX compiles for this process the check raises by calling back to Python, as `equinox.error_if` does. A program
+that is exported cannot call back: there a value that fails becomes what is not a number, and the status of a result
+says so. Outside of `jax.jit` (under `jax.vmap`, say) it raises at once.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Bool, PyTree
+
+from jaxrock._abstract import typed_like, without_mesh
+
+_guard_p = Primitive("guard")
+_guard_p.multiple_results = True
+
+
+def guarded(values: PyTree, failed: Bool[Array, ""], message: str) -> PyTree:
+    """`values`, with a check that raises `message` where it has `failed`."""
+    leaves, structure = jax.tree.flatten(values)
+    return structure.unflatten(_guard_p.bind(jnp.asarray(failed), *map(jnp.asarray, leaves), message=message))
+
+
+@_guard_p.def_impl
+def _(failed, *values, message):
+    if np.asarray(failed).any():
+        raise ValueError(message)
+    return list(values)
+
+
+@_guard_p.def_abstract_eval
+def _(failed, *values, message):
+    return typed_like([failed, *values], [(x.shape, x.dtype) for x in values])
+
+
+def _batched(operands, axes, *, message):
+    size = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    moved = [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(operands, axes)
+    ]
+    found = _guard_p.bind(*moved, message=message)
+    return found, [0] * len(found)
+
+
+def _pushed(operands, changes, *, message):
+    found = _guard_p.bind(*operands, message=message)
+    return found, list(changes[1:])
+
+
+def _transposed(cotangents, failed, *values, message):
+    return [None, *cotangents]
+
+
+def _raising(failed, *values, message):
+    return list(eqx.error_if(values, failed, message))
+
+
+def _marked(failed, *values, message):
+    """Lane by lane: what has failed is not a number."""
+
+    def of(x):
+        if not jnp.issubdtype(x.dtype, jnp.inexact):
+            return x
+        return jnp.where(failed.reshape(failed.shape + (1,) * (x.ndim - failed.ndim)), jnp.nan, x)
+
+    return [of(x) for x in values]
+
+
+def _lowered(context, *operands, message):
+    settings = getattr(context.module_context, "lowering_parameters", None)
+    rule = _marked if getattr(settings, "for_export", False) else _raising
+    return mlir.lower_fun(rule)(without_mesh(context), *operands, message=message)
+
+
+batching.primitive_batchers[_guard_p] = _batched
+ad.primitive_jvps[_guard_p] = _pushed
+ad.primitive_transposes[_guard_p] = _transposed
+mlir.register_lowering(_guard_p, _lowered)
