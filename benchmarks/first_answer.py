@@ -152,7 +152,9 @@ def main():
     parser.add_argument("--package", type=pathlib.Path, default=HERE.parent)
     parser.add_argument("--rounds", type=int, default=2, help="1: cold only")
     arguments = parser.parse_args()
-    print("| question | cold [s] | bar | warm [s] | bar | warm, wall [s] | memory [MB] |\n|---|---|---|---|---|---|---|")
+    print(
+        "| question | cold [s] | bar | warm [s] | bar | warm, wall [s] | memory [MB] |\n|---|---|---|---|---|---|---|"
+    )
     for question in arguments.only:
         words, _, cold, warm = QUESTIONS[question]
         with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryDirectory() as folder:

@@ -8,33 +8,20 @@ if no lane is in it. What no loop changes is computed before it.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.operations import MOVES, NOTHING, OPERATIONS, SUMS, Unsupported, is_float
+from jaxrock.native.lists import OF_FEW, Memory, boxed, of_memory, unboxed
+from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
-
-
-class Memory(NamedTuple):
-    """A list of numbers in memory, of which single ones are looked up; or a few such lists, row by row."""
-
-    pointer: Any
-    size: int
-    starts: list | None  # where each lane's own begins; None: all look up the same
-    rows: int | None = None  # None: one list, and not a table of one
-    stride: int = 0  # from row to row
-
-    def row(self, b: ir.IRBuilder, number: int) -> "Memory":
-        """One of the lists."""
-        return Memory(b.gep(self.pointer, [_I64(number * self.stride)]), self.size, self.starts)
 
 
 class Emitter:
@@ -164,88 +151,26 @@ class Emitter:
         if name in WITH_PROGRAMS:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
-            return [unboxed(self._of_memory(name, parameters, *inputs))]
+            return [unboxed(of_memory(self, equation, *inputs))]
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
             moved = MOVES[name](parameters, *map(boxed, inputs))
             return [unboxed(x) for x in (moved if isinstance(moved, list) else [moved])]
         if name in SUMS and boxed(inputs[0]).size:
-            array = boxed(inputs[0])
-            for axis in sorted(parameters["axes"], reverse=True):
-                parts = list(np.moveaxis(array, axis, 0))
-                array = functools.reduce(lambda x, y: _each(lambda *v: SUMS[name](self, equation, *v), x, y), parts)
-            return [unboxed(array)]
-        if name == "dynamic_slice":
-            return [self._picked(parameters["slice_sizes"], *inputs)]
-        if name == "sort":
-            return [self._sorted(equation, *inputs)]
+            return [self._total(equation, boxed(inputs[0]))]
+        if name in OF_FEW:
+            return [OF_FEW[name](self, equation, *inputs)]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
 
-    def _picked(self, sizes: tuple[int, ...], numbers, index, *more) -> np.ndarray:
-        """One number of a few; an index outside is moved to the nearest inside."""
-        if sizes != (1,) or more:
-            raise Unsupported(f"a slice of {sizes}")
-        found, *others = boxed(numbers)
-        for place, number in enumerate(others, 1):
-            found = self.b.select(self.b.icmp_signed(">=", index, self.constant_of(place, index.type)), number, found)
-        return boxed([found])
-
-    def _sorted(self, equation, *arrays) -> np.ndarray:
-        """The few numbers of a list in order, by exchanging neighbours."""
-        if len(arrays) > 1 or boxed(arrays[0]).ndim != 1:
-            raise Unsupported("a sort of more than one list")
-        numbers = list(boxed(arrays[0]))
-        less, chosen = (OPERATIONS[name] for name in ("lt", "select_n"))
-        for last in range(len(numbers) - 1, 0, -1):
-            for i in range(last):
-                one, other = numbers[i : i + 2]
-                swapped = less(self, equation, other, one)
-                if is_float(one):  # what is not a number comes last
-                    ordered = self.b.fcmp_ordered("ord", other, other)
-                    swapped = self.b.or_(swapped, self.b.and_(ordered, self.b.fcmp_unordered("uno", one, one)))
-                numbers[i] = chosen(self, equation, swapped, one, other)
-                numbers[i + 1] = chosen(self, equation, swapped, other, one)
-        return boxed(numbers)
-
-    def _of_memory(self, name: str, parameters: dict, memory, *more):
-        sizes = parameters.get("slice_sizes", ())
-        if name == "slice" and not parameters["strides"]:
-            (*first, start), (*last, stop) = parameters["start_indices"], parameters["limit_indices"]
-            if memory.rows is None or (first, last) == ([0], [memory.rows]):
-                return memory._replace(pointer=self.b.gep(memory.pointer, [_I64(start)]), size=stop - start)
-        if name == "squeeze" and memory.size == 1:
-            return self._looked_up(memory, self.constant(0, np.int32)).reshape(() if memory.rows is None else -1)
-        if name == "dynamic_slice" and sizes[-1] == 1 and sizes[:-1] in ((), (memory.rows,)):
-            return self._looked_up(memory, more[-1])
-        if name == "gather" and _is_column(parameters, memory):
-            return self._looked_up(memory, boxed(more[0])[0])
-        if name in NOTHING:
-            return memory
-        raise Unsupported(f"{name} of a long list")
-
-    def _looked_up(self, memory: Memory, index) -> np.ndarray:
-        """One number of each list."""
-        if memory.rows is None:
-            return boxed([self._look_up(memory, index)])
-        return boxed([self._look_up(memory.row(self.b, k), index) for k in range(memory.rows)]).reshape(-1, 1)
-
-    def _look_up(self, memory: Memory, index):
-        # An index outside is moved to the nearest inside, as `dynamic_slice` does.
-        zero, last = (self.constant_of(k, index.type) for k in (0, memory.size - 1))
-        index = self.b.select(self.b.icmp_signed("<", index, zero), zero, index)
-        index = self.b.select(self.b.icmp_signed(">", index, last), last, index)
-        numbers = []
-        for i in range(self.lanes):
-            place = self.lane(index, i)
-            place = self.b.sext(place, _I64) if place.type != _I64 else place
-            place = place if memory.starts is None else self.b.add(place, memory.starts[i])
-            numbers.append(self.b.load(self.b.gep(memory.pointer, [place])))
-        found = self.gather(numbers)
-        is_flag = memory.pointer.type.pointee == ir.IntType(8)  # a byte in memory
-        return self.b.icmp_unsigned("!=", found, self.constant_of(0, found.type)) if is_flag else found
+    def _total(self, equation, array: np.ndarray):
+        operation = SUMS[equation.primitive.name]
+        for axis in sorted(equation.params["axes"], reverse=True):
+            parts = list(np.moveaxis(array, axis, 0))
+            array = functools.reduce(lambda x, y: _each(lambda *v: operation(self, equation, *v), x, y), parts)
+        return unboxed(array)
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
         """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""
@@ -310,27 +235,6 @@ class Emitter:
             phi.add_incoming(old, before)
         self.remember(joined, len(self.before))
         return like(results, joined)
-
-
-def _is_column(parameters: dict, memory: Memory) -> bool:
-    """Whether a gather takes one number of each of some lists: what `jax.vmap` makes of a look-up."""
-    told = parameters["dimension_numbers"]
-    maps = tuple(told.offset_dims), tuple(told.collapsed_slice_dims), tuple(told.start_index_map)
-    inside = parameters["mode"] == jax.lax.GatherScatterMode.CLIP
-    return inside and maps == ((0, 1), (), (1,)) and parameters["slice_sizes"] == (memory.rows, 1)
-
-
-def boxed(x) -> np.ndarray:
-    """An array of vectors of what may be one vector; NumPy would look into them."""
-    if isinstance(x, np.ndarray):
-        return x
-    box = np.empty(len(x) if isinstance(x, list) else (), object)
-    box[...] = x
-    return box
-
-
-def unboxed(x):
-    return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
 
 
 def _each(function: Callable, *inputs):

@@ -10,7 +10,8 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.emitter import SMALL, Emitter, Memory, boxed, flat, like, unboxed
+from jaxrock.native.emitter import SMALL, Emitter, flat, like
+from jaxrock.native.lists import Memory, boxed, unboxed
 from jaxrock.native.operations import Unsupported
 
 _I8, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)

@@ -1,4 +1,7 @@
-"""LLVM for this machine: it compiles modules, once for all sessions, and tells XLA where the code is. Needs llvmlite."""
+"""LLVM for this machine: it compiles modules, once for all sessions, and tells XLA where the code is.
+
+Needs llvmlite.
+"""
 
 import ctypes
 import functools

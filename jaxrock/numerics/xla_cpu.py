@@ -57,6 +57,7 @@ ad.defjvp(_one_p, None)
 mlir.register_lowering(_one_p, mlir.lower_fun(jnp.ones_like, multiple_results=False))
 mlir.register_lowering(_one_p, mlir.lower_fun(_one_on_cpu, multiple_results=False), platform="cpu")
 
+
 def _of_many(operands, axes, by_one):
     size = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     value, witness = (

@@ -6,7 +6,6 @@ by the careful one, again in chunks.
 
 import functools
 import logging
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -37,7 +36,9 @@ class Lanes:
     `portable`: whether it has to go without machine code of our own.
     """
 
-    def __init__(self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1, portable=False):
+    def __init__(
+        self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1, portable=False
+    ):
         self.recipe, self.own, self.size, self.on_cpu, self.portable = recipe, own, size, on_cpu, portable
         self.threads = native.threads(devices) if native is not None else 1
 
@@ -149,7 +150,7 @@ class Lanes:
         return min(most if self.on_cpu else _WIDE, size)
 
     def _chunked(self, function: Callable, leaves, most: int = _LANES):
-        """`function` of leaves with a leading axis of all scenes, in chunks; the last is filled up with its last scene."""
+        """`function` of leaves with a leading axis, in chunks; the last is filled up with its last scene."""
         lanes = self._width(most, self.size)
         chunks = -(-self.size // lanes)
 
@@ -158,7 +159,7 @@ class Lanes:
             return x.reshape(chunks, lanes, *x.shape[1:])
 
         results = jax.lax.map(function, jax.tree.map(cut, leaves))
-        return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:self.size], results)
+        return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[: self.size], results)
 
     def _again(self, function: Callable, leaves, found, which, most: int = _LANES):
         """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first

@@ -139,6 +139,7 @@ class TaylorStepper(AbstractStepper):
         scene = self.scene.on(state.side)
         moments = scene.moments
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
+        moving = moving & ((state.opening != 0) | (state.velocity != 0))  # lifted for no time at all
         here, there = Visit(moments, scene.reset), Visit(scene.both_moments[1], scene.far_reset)
         visits = (here, there) if scene.far is None else (here, there, here)
         start = visits, state.opening, state.velocity, moving, state.peak

@@ -1,0 +1,124 @@
+"""Lists of numbers in programs: long ones in memory, where single numbers are looked up, and short ones in registers.
+
+Functions of the emitter that writes the program (`e`). Needs llvmlite.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from llvmlite import ir
+
+from jaxrock.native.operations import NOTHING, OPERATIONS, Unsupported, is_float
+
+_I8, _I64 = ir.IntType(8), ir.IntType(64)
+
+
+class Memory(NamedTuple):
+    """A list of numbers in memory, of which single ones are looked up; or a few such lists, row by row."""
+
+    pointer: Any
+    size: int
+    starts: list | None  # where each lane's own begins; None: all look up the same
+    rows: int | None = None  # None: one list, and not a table of one
+    stride: int = 0  # from row to row
+
+    def row(self, b: ir.IRBuilder, number: int) -> "Memory":
+        """One of the lists."""
+        return Memory(b.gep(self.pointer, [_I64(number * self.stride)]), self.size, self.starts)
+
+
+def boxed(x) -> np.ndarray:
+    """An array of vectors of what may be one vector; NumPy would look into them."""
+    if isinstance(x, np.ndarray):
+        return x
+    box = np.empty(len(x) if isinstance(x, list) else (), object)
+    box[...] = x
+    return box
+
+
+def unboxed(x):
+    return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
+
+
+def of_memory(e, equation, memory: Memory, *more):
+    """What an operation makes of a long list."""
+    name, parameters = equation.primitive.name, equation.params
+    sizes = parameters.get("slice_sizes", ())
+    if name == "slice" and not parameters["strides"]:
+        (*first, start), (*last, stop) = parameters["start_indices"], parameters["limit_indices"]
+        if memory.rows is None or (first, last) == ([0], [memory.rows]):
+            return memory._replace(pointer=e.b.gep(memory.pointer, [_I64(start)]), size=stop - start)
+    if name == "squeeze" and memory.size == 1:
+        return _looked_up(e, memory, e.constant(0, np.int32)).reshape(() if memory.rows is None else -1)
+    if name == "dynamic_slice" and sizes[-1] == 1 and sizes[:-1] in ((), (memory.rows,)):
+        return _looked_up(e, memory, more[-1])
+    if name == "gather" and _is_column(parameters, memory):
+        return _looked_up(e, memory, boxed(more[0])[0])
+    if name in NOTHING:
+        return memory
+    raise Unsupported(f"{name} of a long list")
+
+
+def _looked_up(e, memory: Memory, index) -> np.ndarray:
+    """One number of each list."""
+    if memory.rows is None:
+        return boxed([_look_up(e, memory, index)])
+    return boxed([_look_up(e, memory.row(e.b, k), index) for k in range(memory.rows)]).reshape(-1, 1)
+
+
+def _look_up(e, memory: Memory, index):
+    # An index outside is moved to the nearest inside, as `dynamic_slice` does.
+    zero, last = (e.constant_of(k, index.type) for k in (0, memory.size - 1))
+    index = e.b.select(e.b.icmp_signed("<", index, zero), zero, index)
+    index = e.b.select(e.b.icmp_signed(">", index, last), last, index)
+    numbers = []
+    for i in range(e.lanes):
+        place = e.lane(index, i)
+        place = e.b.sext(place, _I64) if place.type != _I64 else place
+        place = place if memory.starts is None else e.b.add(place, memory.starts[i])
+        numbers.append(e.b.load(e.b.gep(memory.pointer, [place])))
+    found = e.gather(numbers)
+    is_flag = memory.pointer.type.pointee == _I8  # a byte in memory
+    return e.b.icmp_unsigned("!=", found, e.constant_of(0, found.type)) if is_flag else found
+
+
+def _is_column(parameters: dict, memory: Memory) -> bool:
+    """Whether a gather takes one number of each of some lists: what `jax.vmap` makes of a look-up."""
+    told = parameters["dimension_numbers"]
+    maps = tuple(told.offset_dims), tuple(told.collapsed_slice_dims), tuple(told.start_index_map)
+    inside = parameters["mode"] == jax.lax.GatherScatterMode.CLIP
+    return inside and maps == ((0, 1), (), (1,)) and parameters["slice_sizes"] == (memory.rows, 1)
+
+
+def _pick(e, equation, numbers, index, *more) -> np.ndarray:
+    """One number of a few; an index outside is moved to the nearest inside."""
+    sizes = equation.params["slice_sizes"]
+    if sizes != (1,) or more:
+        raise Unsupported(f"a slice of {sizes}")
+    found, *others = boxed(numbers)
+    for place, number in enumerate(others, 1):
+        found = e.b.select(e.b.icmp_signed(">=", index, e.constant_of(place, index.type)), number, found)
+    return boxed([found])
+
+
+def _sort(e, equation, *arrays) -> np.ndarray:
+    """The few numbers of a list in order, by exchanging neighbours."""
+    if len(arrays) > 1 or boxed(arrays[0]).ndim != 1:
+        raise Unsupported("a sort of more than one list")
+    numbers = list(boxed(arrays[0]))
+    less, chosen = (OPERATIONS[name] for name in ("lt", "select_n"))
+    for last in range(len(numbers) - 1, 0, -1):
+        for i in range(last):
+            one, other = numbers[i : i + 2]
+            swapped = less(e, equation, other, one)
+            if is_float(one):  # what is not a number comes last
+                ordered = e.b.fcmp_ordered("ord", other, other)
+                swapped = e.b.or_(swapped, e.b.and_(ordered, e.b.fcmp_unordered("uno", one, one)))
+            numbers[i] = chosen(e, equation, swapped, one, other)
+            numbers[i + 1] = chosen(e, equation, swapped, other, one)
+    return boxed(numbers)
+
+
+# Operations on short lists as a whole.
+OF_FEW = {"dynamic_slice": _pick, "sort": _sort}
