@@ -15,7 +15,6 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
 from jaxrock.blocks.random import draw_blocks as draw_blocks
 from jaxrock.blocks.rigid import Block as Block
-from jaxrock.engines.diffrax.arcs import Diffrax as Diffrax
 from jaxrock.engines.taylor.careful import Series as Series
 from jaxrock.flexible.response import (
     FlexibleResponse as FlexibleResponse,
@@ -133,12 +132,15 @@ from jaxrock.sweeps.sweep import sweep as sweep
 
 if TYPE_CHECKING:
     from jaxrock import plot as plot
+    from jaxrock.engines.diffrax.arcs import Diffrax as Diffrax
 
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str):
-    # Figures are drawn by few programs that compute: `jaxrock.plot` is imported when it is first used.
+    # Few programs that compute draw figures, or solve by Diffrax: both are imported when they are first used.
     if name == "plot":
         return importlib.import_module("jaxrock.plot")
+    if name == "Diffrax":
+        return importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
     raise AttributeError(f"module 'jaxrock' has no attribute {name!r}")

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -88,3 +89,8 @@ def test_a_motion_too_weak_has_no_ends():
     assert (
         found.count == 0 and np.isinf(found.lowest) and found.value.shape == (0,) and found.derivative.shape == (0, 4)
     )
+
+
+def test_a_search_cannot_be_traced():
+    with pytest.raises(TypeError, match="give all scenes in one call, and take `derivative`"):
+        jax.jit(lambda alpha: rk.critical_amplitudes(rk.Block(alpha, 2.0), rk.SinePulse(0.3, 0.8)).value)(0.2)

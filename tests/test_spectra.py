@@ -105,3 +105,41 @@ def test_figures(surface, tmp_path):
     assert rk.plot.overturning(surface, axis) is axis
     axis.figure.savefig(tmp_path / "map.png")
     plt.close("all")
+
+
+FEW_RATIOS, FEW_INTENSITIES, PERIODS = np.array([2.0, 5.0, 6.0]), np.array([1.5, 2.5]), np.array([2.0, 5.0, 9.0])
+TRACED = {
+    "map, slenderness": lambda alpha: (
+        rk.overturning_map(FEW_RATIOS, FEW_INTENSITIES, alpha=alpha, progress=False).margin
+    ),
+    "map, axes": lambda alpha: rk.overturning_map(5 * alpha * FEW_RATIOS, FEW_INTENSITIES, progress=False).margin,
+    "map, shape of a pulse": lambda shape: (
+        (
+            rk.overturning_map(
+                FEW_RATIOS, FEW_INTENSITIES, pulse=lambda a, t: rk.ExponentialPulse(a, t, shape), progress=False
+            )
+        ).margin
+    ),
+    "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, progress=False).max_rotation,
+    "self-similar spectrum": lambda alpha: (
+        rk.self_similar_spectrum(2 * FEW_RATIOS, FEW_INTENSITIES, alpha=alpha, progress=False).max_rotation
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_surfaces_go_through_transformations(name):
+    """jit, vmap and derivatives; the same as on all devices."""
+
+    def total(x):
+        values = TRACED[name](x)
+        return jnp.where(jnp.isfinite(values), values, 0.0).sum()
+
+    at = jnp.array([0.2, 0.21])
+    eager = [TRACED[name](float(x)) for x in at]
+    np.testing.assert_allclose(jax.jit(TRACED[name])(at[0]), eager[0], rtol=1e-11)
+    np.testing.assert_allclose(jax.vmap(TRACED[name])(at), eager, rtol=1e-11)
+    slope = jax.grad(total)(at[0])
+    step = 1e-7
+    difference = (total(float(at[0]) + step) - total(float(at[0]) - step)) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-5)

@@ -12,13 +12,13 @@ from jaxrock._checks import put_down
 from jaxrock._parameters import Parameter, check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
-from jaxrock.engines.diffrax.arcs import Diffrax
 from jaxrock.engines.scene import peak_bound
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
+from jaxrock.responses.arguments import engine_of
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.history import simulate
 from jaxrock.status import Status
@@ -61,7 +61,7 @@ class FittedScene(eqx.Module):
             initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
         block = _given(block, names)
         if engine is None:
-            engine = Diffrax() if not model.is_series else Series(order=8, tolerance=1e-10)
+            engine = Series(order=8, tolerance=1e-10) if model.is_series else engine_of(None, model)
         model = current_model(model, block, motion)
         return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
 

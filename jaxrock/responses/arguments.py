@@ -7,7 +7,6 @@ from jaxrock._checks import as_real, checked, scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
-from jaxrock.engines.diffrax.arcs import Diffrax
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
@@ -23,7 +22,11 @@ def engine_of(engine: AbstractEngine | None, model: AbstractEquation) -> Abstrac
     """The engine that was asked for, or the usual one of a model."""
     if engine is not None:
         return engine
-    return Series() if model.is_series else Diffrax()
+    if model.is_series:
+        return Series()
+    from jaxrock.engines.diffrax.arcs import Diffrax  # it takes a fifth of a second
+
+    return Diffrax()
 
 
 def start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:

@@ -153,6 +153,11 @@ class _Scenes(eqx.Module):
     def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "_Scenes":
         """Broadcast all parameters against one another."""
         both = block, motion
+        if any(isinstance(leaf.value, jax.core.Tracer) for leaf in leaves_of(both)):
+            raise TypeError(
+                "Critical values are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap, "
+                "jax.grad): give all scenes in one call, and take `derivative`."
+            )
         shape = jnp.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(both) if not leaf.is_shared))
         if len(shape) > 1:
             raise ValueError(

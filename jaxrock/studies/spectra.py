@@ -81,6 +81,7 @@ def rocking_spectrum(
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Spectrum` over the periods.
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -116,6 +117,7 @@ def self_similar_spectrum(
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Spectrum` with results of shape (rows, n).
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -143,6 +145,7 @@ def overturning_map(
     **Arguments:** as in `self_similar_spectrum`.
 
     **Returns:** an `OverturningMap`.
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
 

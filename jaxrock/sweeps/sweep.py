@@ -112,10 +112,21 @@ def surface(
     columns: bool = False,
 ):
     """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
-    `columns`: neighbours along the last axis but one are computed together."""
+    `columns`: neighbours along the last axis but one are computed together.
+
+    Within `jax.jit`, `jax.vmap` or a derivative it is the plain function of arrays, on the device that JAX takes.
+    """
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((axes, scene))):
+        return _traced_surface(function, tuple(map(jnp.asarray, axes)), scene, outer)
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
     results = compute(function, plan, scene, label, progress, columns=columns)[0]
     return jax.tree.map(jnp.asarray, results)
+
+
+def _traced_surface(function: Callable, axes: tuple, scene, outer: bool):
+    points = jnp.meshgrid(*axes, indexing="ij") if outer else axes
+    results = jax.vmap(lambda *point: function(*point, scene))(*(x.ravel() for x in points))
+    return jax.tree.map(lambda x: x.reshape(*points[0].shape, *x.shape[1:]), results)
 
 
 def compute(

@@ -1,0 +1,179 @@
+"""What is kept between sessions: found again, refused when it is damaged, made anew when anything changed."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.keeping import facts, folder
+from jaxrock.transforms import lowering
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+def test_what_is_written_is_read(place):
+    assert folder.read("kind", "name") is None
+    folder.write("kind", "name", b"content")
+    assert folder.read("kind", "name") == b"content"
+    assert [path.name for path in folder.kept()] == ["name"]
+
+
+@pytest.mark.parametrize("damage", ["a flipped bit", "cut short", "empty", "longer"])
+def test_what_is_damaged_is_not_read(place, damage):
+    folder.write("kind", "name", b"content" * 100)
+    path = place / "kind" / "name"
+    content = bytearray(path.read_bytes())
+    if damage == "a flipped bit":
+        content[200] ^= 1
+    path.write_bytes({"cut short": content[:-1], "empty": b"", "longer": content + b"x"}.get(damage, content))
+    assert folder.read("kind", "name") is None
+    assert not path.exists()  # so that it is made again
+
+
+def test_the_oldest_goes_first(place):
+    for i in range(5):
+        folder.write("kind", str(i), bytes(1000))
+        os.utime(place / "kind" / str(i), (i, i))
+    folder.read("kind", "0")  # used now
+    folder.prune(3 * 1032)
+    assert sorted(path.name for path in folder.kept()) == ["0", "3", "4"]
+
+
+def test_nothing_fails_where_nothing_can_be_kept(place):
+    place.write_text("a file is in the way")
+    folder.write("kind", "name", b"content")
+    assert folder.read("kind", "name") is None
+    assert float(jax.jit(lambda a: rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(a, 0.8)).margin)(0.3)) > 0
+
+
+def test_many_write_at_once(place):
+    contents = [bytes([i]) * 100_000 for i in range(8)]
+
+    def work(content):
+        for _ in range(20):
+            folder.write("kind", "name", content)
+            assert folder.read("kind", "name") in contents
+
+    threads = [threading.Thread(target=work, args=(content,)) for content in contents]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert folder.read("kind", "name") in contents
+
+
+def test_facts_of_a_question():
+    """The same where only numbers differ; another for another kind, setting, shape or type of numbers."""
+    block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
+    known = facts.facts((block, pulse, rk.Series()))
+    assert known is not None
+    assert known == facts.facts((rk.Block(0.3, 1.0), rk.SinePulse(0.1, 2.0), rk.Series()))
+    assert known == facts.facts(jax.eval_shape(lambda: (block, pulse, rk.Series())))
+    record = rk.example_record()
+    others = [
+        (rk.Block(0.2, 2.0, rk.restitution.AngularMomentum()), pulse, rk.Series()),
+        (block, rk.CosinePulse(0.3, 0.8), rk.Series()),
+        (block, pulse, rk.Series(order=12)),
+        (block, pulse, rk.Series(tolerance=1e-9)),
+        (block, pulse, rk.Diffrax()),
+        (block, pulse, rk.Diffrax(rtol=1e-5)),
+        (block, record, rk.Series()),
+        (block, rk.Record(record.samples[:-1], record.dt), rk.Series()),
+        (block, 2.0 * record, rk.Series()),
+        (block, rk.Record(np.float32(record.samples), np.float32(0.01)), rk.Series()),
+    ]
+    told = [facts.facts(each) for each in others]
+    assert None not in told and len({known, *told}) == len(others) + 1
+    renamed = rk.Record(record.samples, record.dt, name="another")
+    assert facts.facts((block, renamed, rk.Series())) == told[6]
+
+
+def test_what_is_a_users_own_has_no_facts():
+    class Mine(rk.SinePulse):
+        pass
+
+    equation = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
+    for own in (Mine(0.3, 0.8), equation, lambda x: x, [1.0, object()]):
+        assert facts.facts(own) is None
+
+
+_ANSWER = """
+import sys, time, jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp, jaxrock as rk
+from jaxrock.transforms.recipe import Recipe
+traced = []
+trace = Recipe._trace
+Recipe._trace = lambda *given: traced.append(1) or trace(*given)
+def peak(x): return rk.outcome(rk.Block(x[0], 2.0), rk.SinePulse(x[1], 0.8)).max_rotation
+x = jnp.array([0.2, 0.3]) * jnp.linspace(0.98, 1.02, 70)[:, None]
+found = [peak(x[0])[None], jax.vmap(peak)(x), *jax.vmap(jax.grad(peak))(x).T,
+         rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)).rotation,
+         rk.overturning_map(x[:, 1] * 5, [2.0, 3.0], progress=False).margin.ravel()]
+print(len(traced), jnp.concatenate(found).tobytes().hex())
+"""
+
+
+def answer(place):
+    environment = os.environ | {"JAXROCK_CACHE": str(place)}
+    done = subprocess.run([sys.executable, "-c", _ANSWER], env=environment, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    traced, numbers = done.stdout.split()
+    return int(traced), numbers
+
+
+def test_another_session_traces_nothing_and_answers_the_same_bits(tmp_path):
+    traced, numbers = answer(tmp_path)
+    assert traced > 0
+    assert answer(tmp_path) == (0, numbers)
+    files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+    assert {path.parent.name for path in files} == {"lowered", "machine"}
+    for path in files:  # damage all of it
+        content = bytearray(path.read_bytes())
+        content[-20] ^= 255
+        path.write_bytes(content)
+    again, same = answer(tmp_path)
+    assert again > 0 and same == numbers
+
+
+def test_processes_share_a_folder(tmp_path):
+    """Four at once with an empty one; none waits for another."""
+    environment = os.environ | {"JAXROCK_CACHE": str(tmp_path)}
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', True); import jaxrock as rk\n"
+        "print(repr(float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)).max_rotation)))"
+    )
+    start = time.time()
+    running = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(4)
+    ]
+    told = {process.communicate(timeout=300)[0] for process in running}
+    assert len(told) == 1 and all(process.returncode == 0 for process in running)
+    assert time.time() - start < 200
+
+
+def test_another_version_of_the_package_asks_anew(place, monkeypatch):
+    def ask():
+        jax.clear_caches()
+        return float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)).max_rotation)
+
+    exports = []
+    exported = lowering._exported
+    monkeypatch.setattr(lowering, "_exported", lambda *given: exports.append(1) or exported(*given))
+    first = ask()
+    assert len(exports) == 1
+    assert ask() == first and len(exports) == 1
+    monkeypatch.setattr(facts, "versions", lambda: "another")
+    assert ask() == first and len(exports) == 2
