@@ -122,7 +122,7 @@ TRACED = {
     ),
     "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, progress=False).max_rotation,
     "self-similar spectrum": lambda alpha: (
-        rk.self_similar_spectrum(2 * FEW_RATIOS, FEW_INTENSITIES, alpha=alpha, progress=False).max_rotation
+        rk.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, progress=False).max_rotation
     ),
 }
 
