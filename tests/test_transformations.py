@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -243,3 +244,28 @@ def test_results_are_pickled_and_kept(tmp_path):
         loaded = eqx.tree_deserialise_leaves(tmp_path / "found", found)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(loaded), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_a_search_by_optax_under_vmap():
+    """L-BFGS with its line search from several starts at once, as from each alone."""
+
+    def loss(x):
+        found = rk.outcome(BLOCK, rk.SinePulse(jnp.exp(x[0]), jnp.exp(x[1])))
+        return (found.margin - 0.5) ** 2 + 1e-3 * (x**2).sum()
+
+    def search(x):
+        optimiser = optax.lbfgs()
+        value_and_slope = optax.value_and_grad_from_state(loss)
+
+        def step(carry, _):
+            x, state = carry
+            value, slope = value_and_slope(x, state=state)
+            change, state = optimiser.update(slope, state, x, value=value, grad=slope, value_fn=loss)
+            return (optax.apply_updates(x, change), state), value
+
+        return jax.lax.scan(step, (x, optimiser.init(x)), None, length=12)[1]
+
+    starts = jnp.log(jnp.array([[0.3, 0.8], [0.4, 0.7], [0.35, 0.9]]))
+    many = jax.jit(jax.vmap(search))(starts)
+    assert (many[:, -1] < 0.1 * many[:, 0]).all()
+    np.testing.assert_allclose(many[0], jax.jit(search)(starts[0]), rtol=1e-6)

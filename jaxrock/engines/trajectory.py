@@ -6,7 +6,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
 from jaxrock.numerics.lookup import count_up_to
@@ -58,15 +59,20 @@ class Trajectory(eqx.Module):
 
         Each of `values` comes with what fills it up.
         """
-        order = jnp.argsort(jnp.where(happened, order, jnp.inf), stable=True)
-        found = []
-        for value, filling in values:
-            here = happened.reshape(happened.shape + (1,) * (value.ndim - 1))
-            found.append(jnp.where(here, value, filling)[order])
-        if isinstance(happened, jax.core.Tracer):
-            return tuple(found)
-        count = int(happened.sum())
-        return tuple(value[:count] for value in found)
+        found, count = _in_order(happened, order, values)
+        if isinstance(count, jax.core.Tracer):
+            return found
+        return tuple(jnp.asarray(np.asarray(value)[: int(count)]) for value in found)
+
+
+@jax.jit
+def _in_order(happened, order, values) -> tuple[tuple, Int[Array, ""]]:
+    order = jnp.argsort(jnp.where(happened, order, jnp.inf), stable=True)
+    found = []
+    for value, filling in values:
+        here = happened.reshape(happened.shape + (1,) * (value.ndim - 1))
+        found.append(jnp.where(here, value, filling)[order])
+    return tuple(found), happened.sum()
 
 
 def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> tuple[PyTree, PyTree]:

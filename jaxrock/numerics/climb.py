@@ -3,8 +3,8 @@
 Each climber has a BFGS matrix of its own; there are few dimensions. It tries one point in every round; whether that was
 good enough decides whether it has a new direction or a shorter step in the next one. So no round waits for anybody's
 line search, and a round is one call of one compiled program, whatever the climbers are at. (`optax.lbfgs` under
-`jax.vmap` would wait for the longest line search; its search also fails where the function has a batching rule of its
-own, as outcomes have. `optax.adam` takes many times as many points: benchmarks/inverse.md.)
+`jax.vmap` goes through, too, and would wait for the longest line search; `optax.adam` takes many times as many points:
+benchmarks/inverse.md.)
 """
 
 from collections.abc import Callable

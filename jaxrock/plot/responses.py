@@ -8,6 +8,11 @@ from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 
 
+@jax.jit
+def _acceleration(motion, time):
+    return motion.acceleration(time)
+
+
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
     scene = response.scene
@@ -33,7 +38,7 @@ def history(response: Response, axes=None):
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
     scene = response.scene
     time, rotation, velocity = _dense(response)
-    acceleration = np.asarray(scene.motion.acceleration(time))
+    acceleration = np.asarray(_acceleration(scene.motion, time))
     impacts = np.asarray(response.impact_times)
     speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
     for axis, curve in zip(axes, (rotation, velocity, acceleration)):

@@ -118,16 +118,12 @@ class Response(eqx.Module):
     @property
     def _impacts(self) -> tuple:
         self.trajectory.check_single()
-        path, nodes = self.trajectory, self.trajectory.nodes
-        values = (nodes.impact_time, jnp.inf), (nodes.impact_velocity * self.scene.p, 0.0)
-        return path.events(path.impacted, nodes.impact_time, *values)
+        return self.trajectory.events(*_impacts_of(self.trajectory))
 
     @property
     def _peaks(self) -> tuple:
         self.trajectory.check_single()
-        path, nodes = self.trajectory, self.trajectory.nodes
-        turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
-        return path.events(turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0))
+        return self.trajectory.events(*_peaks_of(self.trajectory))
 
     @property
     def impact_times(self) -> Inexact[Array, " impacts"]:
@@ -148,6 +144,23 @@ class Response(eqx.Module):
     def peak_rotations(self) -> Inexact[Array, " peaks"]:
         """Rotations at the turning points [rad]."""
         return self._peaks[1]
+
+
+# What `Trajectory.events` takes.
+
+
+@jax.jit
+def _impacts_of(path: Trajectory) -> tuple:
+    nodes = path.nodes
+    velocities = nodes.impact_velocity * path.stepper.scene.p
+    return path.impacted, nodes.impact_time, (nodes.impact_time, jnp.inf), (velocities, 0.0)
+
+
+@jax.jit
+def _peaks_of(path: Trajectory) -> tuple:
+    nodes = path.nodes
+    turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
+    return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
 
 
 def simulate(
