@@ -14,6 +14,7 @@ import jaxrock as rk
 from jaxrock.sweeps.plan import Plan, layout
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.sweep import surface
+from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.fingerprint import Traced
 
 COMPILED = []
@@ -208,6 +209,35 @@ def test_programs_are_told_apart():
     assert called[0] != called[1]
     checks = [Traced(lambda x: rk.Block(x, 1.0).restitution, point()) for _ in range(2)]
     assert checks[0] == checks[1]
+
+
+class Alike:
+    """Functions that print alike."""
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, x):
+        return self.factor * x
+
+    def __repr__(self):
+        return "alike"
+
+
+def test_programs_of_scenes_are_told_apart():
+    """By what they compute, by arrays in them, and by what they call back to; not by how often they were traced."""
+
+    def traced(function):
+        return Traced(lambda x: differentiable(function)(x), point())
+
+    def calling(f):
+        return traced(lambda x: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"))
+
+    assert traced(jnp.sin) == traced(jnp.sin) != traced(jnp.cos)
+    arrays = [traced(lambda x, c=np.arange(100.0) + c: x * jnp.asarray(c).sum()) for c in (0.0, 1.0, 1.0)]
+    assert arrays[0] != arrays[1] == arrays[2]
+    one, other = Alike(2.0), Alike(3.0)
+    assert calling(one) == calling(one) != calling(other)
 
 
 def fresh(code, *, seed="0"):

@@ -139,6 +139,9 @@ def _hidden(jaxpr: Jaxpr) -> Iterator:
                     yield from _hidden(part.jaxpr)
                 elif isinstance(part, Jaxpr):
                     yield from _hidden(part)
+                elif getattr(part, "facts", "") is None:  # a recipe that only its program tells
+                    yield from part.program.consts
+                    yield from _hidden(part.program.jaxpr)
                 elif "callback" in equation.primitive.name and callable(part):
                     yield getattr(part, "callback_func", part)
 

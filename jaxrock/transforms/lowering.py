@@ -4,8 +4,8 @@ What is known by its facts is exported, and kept: in another session it need not
 """
 
 import contextvars
+import json
 import logging
-import pickle
 from collections.abc import Callable, Sequence
 
 import jax
@@ -44,12 +44,13 @@ def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
     )  # fmt: skip
     content = folder.read("lowered", name)
     if content is not None:
-        program, codes = pickle.loads(content)
+        told, _, program = content.partition(b"\n")
+        codes = json.loads(told)
         if all(map(lanes.found, codes)):
             return jax.export.deserialize(bytearray(program)).call, codes
     try:
         exported, codes = _exported(lanes, shapes)
-        folder.write("lowered", name, pickle.dumps((bytes(exported.serialize()), codes)))
+        folder.write("lowered", name, json.dumps(codes).encode() + b"\n" + exported.serialize())
     except Exception as error:  # such as a callback in it, which no other process has
         _LOG.debug("%s is not kept: %.300s", lanes.recipe, error)
         return None
