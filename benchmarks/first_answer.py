@@ -1,9 +1,10 @@
 """How long the first answer takes: every question in a fresh process, with nothing kept (cold) and once more (warm).
 
-    python benchmarks/first_answer.py [--only WORDS] [--package FOLDER] [--rounds 2]
+    python benchmarks/first_answer.py [--only QUESTIONS] [--package FOLDER]
 
-Times are processor seconds of all threads, from after the imports of the package to the answer; of the command line,
-the whole process. Every question starts with an empty folder of kept programs. `--package` measures another copy.
+Times are processor seconds of all threads, and seconds on the wall, from after the imports of the package to the
+answer; of the command line, the whole process. Every question starts with an empty folder of kept programs; the second
+process finds what the first has left. `rk.keep_compiled()` is called. `--package` measures another copy.
 """
 
 import argparse
@@ -145,25 +146,33 @@ sys.exit(status)
 """
 
 
-def main():
-    """Print a table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--only", nargs="*", default=list(QUESTIONS))
-    parser.add_argument("--package", type=pathlib.Path, default=HERE.parent)
-    parser.add_argument("--rounds", type=int, default=2, help="1: cold only")
-    arguments = parser.parse_args()
-    print(
-        "| question | cold [s] | bar | warm [s] | bar | warm, wall [s] | memory [MB] |\n|---|---|---|---|---|---|---|"
-    )
-    for question in arguments.only:
+def table(questions: list[str], package: pathlib.Path) -> str:
+    """A table of cold and warm answers."""
+    head = "question", "cold [s]", "wall", "bar", "warm [s]", "wall", "bar", "memory [MB]"
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for question in questions:
         words, _, cold, warm = QUESTIONS[question]
         with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryDirectory() as folder:
-            found = [measure(question, arguments.package, kept, folder) for _ in range(arguments.rounds)]
-        first, last = found[0], found[-1]
-        key = "import" if question == "import" else "answer"
-        cells = [words, f"{first[key]:.2f}", f"{cold or ''}", f"{last[key]:.2f}", f"{warm}", f"{last['wall']:.2f}",
-                 f"{first['memory']:.0f}"]  # fmt: skip
-        print("| " + " | ".join(cells) + " |", flush=True)
+            first, last = (measure(question, package, kept, folder) for _ in range(2))
+        key, wall = ("import", "import") if question == "import" else ("answer", "wall")
+        cells = f"{first[key]:.2f}", f"{first[wall]:.2f}", f"{cold or ''}", f"{last[key]:.2f}", f"{last[wall]:.2f}"
+        lines.append("| " + " | ".join((words, *cells, f"{warm}", f"{first['memory']:.0f}")) + " |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def main():
+    """Print the table, and write it if it is whole."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", nargs="*", choices=list(QUESTIONS), default=None)
+    parser.add_argument("--package", type=pathlib.Path, default=HERE.parent)
+    arguments = parser.parse_args()
+    found = table(arguments.only or list(QUESTIONS), arguments.package)
+    if arguments.only is None and arguments.package == HERE.parent:
+        path = HERE / "first_answer.md"
+        before, _, after = path.read_text().partition("| question")
+        rest = after.partition("\n\n")[2]
+        path.write_text(f"{before}{found}\n\n{rest}")
 
 
 if __name__ == "__main__":
