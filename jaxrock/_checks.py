@@ -5,7 +5,7 @@ import contextvars
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,6 +128,19 @@ def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
     if array.ndim:
         raise ValueError(f"Argument `{name}` must be one number, but has shape {array.shape}. Use jax.vmap for many.")
     return array
+
+
+def whole(name: str, value: int | None, least: int) -> None:
+    """Raise ValueError for what is no whole number from `least` on, or None."""
+    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if value is not None and not (good and value >= least):
+        raise ValueError(f"Argument `{name}` must be a whole number, at least {least}, but is {value!r}.")
+
+
+def instance(name: str, value: Any, kind: type, words: str) -> None:
+    """Raise ValueError for what is not of a kind."""
+    if not isinstance(value, kind):
+        raise ValueError(f"Argument `{name}` must be {words}, but is {value!r}.")
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:

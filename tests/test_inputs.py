@@ -161,14 +161,16 @@ BAD = {
     "samples 1": (lambda: rk.simulate(BLOCK, SINE, samples=1), "samples", "be at least 2", "1"),
     "samples 0": (lambda: rk.simulate(BLOCK, SINE, samples=0), "samples", "be at least 2", "0"),
     # Engine
-    "order 3": (lambda: rk.Series(order=3), "order", "be at least 4", "3"),
-    "order 0": (lambda: rk.Series(order=0), "order", "be at least 4", "0"),
+    "order 3": (lambda: rk.Series(order=3), "order", "be a whole number, at least 4", "3"),
+    "order 0": (lambda: rk.Series(order=0), "order", "be a whole number, at least 4", "0"),
+    "order True": (lambda: rk.Series(order=True), "order", "be a whole number, at least 4", "True"),
     "tolerance 0": (lambda: rk.Series(tolerance=0.0), "tolerance", "be in (0, 1)", "0.0"),
     "tolerance 1": (lambda: rk.Series(tolerance=1.0), "tolerance", "be in (0, 1)", "1.0"),
     "tolerance negative": (lambda: rk.Series(tolerance=-1e-9), "tolerance", "be in (0, 1)", "-1e-09"),
     "tolerance NaN": (lambda: rk.Series(tolerance=NAN), "tolerance", "be in (0, 1)", "nan"),
-    "max_steps 0": (lambda: rk.Series(max_steps=0), "max_steps", "be at least 1", "0"),
-    "max_steps negative": (lambda: rk.Series(max_steps=-5), "max_steps", "be at least 1", "-5"),
+    "max_steps 0": (lambda: rk.Series(max_steps=0), "max_steps", "be a whole number, at least 1", "0"),
+    "max_steps negative": (lambda: rk.Series(max_steps=-5), "max_steps", "be a whole number, at least 1", "-5"),
+    "vertical number": (lambda: SINE.with_vertical(0.1), "vertical", "be a motion", "0.1"),
     # Spectra and maps
     "spectrum, no period": (lambda: rk.rocking_spectrum(0.2, SINE, []), "period", LIST, "shape (0,)"),
     "spectrum, table of periods": (
@@ -451,3 +453,43 @@ def test_single_precision_warns_once():
     # It points at the user's line, and says what to do.
     assert warned[0].startswith("UserWarning <string> jaxrock runs in single precision")
     assert 'jax.config.update("jax_enable_x64", True)' in warned[0]
+
+
+@pytest.mark.parametrize("other", [3, 0.5, None, "motion"], ids=repr)
+def test_only_motions_are_added(other):
+    for add in (lambda: SINE + other, lambda: SINE - other):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            add()
+
+
+def test_an_array_times_a_motion_is_a_motion():
+    found = np.array([1.0, 2.0]) * SINE
+    assert isinstance(found, rk.AbstractMotion)
+    many = jax.vmap(lambda motion: rk.outcome(BLOCK, motion).max_rotation, in_axes=(found_axes(found),))(found)
+    np.testing.assert_allclose(many, [rk.outcome(BLOCK, factor * SINE).max_rotation for factor in (1.0, 2.0)])
+
+
+def found_axes(motion):
+    return jax.tree.map(lambda x: 0 if x.ndim else None, motion)
+
+
+def test_wrong_kinds_are_named():
+    """Where annotations are not checked, as tests do."""
+    code = """
+import math, jaxrock as rk
+for make, words in (
+    (lambda: rk.Series(order=8.0), "Argument `order` must be a whole number, at least 4, but is 8.0."),
+    (lambda: rk.Series(order=math.nan), "Argument `order` must be a whole number, at least 4, but is nan."),
+    (lambda: rk.Series(max_steps=1.5), "Argument `max_steps` must be a whole number, at least 1, but is 1.5."),
+    (lambda: rk.Suite([1.0]), "Argument `motions` must be a list of motions, but is 1.0."),
+    (lambda: rk.SinePulse(0.3, 0.8).with_vertical(0.1), "Argument `vertical` must be a motion, but is 0.1."),
+):
+    try:
+        make()
+    except ValueError as error:
+        assert str(error) == words, error
+    else:
+        raise AssertionError(words)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

@@ -2,6 +2,7 @@
 
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -180,3 +181,24 @@ def test_a_missing_package_says_how_to_get_it(monkeypatch, tmp_path, straight, m
     use = {"zarr": lambda: run(store=tmp_path / "a.zarr"), "xarray": straight.to_xarray}
     with pytest.raises(ImportError, match=rf'needs {module}: `pip install "jaxrock\[store\]"`'):
         use.get(module, lambda: straight.save(tmp_path / "a.nc"))()
+
+
+def test_functions_that_call_back_need_a_version(tmp_path):
+    """The program does not tell what they call; two of them may even print alike."""
+
+    def calling(factor):
+        def called(x):
+            return np.asarray(factor * x)
+
+        return lambda x: {
+            "y": jax.pure_callback(called, jax.ShapeDtypeStruct((), x.dtype), x, vmap_method="sequential")
+        }
+
+    axis, path = np.arange(1.0, 5.0), tmp_path / "sweep.zarr"
+    with pytest.raises(ValueError, match="Argument `version` must be given for a function that calls back to Python"):
+        rk.sweep(calling(2.0), store=path, progress=False, x=axis)
+    first = rk.sweep(calling(2.0), store=path, progress=False, version="twice", x=axis)
+    np.testing.assert_array_equal(first.values["y"], 2 * axis)
+    with pytest.raises(ValueError, match="argument `version`"):
+        rk.sweep(calling(3.0), store=path, progress=False, version="three times", x=axis)
+    np.testing.assert_array_equal(rk.sweep(calling(3.0), progress=False, x=axis).values["y"], 3 * axis)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import Values, finite, not_negative
+from jaxrock._checks import Values, finite, instance, not_negative
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
@@ -120,6 +120,7 @@ class AbstractMotion(eqx.Module):
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
+        instance("vertical", vertical, AbstractMotion, "a motion")
         return WithVertical(self, vertical)
 
     def shifted(self, delay: ArrayLike) -> "Shifted":
@@ -136,10 +137,12 @@ class AbstractMotion(eqx.Module):
         return Scaled(self, -1.0)
 
     def __add__(self, other: "AbstractMotion") -> "Summed":
-        return Summed(self, other)
+        return Summed(self, other) if isinstance(other, AbstractMotion) else NotImplemented
 
     def __sub__(self, other: "AbstractMotion") -> "Summed":
-        return Summed(self, -other)
+        return Summed(self, -other) if isinstance(other, AbstractMotion) else NotImplemented
+
+    __array_ufunc__ = None  # an array of NumPy times a motion is a motion, and not an array of motions
 
 
 class Scaled(AbstractMotion):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxrock._checks import instance
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
@@ -37,6 +38,8 @@ class Suite(eqx.Module):
         motions = tuple(motions)
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
+        for motion in motions:
+            instance("motions", motion, AbstractMotion, "a list of motions")
         lengths = [m.samples.shape[-1] for m in motions if isinstance(m, Record)]
         self.groups = tuple(_ensemble(_padded(m, max(lengths, default=0))) for m in motions)
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]

@@ -34,6 +34,7 @@ def sweep(
     load: bool = True,
     block: int | None = None,
     progress: bool | None = None,
+    version: str | None = None,
     **axes: ArrayLike | Sequence,
 ) -> Grid | None:
     """Evaluate a function at every point of labelled axes, on all devices, and on all machines of a job.
@@ -50,6 +51,8 @@ def sweep(
     - `block`: points that are computed, written and dealt to a process at a time; None: as many as fit well, between
       65,536 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+    - `version`: what tells the function from others in a store, besides its program. It has to be given for a function
+      that calls back to Python (`jax.pure_callback`), where the program does not tell what is computed.
 
     **Returns:** a `Grid`, the same in every process; None if the results stay in the store.
 
@@ -74,15 +77,22 @@ def sweep(
     plan = Plan.of(tuple(lists.values()), outer, block)
     keeper = None
     if store is not None:
-        keeper = _keeper(store, plan, lists, traced)
+        if version is None and traced.program.calls_back:
+            raise ValueError(
+                "Argument `version` must be given for a function that calls back to Python: a store cannot tell "
+                "whether what it calls has changed."
+            )
+        keeper = _keeper(store, plan, lists, traced, version)
         plan = plan._replace(block=keeper.block)
     values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
     return Grid(lists, values, outer, resumed) if load else None
 
 
-def _keeper(path: str | Path, plan: "Plan", axes: dict[str, np.ndarray], traced: Traced) -> Store:
+def _keeper(path: str | Path, plan: "Plan", axes: dict[str, np.ndarray], traced: Traced, version) -> Store:
     """The store at a path: made by the first process, if there is none; a sweep's own, in every process."""
     made_by = fingerprint(axes, plan.outer, traced.fingerprint)
+    if version is not None:
+        made_by["argument `version`"] = version
     names, leaves = names_of(traced.shapes), jax.tree.leaves(traced.shapes)
     try:
         if process()[0] == 0 and not Path(path).exists():

@@ -30,6 +30,7 @@ class Program:
                 callbacks.append(_same_callback(part))
             else:
                 _tell(self._told, part)
+        self.calls_back = any(map(callable, callbacks))  # to what no fingerprint tells from others
         self._key = (self._told.hexdigest(), structure, messages, tuple(callbacks), *more)
 
     def __call__(self, *arguments):

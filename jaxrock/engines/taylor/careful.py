@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, Inexact, Int
 
+from jaxrock._checks import whole
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.events import WATCHED, Events, landed, level_of
 from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
@@ -68,12 +69,10 @@ class Series(AbstractEngine):
     max_steps: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.order is not None and self.order < 4:
-            raise ValueError(f"Argument `order` must be at least 4, but is {self.order}.")
+        whole("order", self.order, 4)
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise ValueError(f"Argument `tolerance` must be in (0, 1), but is {self.tolerance}.")
-        if self.max_steps is not None and self.max_steps < 1:
-            raise ValueError(f"Argument `max_steps` must be at least 1, but is {self.max_steps}.")
+        whole("max_steps", self.max_steps, 1)
 
     def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
         """This engine at work on a scene; short pieces of a record need few terms."""
