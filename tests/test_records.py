@@ -707,3 +707,17 @@ def test_esm_that_is_cut_anywhere(file):
             continue
         np.testing.assert_array_equal(record.samples, whole.samples)
         assert end == len(ESM) - 1
+
+
+def test_an_at2_file_that_is_cut_within_its_last_number(tmp_path):
+    """Anywhere: every digit that is missing would be a sample ten times as large, or less exact."""
+    numbers = [f"{x:15.7E}" for x in (0.0, 1.5e-3, -2.25e-3, 4.125e-2, -1.0e-4)]
+    whole = f"PEER\nTITLE\nACCELERATION TIME SERIES IN UNITS OF G\nNPTS=  5, DT=  .0050 SEC\n{''.join(numbers)}\n"
+    path = tmp_path / "cut.AT2"
+    for missing in range(len(numbers[-1].strip()) + 1):
+        path.write_text(whole[: len(whole) - missing])
+        if missing <= 1:  # the end of the line
+            np.testing.assert_array_equal(read_record(path).samples, [0.0, 1.5e-3, -2.25e-3, 4.125e-2, -1.0e-4])
+        else:
+            with pytest.raises(ValueError, match="cut off|announces 5 samples|should hold samples"):
+                read_record(path)

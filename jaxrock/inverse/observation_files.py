@@ -230,6 +230,8 @@ def _number(name: str, text: str) -> float | None:
     if not text:
         return None
     try:
+        if "_" in text:  # which Python reads over
+            raise ValueError
         return float(text)
     except ValueError:
         raise ValueError(f"`{name}` must be a number, but is {text!r}.") from None
