@@ -347,3 +347,18 @@ def test_wrong_durations():
 def test_vertical_motions_raise():
     with pytest.raises(ValueError, match="`motion` must not be vertical for a FlexibleBlock"):
         rk.outcome(rk.FlexibleBlock(**TALL, damping_ratio=0.01), PULSE.with_vertical(PULSE))
+
+
+@pytest.mark.slow
+def test_second_derivatives():
+    """Where the greatest rotation is reached moves with the amplitude: differences of values and of slopes."""
+    block = rk.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
+
+    def peak(amplitude):
+        return rk.outcome(block, rk.SinePulse(amplitude, 0.8)).max_rotation
+
+    value, slope, bent = (jax.jit(f) for f in (peak, jax.grad(peak), jax.hessian(peak)))
+    at, step = 0.266, 1e-3
+    assert float(bent(at)) == pytest.approx(float(slope(at + 1e-5) - slope(at - 1e-5)) / 2e-5, rel=1e-6)
+    twice = (float(value(at + step)) - 2 * float(value(at)) + float(value(at - step))) / step**2
+    assert float(bent(at)) == pytest.approx(twice, rel=5e-3)

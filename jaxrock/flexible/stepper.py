@@ -15,6 +15,7 @@ from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rock
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
 from jaxrock.numerics.polynomial import step_length
+from jaxrock.numerics.roots import carried
 from jaxrock.status import Status
 
 Scalar = Inexact[ArrayLike, "..."]
@@ -148,11 +149,19 @@ class FlexibleScene(eqx.Module):
         low, high = jnp.where(rocking, 0.0, -limit), jnp.where(rocking, jnp.pi / 2, limit)
         x, below, above = first_exit(watched, low, high, share)
         value, slope = watched.jet(x)
-        # One step of Newton's method gives the time of the event its derivatives.
+        # Two steps of Newton's method give the time of the event its derivatives, the first and the second.
         miss = value - jnp.where(below, low, high)
         hit = (below | above) & (slope != 0) & (x > 0)
         at_end = ~(below | above) & (x >= jax.lax.stop_gradient(share))
         x = jnp.where(hit, x - miss / jnp.where(hit, slope, 1.0), jnp.where(at_end, share, x))
+
+        def left(x):
+            value, slope = watched.jet(x)
+            return (value - jnp.where(below, low, high)) / jnp.where(hit, slope, 1.0)
+
+        x = jnp.where(hit, carried(x, left, 1), x)
+        moved = watched.jet(x)[1]
+        slope = jax.lax.stop_gradient(slope - moved) + moved  # as it was found, with the derivatives of where it ends
         motion = path.state(x)
         maxima, certain = _maxima(rows, state.maxima, x)
         status = Status.where(certain, state.status, Status.solver_failed)

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
+from jaxrock.numerics.roots import carried
+
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]
 Values = Inexact[ArrayLike, "*values"]
@@ -200,7 +202,14 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
     at_end = ~nowhere & (still.jet(last)[0] >= least)
-    place = jnp.where(at_end, end, place)
+
+    def bend(curve, x):
+        return jax.jvp(lambda x: curve.jet(x)[1], (x,), (jnp.ones_like(x),))[1]
+
+    # The top moves, too, which second derivatives feel.
+    is_top = (place > 0) & ~at_end & (bend(still, place) < 0)
+    moving = carried(place, lambda x: curve.jet(x)[1] / jnp.where(is_top, bend(curve, x), 1.0))
+    place = jnp.where(at_end, end, jnp.where(is_top, moving, place))
     return jnp.where(place >= 0, curve.jet(place)[0], best), x >= last
 
 
