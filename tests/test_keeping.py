@@ -177,3 +177,32 @@ def test_another_version_of_the_package_asks_anew(place, monkeypatch):
     assert ask() == first and len(exports) == 1
     monkeypatch.setattr(facts, "versions", lambda: "another")
     assert ask() == first and len(exports) == 2
+
+
+def test_settings_are_told_by_their_values():
+    """Numbers of NumPy, too: they are no leaves."""
+    settings = [np.int64(3), np.int64(4), np.int32(4), 4, np.float32(1e-3), np.float32(1e-9), np.arange(3), np.ones(3)]
+    told = {facts.facts((rk.Series(), setting)) for setting in settings}
+    assert None not in told and len(told) == len(settings)
+
+
+def test_code_that_changed_since_it_was_imported_is_not_kept(monkeypatch):
+    facts.versions.cache_clear()
+    known = facts.versions()
+    monkeypatch.setattr(facts, "_AT_IMPORT", facts._AT_IMPORT[1:])
+    facts.versions.cache_clear()
+    first = facts.versions()
+    facts.versions.cache_clear()
+    assert len({known, first, facts.versions()}) == 3
+    monkeypatch.undo()
+    facts.versions.cache_clear()
+    assert facts.versions() == known
+
+
+def test_a_folder_that_vanishes(place, monkeypatch):
+    def gone(largest):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(folder, "prune", gone)
+    folder.write("kind", "name", b"content")
+    assert folder.read("kind", "name") == b"content"

@@ -116,3 +116,10 @@ def test_a_jacobian_is_traced_where_it_is_compiled():
     exact = x**steps + (x + 1) * steps * x ** (steps - 1)
     np.testing.assert_allclose(many, exact, rtol=1e-14)
     np.testing.assert_allclose(one, exact, rtol=1e-14)
+
+
+def test_no_scenes():
+    run = differentiable(lambda x: {"y": jnp.sin(x[0]) * x[1], "n": jnp.int32(1)})
+    for given in (run, jax.grad(lambda x: run(x)["y"])):
+        found = jax.vmap(lambda a, given=given: given((a, 2.0)))(jnp.zeros(0))
+        assert all(x.shape == (0,) for x in jax.tree.leaves(found))

@@ -395,3 +395,15 @@ def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
     jax.clear_caches()
     monkeypatch.setattr(batching, "native", None)
     np.testing.assert_allclose(found, jax.vmap(SCENES[name])(a, u), rtol=1e-9)
+
+
+def test_a_place_of_a_lanes_own_list_in_a_refilled_loop():
+    def function(leaves):
+        numbers, turns = leaves
+        more = lambda c: (c[0] + 1, c[1] + numbers[3])  # noqa: E731
+        return list(jax.lax.while_loop(lambda c: c[0] < turns, more, (jnp.int32(0), jnp.float64(0))))
+
+    numbers, turns = jnp.asarray(np.random.default_rng(0).random((40, 12))), jnp.arange(40, dtype=jnp.int32) % 7
+    for refilled in (False, True):
+        found = run(function, [numbers, turns], [False, False], refilled)
+        np.testing.assert_allclose(found[1], numbers[:, 3] * turns, rtol=1e-14)

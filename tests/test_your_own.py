@@ -224,3 +224,24 @@ def test_a_controller_with_arrays():
     found = jax.vmap(peak)(jnp.array([1e-4, 1e-9]))
     assert float(found[1]) == pytest.approx(float(peak(1e-9)), rel=1e-12)
     assert abs(float(found[1]) / exact - 1) < 1e-7 < abs(float(found[0]) / exact - 1)
+
+
+def test_a_class_that_closes_over_a_traced_number():
+    """It is an input of the program like any other: values and derivatives."""
+    block, pulse = rk.Block(0.2, 1.0, 0.9), rk.SinePulse(6.0, 0.3)
+
+    def peak(factor):
+        class Scaled(rk.Housner):
+            def moments(self, block):
+                return super().moments(block).times(factor)
+
+        return rk.outcome(block, pulse, Scaled()).max_rotation
+
+    step = 1e-6
+    expected = float(peak(1 + step) - peak(1 - step)) / (2 * step)
+    assert expected != 0
+    assert float(jax.grad(peak)(1.0)) == pytest.approx(expected, rel=1e-6)
+    assert float(jax.jit(jax.grad(peak))(1.0)) == pytest.approx(expected, rel=1e-6)
+    assert float(jax.jit(peak)(1.0)) == pytest.approx(float(peak(1.0)), rel=1e-12)
+    many = jax.vmap(peak)(jnp.array([0.9, 1.0, 1.1]))
+    np.testing.assert_allclose(many, [peak(x) for x in (0.9, 1.0, 1.1)], rtol=1e-12)

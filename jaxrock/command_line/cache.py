@@ -16,7 +16,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if place is None:
         print("nothing is kept: JAXROCK_CACHE is off")
         return 0
-    files = kept()
+    files = [file for file in kept() if file.exists()]
     size = sum(file.stat().st_size for file in files) / 2**20
     programs = sum(file.parent.name != "xla" or file.name.endswith("-cache") for file in files)
     if arguments.clear:

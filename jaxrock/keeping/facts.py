@@ -10,6 +10,8 @@ import functools
 import hashlib
 import importlib.metadata
 import platform
+import sys
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +40,22 @@ def facts(tree: Any) -> str | None:
         return None
 
 
+def _files() -> list[tuple[Path, int, int]]:
+    paths = sorted(Path(__file__).parents[1].rglob("*.py"))
+    return [(path, (about := path.stat()).st_mtime_ns, about.st_size) for path in paths]
+
+
+_AT_IMPORT = _files()
+
+
 @functools.cache
 def versions() -> str:
-    """Digest of the package's own code, the versions of what it stands on, and the kind of this machine."""
+    """Digest of the package's own code, the versions of what it stands on, and the kind of this machine.
+
+    Where the code on disk is not what this process has imported, it is something that is never asked for again.
+    """
+    if _files() != _AT_IMPORT:
+        return uuid.uuid4().hex
     told = [platform.machine(), platform.system(), platform.python_version()]
     for name in _VERSIONS:
         try:
@@ -48,7 +63,7 @@ def versions() -> str:
         except importlib.metadata.PackageNotFoundError:
             told.append(f"no {name}")
     root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
+    for path, *_ in _AT_IMPORT:
         told.append(f"{path.relative_to(root)} {hashlib.sha256(path.read_bytes()).hexdigest()}")
     return name_of(*told)
 
@@ -62,7 +77,10 @@ def settings() -> str:
 def _told(value: Any) -> str:
     if value is None or isinstance(value, (bool, int, float, complex, str, enum.Enum, np.dtype)):
         return repr(value)
-    if isinstance(value, (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct)):
+    if isinstance(value, (np.ndarray, np.generic)):  # a setting: leaves are shapes
+        array = np.asarray(value)
+        return f"{array.dtype}{array.shape} {array.tobytes().hex()}"
+    if isinstance(value, (jax.Array, jax.ShapeDtypeStruct)):
         weak = getattr(jax.typeof(value), "weak_type", False)
         return f"{jnp.result_type(value)}{list(np.shape(value))}{'w' * weak}"
     if isinstance(value, Label):  # which compiled functions do not see
@@ -84,5 +102,7 @@ def _named(value: Any) -> str:
     """A class or a function that the package or a library defines, by where it is."""
     module, name = getattr(value, "__module__", "") or "", getattr(value, "__qualname__", "<")
     if module.split(".")[0] not in (_OWN, *_LIBRARIES) or "<" in name or getattr(value, "__closure__", None):
+        raise _Unknown
+    if getattr(sys.modules.get(module), name, None) is not value:  # something else of the same name
         raise _Unknown
     return f"{module}.{name}"

@@ -67,7 +67,8 @@ def write(kind: str, name: str, content: bytes) -> None:
             with contextlib.suppress(OSError):
                 os.unlink(aside)
         return
-    prune(LARGEST)
+    with contextlib.suppress(OSError):  # somebody may be deleting all of it
+        prune(LARGEST)
 
 
 def prune(largest: int) -> None:

@@ -127,6 +127,7 @@ class Emitter:
         if equation.primitive.name in WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
         vectors = flat([x for x in inputs if not isinstance(x, Memory)])
+        vectors += [start for x in inputs if isinstance(x, Memory) for start in x.starts or ()]
         depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
         if depth == len(self.before):
             results = self._apply(equation, inputs, active)

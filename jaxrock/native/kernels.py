@@ -218,7 +218,9 @@ class _Refilled:
 
     def _starts(self, size: int) -> list:
         b = self.b
-        return [b.mul(b.load(b.gep(self.scene, [_I64(i)])), _I64(size)) for i in range(self.e.lanes)]
+        starts = [b.mul(b.load(b.gep(self.scene, [_I64(i)])), _I64(size)) for i in range(self.e.lanes)]
+        self.e.remember(starts, 1)
+        return starts
 
     def _each_lane(self, function) -> None:
         b = self.b

@@ -34,8 +34,11 @@ class _Machine:
 
     def object_of(self, text: str) -> bytes:
         """The machine code of a module."""
-        code = binding.parse_assembly(text)
-        code.verify()
+        try:
+            code = binding.parse_assembly(text)
+            code.verify()
+        except RuntimeError as error:  # what was written is no program: XLA takes over
+            raise Unsupported(f"a program that LLVM refuses: {error}") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
         builder = binding.create_pass_builder(self._target, options)
         builder.getModulePassManager().run(code, builder)

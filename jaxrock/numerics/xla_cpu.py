@@ -37,6 +37,8 @@ def keep_flag(flag, witness):
 
 def _marked(value, witness, by_one: bool):
     value, witness = jnp.asarray(value), jax.lax.stop_gradient(jnp.asarray(witness))
+    if not jnp.issubdtype(value.dtype, jnp.inexact):
+        return value
     witness = jnp.broadcast_to(witness.astype(value.dtype), value.shape)
     return _keep_p.bind(value, witness, by_one=by_one)
 

@@ -43,6 +43,8 @@ class Lanes:
         self.threads = native.threads(devices) if native is not None else 1
 
     def __call__(self, *leaves) -> list:
+        if self.size == 0:
+            return [jnp.zeros((0, *x.shape), x.dtype) for x in jax.tree.leaves(self.recipe.results)]
         if self.in_machine_code:
             if self.size is not None:
                 return self._natively(leaves)

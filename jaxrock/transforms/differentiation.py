@@ -66,7 +66,7 @@ def _strong(x: Any) -> Any:
 
 def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
     """A recipe whose function holds no traced values of what is around it: they become leaves."""
-    if recipe.facts is not None or recipe.passes is not None:
+    if recipe.facts is not None:
         return recipe, leaves
     program, shapes = recipe.program, recipe.results
     outside = [isinstance(x, jax.core.Tracer) for x in program.consts]
@@ -82,4 +82,5 @@ def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     like = [*recipe.like, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in more)]
-    return Recipe(function, jax.tree.structure(like), like, in_lanes=recipe.in_lanes), [*leaves, *more]
+    structure = jax.tree.structure(like)
+    return Recipe(function, structure, like, in_lanes=recipe.in_lanes, refilled=recipe.refilled), [*leaves, *more]
