@@ -367,10 +367,12 @@ def test_compiled_programs_are_kept(tmp_path):
     call("map", "--points", "4", "--out", str(tmp_path / "first"))
     first = kept()
     call("map", "--points", "4", "--out", str(tmp_path / "second"))
-    assert first and kept() == first
+    # What XLA compiles is kept if that takes long enough: now and then one more.
+    assert first and first <= kept()
+    assert {name for name in kept() - first if not name.endswith("-cache")} == set()
     tables = [(tmp_path / folder / "map.csv").read_bytes() for folder in ("first", "second")]
     assert tables[0] == tables[1]
-    assert f"{len(first)} compiled programs" in call("cache")
+    assert f"{len(kept())} compiled programs" in call("cache")
     assert "deleted" in call("cache", "--clear")
     assert not kept()
 
