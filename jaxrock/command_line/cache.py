@@ -4,7 +4,7 @@ import argparse
 import shutil
 
 from jaxrock.command_line.command import Command
-from jaxrock.keeping.folder import folder, kept
+from jaxrock.keeping.folder import OF_JAX, folder, kept
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -18,7 +18,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     files = [file for file in kept() if file.exists()]
     size = sum(file.stat().st_size for file in files) / 2**20
-    programs = sum(file.parent.name != "xla" or file.name.endswith("-cache") for file in files)
+    programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
     if arguments.clear:
         shutil.rmtree(place, ignore_errors=True)
     print(f"{programs} compiled programs, {size:.1f} MiB, {'deleted from' if arguments.clear else 'in'} {place}")

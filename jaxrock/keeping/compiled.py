@@ -4,7 +4,7 @@ import os
 
 import jax
 
-from jaxrock.keeping.folder import LARGEST, folder
+from jaxrock.keeping.folder import LARGEST, OF_JAX, folder
 
 
 def keep_compiled() -> None:
@@ -17,7 +17,7 @@ def keep_compiled() -> None:
     place = folder()
     if place is None or jax.config.jax_compilation_cache_dir:
         return
-    place = place / "xla"
+    place = place / OF_JAX
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError:

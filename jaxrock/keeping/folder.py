@@ -14,6 +14,7 @@ from pathlib import Path
 import platformdirs
 
 LARGEST = 2**30  # bytes
+OF_JAX = "xla"  # the part that JAX looks after (see `compiled`)
 _DIGEST = hashlib.sha256().digest_size
 _PATIENCE = 600  # seconds after which a file that was never finished is nobody's
 
@@ -77,6 +78,8 @@ def prune(largest: int) -> None:
     for path in kept():
         with contextlib.suppress(OSError):  # another process may have been faster
             about = path.stat()
+            if path.parent.name == OF_JAX:
+                continue
             if not path.name.startswith("."):
                 found.append((about.st_mtime, about.st_size, path))
             elif time.time() - about.st_mtime > _PATIENCE:
