@@ -80,6 +80,10 @@ WAYS = {
     "vmap of jit": lambda f: jax.vmap(jax.jit(f))(AT),
     "scan": lambda f: jax.lax.scan(lambda carry, a: (carry, f(a)), 0.0, AT)[1],
     "map": lambda f: jax.lax.map(f, AT),
+    "while": lambda f: jax.lax.while_loop(
+        lambda carry: carry[0] < AT.size, lambda carry: (carry[0] + 1, carry[1].at[carry[0]].set(f(AT[carry[0]]))),
+        (0, jnp.zeros_like(AT)),
+    )[1],
     "cond": lambda f: jnp.stack([jax.lax.cond(a > 0, f, lambda a: a, a) for a in AT]),
     "switch, batched": lambda f: jax.vmap(lambda a: jax.lax.cond(a > 0, f, lambda a: a, a))(AT),
     "shard_map": lambda f: jax.jit(dealt(jax.vmap(f)))(AT),
