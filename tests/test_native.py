@@ -13,6 +13,7 @@ machine = pytest.importorskip("jaxrock.native.machine", reason="needs llvmlite")
 import jaxrock as rk  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
+from jaxrock.transforms.differentiation import differentiable  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
 OTHERS = np.roll(NUMBERS, 5)
@@ -407,3 +408,11 @@ def test_a_place_of_a_lanes_own_list_in_a_refilled_loop():
     for refilled in (False, True):
         found = run(function, [numbers, turns], [False, False], refilled)
         np.testing.assert_allclose(found[1], numbers[:, 3] * turns, rtol=1e-14)
+
+
+def test_an_interface_that_is_not_known_is_left_to_xla(monkeypatch, caplog):
+    monkeypatch.setattr(machine, "is_known", lambda: False)
+    twice = differentiable(lambda x: 2 * x, in_lanes=True)
+    with caplog.at_level(logging.DEBUG, "jaxrock"):
+        np.testing.assert_array_equal(jax.vmap(twice)(jnp.arange(5.0)), 2 * np.arange(5.0))
+    assert "left to XLA: XLA's interface of this version" in caplog.text
