@@ -9,7 +9,6 @@ from jaxtyping import ArrayLike, Bool, Inexact
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.motions.motion import Shaking
-from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import Watch, first_event, meet, step_length
 
 Scalar = Inexact[ArrayLike, ""]
@@ -23,7 +22,7 @@ def wait(
     scene, eps = stepper.scene, jnp.finfo(state.local.dtype).eps
     room = stepper.room(state) / unit
     length = longest_wait(stepper, shaking, room, order, tolerance)
-    never = pick(scene.drives, state.piece) <= scene.threshold
+    never = scene.outlook.is_over(state.piece)
     # How far a step goes changes nothing: it has no derivative.
     room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
     zero = jnp.zeros_like(length)

@@ -11,26 +11,13 @@ from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
+from jaxrock.engines.outlook import Outlook
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[ArrayLike, ""]
-_FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
-
-
-def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array, " n"]:
-    """Largest of the `width` values from each position on (width a power of two; zeros beyond the end)."""
-    reach = 1
-    while reach < width:
-        values = jnp.maximum(values, jnp.pad(values[reach:], (0, min(reach, values.size))))
-        reach *= 2
-    return values
-
-
-def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
-    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
-    return jax.lax.associative_scan(jnp.maximum, values, reverse=True)
+_MANY = 32  # pieces, from which on there may be room for more
 
 
 def peak_bound(motion: AbstractMotion) -> Scalar:
@@ -47,6 +34,12 @@ def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
 
 def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> Scalar:
     return moments.threshold if far is None else jnp.minimum(moments.threshold, far.threshold)
+
+
+def _endless(values: Inexact[Array, " pieces"], count: Int[Array, ""] | None) -> Inexact[Array, " knots"]:
+    """Values of pieces, and infinity for what comes after the last."""
+    values = jnp.concatenate([values, jnp.full(1, jnp.inf, values.dtype)])
+    return values if count is None else jnp.where(jnp.arange(values.size) < count, values, jnp.inf)
 
 
 def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
@@ -71,11 +64,8 @@ class Scene(eqx.Module):
     knots: Inexact[Array, " knots"]
     lengths: Inexact[Array, " knots"]
     scales: Inexact[Array, " knots"]
-    ceilings: Inexact[Array, " knots"]  # bound of |acceleration| from each piece to the end [g]
-    vertical_ceilings: Inexact[Array, " knots"] | None  # the same of the vertical acceleration
-    drives: Inexact[Array, " knots"]  # bound of what acts against the threshold, to the end [g]
-    quiet_near: Inexact[Array, " knots"]  # the same over the next pieces
-    quiet_far: Inexact[Array, " knots"]
+    count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
+    outlook: Outlook
     falls_flat: bool = eqx.field(static=True)
 
     @classmethod
@@ -84,23 +74,18 @@ class Scene(eqx.Module):
         check_single(block=block, motion=motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
         block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
-        knots, bounds, scales = motion.knots, motion.bounds, motion.scales
-        infinity = jnp.full(1, jnp.inf, dtype)
-        bounds, vertical = jnp.pad(bounds, (0, 1)), motion.vertical_bounds
-        if vertical is not None and not model.feels_weight:
+        knots, envelope = motion.knots, motion.envelope
+        count = jnp.sum(knots < knots[-1], dtype=jnp.int32) if knots.size > _MANY else None
+        if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
             )
-        skips = bounds.size > _NEAR
         moments, far = _moments(block, model)
         if isinstance(block, Block):
             p, alpha, corners = block.p, block.alpha, (block.corners, block.corners)
         else:
             p, alpha, corners = block.p1, jnp.minimum(block.alpha1, block.alpha2), block.corners
         reset, far_reset = (Reset.of(block.law, each, p) for each in corners)
-        # At rest while |u| < threshold (1 + v), so at least while |u| + threshold |v| < threshold.
-        threshold = _least_threshold(moments, far)
-        drive = bounds if vertical is None else bounds + threshold * jnp.pad(vertical, (0, 1))
         return cls(
             moments=moments,
             far=far,
@@ -110,20 +95,22 @@ class Scene(eqx.Module):
             far_reset=far_reset,
             motion=motion,
             knots=knots,
-            lengths=jnp.concatenate([jnp.diff(knots), infinity]),
-            scales=jnp.concatenate([scales, infinity]),
-            ceilings=_running_maximum(bounds),
-            vertical_ceilings=None if vertical is None else _running_maximum(jnp.pad(vertical, (0, 1))),
-            drives=_running_maximum(drive),
-            quiet_near=_sliding_maximum(drive, _NEAR) if skips else drive,
-            quiet_far=_sliding_maximum(drive, _FAR) if skips else drive,
+            lengths=_endless(jnp.diff(knots), count),
+            scales=_endless(motion.scales, count),
+            count=count,
+            outlook=Outlook.of(envelope, _least_threshold(moments, far)),
             falls_flat=model.falls_flat,
         )
 
     @property
-    def pieces(self) -> int:
-        """Number of smooth pieces of the motion."""
+    def most_pieces(self) -> int:
+        """For how many pieces there is room."""
         return self.knots.size - 1
+
+    @property
+    def pieces(self) -> Int[ArrayLike, ""]:
+        """Number of smooth pieces of the motion."""
+        return self.most_pieces if self.count is None else self.count
 
     def on(self, side: Scalar) -> "Scene":
         """The scene as a block on this side sees it; at rest as on side +1."""
@@ -169,18 +156,9 @@ class Scene(eqx.Module):
             found.append((drive, moments.threshold))
         return found
 
-    def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:
-        """The forcing [g] and weight still to come that do most for a block past its saddle."""
-        weight = None if self.vertical_ceilings is None else 1 - pick(self.vertical_ceilings, piece)
-        return pick(self.ceilings, piece), weight
-
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
         """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
-        if self.pieces < _NEAR:
-            return piece
-        threshold = self.threshold
-        far, near = self.quiet_far[piece] < threshold, self.quiet_near[piece] < threshold
-        return jnp.minimum(piece + jnp.where(far, _FAR, jnp.where(near, _NEAR, 0)), self.pieces)
+        return jnp.minimum(self.outlook.after_quiet(piece), self.pieces)
 
     def shaking(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[Shaking, Scalar]:
         """Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""

@@ -57,11 +57,11 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     pull = moments.restoring(Angle.of(opening))
     stillness = (moments.stiffness * outward**2 + pull**2) / moments.restoring_at_rest**2
     # A block that the motion cannot lift stays as far from overturning as the motion from lifting it.
-    unlifted = jnp.maximum(2 - scene.drives[0] / scene.threshold, 1)
+    unlifted = jnp.maximum(2 - scene.outlook.strongest_drive / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
     finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
     # A block whose threshold is not a number would seem to stand for ever.
-    finite = finite & ~jnp.isnan(scene.threshold + scene.p + scene.drives[0] + scene.knots[-1])
+    finite = finite & ~jnp.isnan(scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1])
     return State(
         piece=count,
         local=zero,

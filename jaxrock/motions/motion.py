@@ -58,6 +58,34 @@ class Shaking(NamedTuple):
         return bound(self.horizontal), None if self.vertical is None else bound(self.vertical)
 
 
+class Bounds(NamedTuple):
+    """Upper bounds of a component's absolute acceleration within each piece [g], times `gain` where there is one: what
+    only scales a motion leaves the array to all scales alike."""
+
+    values: Inexact[Array, " pieces"]
+    gain: Scalar | None = None
+
+    def scaled(self, factor: Scalar) -> "Bounds":
+        """Those of a motion that is so many times as strong."""
+        factor = jnp.abs(factor)
+        return Bounds(self.values, factor if self.gain is None else factor * self.gain)
+
+    def times_gain(self, values: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        """Some of the values, or what was made of them, as bounds."""
+        return values if self.gain is None else self.gain * values
+
+
+class Envelope(NamedTuple):
+    """Bounds of the horizontal acceleration, and of the vertical one if there is any."""
+
+    horizontal: Bounds
+    vertical: Bounds | None
+
+    def each(self, function) -> "Envelope":
+        """The same with the bounds that a function makes of those of each component."""
+        return Envelope(function(self.horizontal), None if self.vertical is None else function(self.vertical))
+
+
 class AbstractMotion(eqx.Module):
     """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
@@ -92,6 +120,12 @@ class AbstractMotion(eqx.Module):
     def vertical_series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         """As `series`, of the vertical acceleration, positive upward [g]."""
         return None
+
+    @property
+    def envelope(self) -> Envelope:
+        """The bounds of both components."""
+        vertical = self.vertical_bounds
+        return Envelope(Bounds(self.bounds), None if vertical is None else Bounds(vertical))
 
     @property
     def end(self) -> Scalar:
@@ -145,7 +179,26 @@ class AbstractMotion(eqx.Module):
     __array_ufunc__ = None  # an array of NumPy times a motion is a motion, and not an array of motions
 
 
-class Scaled(AbstractMotion):
+class _Changed(AbstractMotion):
+    """A motion made of others, which tells its `envelope`."""
+
+    @property
+    @abc.abstractmethod
+    def envelope(self) -> Envelope:
+        """The bounds of both components."""
+
+    @property
+    def bounds(self):
+        horizontal = self.envelope.horizontal
+        return horizontal.times_gain(horizontal.values)
+
+    @property
+    def vertical_bounds(self):
+        vertical = self.envelope.vertical
+        return None if vertical is None else vertical.times_gain(vertical.values)
+
+
+class Scaled(_Changed):
     """A motion times a factor (`factor * motion`)."""
 
     motion: AbstractMotion
@@ -164,23 +217,18 @@ class Scaled(AbstractMotion):
         return self.motion.scales
 
     @property
-    def bounds(self):
-        return jnp.abs(self.factor) * self.motion.bounds
+    def envelope(self):
+        return self.motion.envelope.each(lambda bounds: bounds.scaled(self.factor))
 
     def series(self, piece, local, unit, order):
         return [self.factor * u for u in self.motion.series(piece, local, unit, order)]
-
-    @property
-    def vertical_bounds(self):
-        bounds = self.motion.vertical_bounds
-        return None if bounds is None else jnp.abs(self.factor) * bounds
 
     def vertical_series(self, piece, local, unit, order):
         terms = self.motion.vertical_series(piece, local, unit, order)
         return None if terms is None else [self.factor * v for v in terms]
 
 
-class Shifted(AbstractMotion):
+class Shifted(_Changed):
     """A motion after `delay` seconds of quiet (`motion.shifted(delay)`)."""
 
     motion: AbstractMotion
@@ -201,17 +249,11 @@ class Shifted(AbstractMotion):
         return jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
 
     @property
-    def bounds(self):
-        return self._after_quiet(self.motion.bounds)
+    def envelope(self):
+        def after_quiet(bounds):
+            return bounds._replace(values=jnp.concatenate([jnp.zeros_like(bounds.values[:1]), bounds.values]))
 
-    @property
-    def vertical_bounds(self):
-        bounds = self.motion.vertical_bounds
-        return None if bounds is None else self._after_quiet(bounds)
-
-    @staticmethod
-    def _after_quiet(bounds):
-        return jnp.concatenate([jnp.zeros_like(bounds[:1]), bounds])
+        return self.motion.envelope.each(after_quiet)
 
     def series(self, piece, local, unit, order):
         inner = self.motion.series(jnp.maximum(piece - 1, 0), local, unit, order)
@@ -240,6 +282,10 @@ class _Pieces(NamedTuple):
         """Values of the motion's pieces for the finer ones; `quiet` where it does not move."""
         piece, moving = self.inside((self.knots[:-1] + self.knots[1:]) / 2)
         return jnp.where(moving, values[piece], quiet)
+
+    def spread_bounds(self, bounds: Bounds) -> Bounds:
+        """Bounds of the motion's pieces for the finer ones."""
+        return bounds._replace(values=self.spread(bounds.values, 0.0))
 
     def series(self, series, piece, local, unit, order) -> list[Scalar] | None:
         """What `series`, the motion's horizontal or vertical one, gives in a finer piece."""
@@ -294,7 +340,7 @@ class Summed(AbstractMotion):
         )
 
 
-class WithVertical(AbstractMotion):
+class WithVertical(_Changed):
     """A horizontal motion together with a vertical one (`horizontal.with_vertical(vertical)`).
 
     **Arguments:**
@@ -322,15 +368,12 @@ class WithVertical(AbstractMotion):
         return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
 
     @property
-    def bounds(self):
-        return self._parts[0].spread(self.horizontal.bounds, 0.0)
+    def envelope(self):
+        pairs = zip(self._parts, (self.horizontal, self.vertical))
+        return Envelope(*(part.spread_bounds(motion.envelope.horizontal) for part, motion in pairs))
 
     def series(self, piece, local, unit, order):
         return self._parts[0].series(self.horizontal.series, piece, local, unit, order)
-
-    @property
-    def vertical_bounds(self):
-        return self._parts[1].spread(self.vertical.bounds, 0.0)
 
     def vertical_series(self, piece, local, unit, order):
         return self._parts[1].series(self.vertical.series, piece, local, unit, order)

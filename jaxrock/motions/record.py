@@ -1,16 +1,49 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
+import functools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Values, finite, positive
+from jaxrock._checks import Values, finite, not_negative, positive
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion
 
+_SHORT = 64  # samples of a record that is a program of its own
 
-class Record(AbstractMotion):
+
+class _Straight(AbstractMotion):
+    """Straight lines between samples."""
+
+    samples: eqx.AbstractVar[Inexact[Array, "*batch n"]]
+    dt: eqx.AbstractVar[Inexact[Array, "..."]]
+
+    @property
+    def _ends(self) -> tuple[Inexact[Array, " pieces"], Inexact[Array, " pieces"]]:
+        """Acceleration at both ends of each piece [g]."""
+        if self.samples.shape[-1] == 1:
+            return self.samples, self.samples
+        return self.samples[:-1], self.samples[1:]
+
+    @property
+    def scales(self) -> Inexact[Array, " pieces"]:
+        return jnp.full_like(self._ends[0], jnp.inf)
+
+    @property
+    def bounds(self) -> Inexact[Array, " pieces"]:
+        left, right = self._ends
+        return jnp.maximum(jnp.abs(left), jnp.abs(right))
+
+    def series(self, piece, local, unit, order):
+        left, right = self._ends
+        slope = (right[piece] - left[piece]) / self.dt
+        return [left[piece] + slope * local, slope * unit][: order + 1]
+
+
+class Record(_Straight):
     """An accelerogram: straight lines between equally spaced samples.
 
     **Arguments:**
@@ -48,23 +81,36 @@ class Record(AbstractMotion):
             return jnp.zeros(2, self.samples.dtype)
         return self.dt * jnp.arange(self.samples.shape[-1])
 
-    @property
-    def _ends(self) -> tuple[Inexact[Array, " pieces"], Inexact[Array, " pieces"]]:
-        """Acceleration at both ends of each piece [g]."""
-        if self.samples.shape[-1] == 1:
-            return self.samples, self.samples
-        return self.samples[:-1], self.samples[1:]
+
+class _Padded(_Straight):
+    """A record with room for more samples, which are zero and at its end."""
+
+    samples: Inexact[Array, "*batch n"] = parameter("g", finite, axes=1)
+    dt: Inexact[Array, "..."] = parameter("s", positive)
+    finish: Inexact[Array, "..."] = parameter("s", not_negative, is_free=False)
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
-        return jnp.full_like(self._ends[0], jnp.inf)
+    def knots(self) -> Inexact[Array, " knots"]:
+        return jnp.minimum(self.dt * jnp.arange(self.samples.shape[-1]), self.finish)
 
-    @property
-    def bounds(self) -> Inexact[Array, " pieces"]:
-        left, right = self._ends
-        return jnp.maximum(jnp.abs(left), jnp.abs(right))
 
-    def series(self, piece, local, unit, order):
-        left, right = self._ends
-        slope = (right[piece] - left[piece]) / self.dt
-        return [left[piece] + slope * local, slope * unit][: order + 1]
+def padded(motion: AbstractMotion) -> AbstractMotion:
+    """The same motion, with room in its records: so that those of many lengths are one program.
+
+    There is room for a quarter more samples at most. Its pieces beyond the end have no length.
+    """
+    return jax.tree.map(_padded, motion, is_leaf=lambda part: type(part) is Record)
+
+
+def _padded(part):
+    if type(part) is not Record or part.samples.shape[-1] <= _SHORT:
+        return part
+    count = part.samples.shape[-1]
+    unit = 1 << (count - 1).bit_length() - 3
+    return _Padded(*_with_room(part.samples, part.dt, -count % unit))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _with_room(samples, dt, more: int):
+    room = [(0, 0)] * (samples.ndim - 1) + [(0, more)]
+    return jnp.pad(samples, room), dt, dt * (samples.shape[-1] - 1)

@@ -16,6 +16,7 @@ from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
@@ -196,7 +197,8 @@ def simulate(
         duration = scalar("duration", duration)
     say_if_single()
     model = current_model(model, block, motion)
-    summary, path = _simulate(block, motion, model, start_of(initial), duration, engine_of(engine, model))
+    engine = engine_of(engine, model)
+    summary, path = _simulate(block, padded(motion), model, start_of(initial), duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     return Response(time, *_evaluate(path, time), summary, path)
 

@@ -18,6 +18,7 @@ from jaxrock.flexible.response import outcome_flexible
 from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status
@@ -104,7 +105,8 @@ def outcome(
             "`simulate`."
         )
     say_if_single()
-    return _outcome(block, motion, current_model(model, block, motion), start_of(initial), engine_of(engine, model))
+    model, engine = current_model(model, block, motion), engine_of(engine, model)
+    return _outcome(block, padded(motion), model, start_of(initial), engine)
 
 
 @jax.jit
@@ -155,7 +157,7 @@ def _passes(rounds: bool) -> Passes:
         begin=begin,
         quickly=follow,
         carefully=_to_the_end,
-        unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.pieces)),
+        unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.most_pieces)),
         conclude=result_of,
         round=POLICY.round if rounds else None,
     )

@@ -137,7 +137,7 @@ class Diffrax(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of solves."""
-        return self.max_solves or POLICY.solves + 4 * scene.pieces
+        return self.max_solves or POLICY.solves + 4 * scene.most_pieces
 
     def loop(self, unfinished, step, carry, budget: int):
         """A loop that goes with the adjoint."""

@@ -100,7 +100,7 @@ class Arc(eqx.Module):
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
         state = start.side, start.opening, start.velocity
-        arc = cls(scene.moments, forcing, *state, zero, zero, zero, scene.most_helpful(start.piece), no, flat)
+        arc = cls(scene.moments, forcing, *state, zero, zero, zero, scene.outlook.most_helpful(start.piece), no, flat)
         y = jnp.stack([start.opening, start.velocity])
         acceleration, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.

@@ -82,7 +82,7 @@ class Series(AbstractEngine):
             scene=scene,
             stop=stop,
             engine=self,
-            order=self.order or (POLICY.record_order if POLICY.is_record(scene.pieces) else POLICY.pulse_order),
+            order=self.order or (POLICY.record_order if POLICY.is_record(scene.most_pieces) else POLICY.pulse_order),
             tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
             history=history,
             taped=taped,
@@ -90,7 +90,7 @@ class Series(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of steps."""
-        return self.max_steps or (POLICY.history_steps + 2 * scene.pieces if history else POLICY.outcome_steps)
+        return self.max_steps or (POLICY.history_steps + 2 * scene.most_pieces if history else POLICY.outcome_steps)
 
     @property
     def in_lanes(self) -> bool:

@@ -22,7 +22,6 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, step_length, tangent
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
@@ -321,7 +320,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     full = full & ~meets & ~lifts
     piece, local, over = stepper.move_on(state, elapsed, full)
     piece = jnp.where(full & ~over, scene.after_quiet(piece), piece)
-    never = pick(scene.drives, state.piece) <= scene.threshold
+    never = scene.outlook.is_over(state.piece)
     unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & (last > 1e-7 * x)))
     rested = replace(
         state,
@@ -353,8 +352,7 @@ def most_steps(pieces: int) -> int:
 
 def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
     """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
-    pieces = stepper.scene.pieces
-    limit = jnp.minimum(limit, most_steps(pieces))
+    limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
 
     def until(condition, step):
         return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
@@ -362,7 +360,7 @@ def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> S
     def resting(state):
         return state.side == 0
 
-    if POLICY.is_record(pieces):
+    if POLICY.is_record(stepper.scene.most_pieces):
         # Among many lanes under a record some rest at any time: each takes the step it needs.
         def step(s):
             return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))

@@ -1,0 +1,110 @@
+"""What the ground may still do: bounds of all that is to come, from each piece of a motion on."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+
+from jaxrock.motions.motion import Bounds, Envelope
+from jaxrock.numerics.lookup import pick
+
+Scalar = Inexact[ArrayLike, ""]
+_FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
+
+
+class _Ahead(eqx.Module):
+    """Bounds of one component from each piece to the end, and over the next pieces [g].
+
+    Scenes that differ by a scale of their motion share the arrays.
+    """
+
+    bounds: Bounds
+    to_end: Inexact[Array, " knots"]
+    near: Inexact[Array, " knots"]
+    far: Inexact[Array, " knots"]
+
+    @classmethod
+    def of(cls, bounds: Bounds) -> "_Ahead":
+        """Of a component; no derivatives."""
+        values = jax.lax.stop_gradient(jnp.pad(bounds.values, (0, 1)))
+        if values.size <= _NEAR:
+            return cls(bounds, _running_maximum(values), values, values)
+        return cls(bounds, _running_maximum(values), *(_sliding_maximum(values, width) for width in (_NEAR, _FAR)))
+
+    def at(self, values: Inexact[Array, " knots"], piece: Int[ArrayLike, ""]) -> Scalar:
+        """One of these bounds."""
+        return self.bounds.times_gain(pick(values, piece))
+
+
+class Outlook(eqx.Module):
+    """What each component of the ground may still do, and whether that lifts a block that rests while
+    |u| < threshold (1 + v)."""
+
+    horizontal: _Ahead
+    vertical: _Ahead | None
+    threshold: Scalar
+
+    @classmethod
+    def of(cls, envelope: Envelope, threshold: Scalar) -> "Outlook":
+        """The outlook at the start."""
+        return cls(*envelope.each(_Ahead.of), threshold)
+
+    @property
+    def strongest_drive(self) -> Scalar:
+        """Bound of what ever acts against the threshold [g], with its derivatives."""
+        horizontal = self.horizontal.bounds
+        if self.vertical is None:
+            return horizontal.times_gain(jnp.max(horizontal.values))
+        vertical = self.vertical.bounds
+        weight = self.threshold * vertical.times_gain(vertical.values)
+        return jnp.max(horizontal.times_gain(horizontal.values) + weight)
+
+    def _drive(self, piece: Int[ArrayLike, ""], which: str) -> Scalar:
+        """Bound of what acts against the threshold [g]; for what is at rest while |u| + threshold |v| < threshold."""
+        drive = self.horizontal.at(getattr(self.horizontal, which), piece)
+        if self.vertical is None:
+            return drive
+        return drive + self.threshold * self.vertical.at(getattr(self.vertical, which), piece)
+
+    def is_over(self, piece: Int[ArrayLike, ""]) -> Bool[Array, ""]:
+        """Whether nothing from a piece on lifts a block at rest."""
+        return self._drive(piece, "to_end") <= self.threshold
+
+    def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
+        """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
+        if self.horizontal.near.size <= _NEAR:
+            return piece
+        far, near = (self._drive(piece, which) < self.threshold for which in ("far", "near"))
+        return piece + jnp.where(far, _FAR, jnp.where(near, _NEAR, 0))
+
+    def most_helpful(self, piece: Int[ArrayLike, ""]) -> tuple[Scalar, Scalar | None]:
+        """The forcing [g] and weight still to come that do most for a block past its saddle."""
+        most, vertical = self.horizontal.at(self.horizontal.to_end, piece), self.vertical
+        return most, None if vertical is None else 1 - vertical.at(vertical.to_end, piece)
+
+
+def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array, " n"]:
+    """Largest of the `width` values from each position on (width a power of two; zeros beyond the end)."""
+    return _doubled(values, width.bit_length() - 1)
+
+
+def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
+    return _doubled(values, (values.size - 1).bit_length())
+
+
+def _doubled(values: Inexact[Array, " n"], times: int) -> Inexact[Array, " n"]:
+    """Largest of the 2^times values from each position on (zeros beyond the end; none is negative).
+
+    A loop for many: unrolled, or as a scan of JAX, it takes XLA longer to compile than all else around a scene.
+    """
+
+    def wider(values, reach):
+        beyond = jnp.concatenate([values, jnp.zeros_like(values)])
+        return jnp.maximum(values, jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size))
+
+    if values.size <= _NEAR:
+        for k in range(times):
+            values = jnp.maximum(values, jnp.pad(values[1 << k :], (0, min(1 << k, values.size))))
+        return values
+    return jax.lax.fori_loop(0, times, lambda k, values: wider(values, 1 << k), values)

@@ -1,0 +1,58 @@
+"""Records of many lengths are one program, and many scales of a record share its arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.responses.outcome import _outcome
+
+
+class Unpadded(rk.Record):
+    """A record that the engines take as it is."""
+
+
+@pytest.mark.parametrize("count", [65, 128, 300])
+def test_room_for_more_samples_changes_nothing(count):
+    """A record gets room for more samples, so that one program serves many lengths: results are those without."""
+    samples, block = 1.5 * np.asarray(rk.example_record().samples)[380 : 380 + count], rk.Block(0.15, 3.0)
+    kinds = rk.Record, Unpadded
+    for found, expected in zip(*(jax.tree.leaves(rk.outcome(block, kind(samples, 0.01))) for kind in kinds)):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-15)
+    histories = [rk.simulate(block, kind(samples, 0.01), samples=101) for kind in kinds]
+    np.testing.assert_allclose(*(history.time for history in histories), rtol=1e-15)
+    np.testing.assert_allclose(*(history.rotation for history in histories), atol=1e-12)
+
+
+def test_derivatives_by_the_time_step_with_room():
+    """The record's end moves with its time step, too."""
+    samples, block = 1.5 * np.asarray(rk.example_record().samples)[380:510], rk.Block(0.15, 3.0)
+    found, expected = (
+        jax.grad(lambda dt: rk.outcome(block, kind(samples, dt)).margin)(0.01) for kind in (rk.Record, Unpadded)
+    )
+    assert abs(expected) > 1
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_records_of_many_lengths_are_one_program():
+    samples, block = np.asarray(rk.example_record().samples), rk.Block(0.2, 2.0)
+    rk.outcome(block, rk.Record(samples[:1790], 0.01))
+    before = _outcome._cache_size()
+    for count in (1537, 1600, 1792):
+        rk.outcome(block, rk.Record(samples[:count], 0.01))
+    assert _outcome._cache_size() == before
+
+
+@pytest.mark.parametrize("vertical", [False, True])
+def test_scales_of_a_record_share_its_arrays(vertical):
+    """No lane keeps arrays of its own as long as the record; what acts against the threshold is one for a moment."""
+    record, block = rk.example_record(), rk.Block(0.2, 2.0)
+
+    def margin(scale):
+        motion = scale * record
+        return rk.outcome(block, motion.with_vertical(0.3 * record) if vertical else motion).margin
+
+    scales = jnp.linspace(0.5, 2.0, 200)
+    memory = jax.jit(jax.vmap(margin)).lower(scales).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < (500 if vertical else 40) * record.samples.nbytes
