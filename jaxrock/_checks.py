@@ -3,7 +3,6 @@
 import contextlib
 import contextvars
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -149,20 +148,3 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
         words = ", ".join(repr(word) for word in allowed)
         raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
     return value
-
-
-def elementwise(**checks: Callable) -> Callable:
-    """Decorate a function of arrays that broadcast: its arguments are checked, by name, and it is compiled."""
-
-    def decorate(function: Callable) -> Callable:
-        signature = inspect.signature(function)
-        compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
-
-        @functools.wraps(function)
-        def checked_and_compiled(*args, **kwargs):
-            given = signature.bind(*args, **kwargs).arguments
-            return compiled(*(checks[name](name, value) for name, value in given.items()))
-
-        return checked_and_compiled
-
-    return decorate

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import checked, elementwise, positive, share
+from jaxrock._checks import checked, positive, share
 from jaxrock.closed_form import _sine_arcs as arcs
 from jaxrock.numerics.roots import bracketed_root
+from jaxrock.transforms.elementwise import elementwise
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]

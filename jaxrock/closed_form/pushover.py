@@ -6,7 +6,8 @@ And what holds the column on a spring that stands for it, and what overturns tha
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, checked, elementwise, finite, one_of, share
+from jaxrock._checks import acute, checked, finite, one_of, share
+from jaxrock.transforms.elementwise import elementwise
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]

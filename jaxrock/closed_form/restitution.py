@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, elementwise, positive
+from jaxrock._checks import acute, positive
+from jaxrock.transforms.elementwise import elementwise
 
 
 @elementwise(alpha=acute, inertia=positive)

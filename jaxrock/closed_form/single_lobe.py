@@ -16,9 +16,10 @@ import enum
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int
 
-from jaxrock._checks import elementwise, not_nan, positive
+from jaxrock._checks import not_nan, positive
 from jaxrock.numerics.divided_differences import exponential_difference, growth_ratio, logarithm_ratio
 from jaxrock.numerics.roots import bracketed_root
+from jaxrock.transforms.elementwise import elementwise
 
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]

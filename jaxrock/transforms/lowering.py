@@ -12,6 +12,7 @@ import jax
 from jax.interpreters import mlir
 
 from jaxrock._abstract import without_mesh
+from jaxrock._garbage import not_collected
 from jaxrock.keeping import facts, folder
 from jaxrock.transforms.batching import Lanes
 from jaxrock.transforms.recipe import Recipe
@@ -20,6 +21,7 @@ _LOG = logging.getLogger("jaxrock")
 _called = contextvars.ContextVar("called", default=None)  # names of machine code that what is lowered now calls
 
 
+@not_collected()
 def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool):
     """The rule of JAX for the primitive of `scenes`."""
     mesh = getattr(context.module_context.axis_context, "mesh", None)

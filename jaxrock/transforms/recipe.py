@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from jaxrock._garbage import not_collected
 from jaxrock.keeping.folder import name_of
 from jaxrock.transforms.fingerprint import Program
 
@@ -78,7 +79,7 @@ class Recipe:
     def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
         # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
         # takes those that tell of the mesh of a `shard_map`, and those that do not, for different ones.
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        with not_collected(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             return jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)(*self.like)
 
     @property

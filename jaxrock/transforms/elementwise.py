@@ -1,0 +1,63 @@
+"""Functions of arrays, element by element: compiled, and with derivatives that are programs of one element."""
+
+import functools
+import inspect
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from jaxrock.transforms.differentiation import differentiable
+
+
+def elementwise(**checks: Callable) -> Callable:
+    """Decorate a function of arrays that broadcast: its arguments are checked, by name, and it is compiled.
+
+    Its derivatives are those of one element, found as those of a scene are: in another session without tracing.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        signature = inspect.signature(function)
+        compiled = _with_kept_derivatives(function)
+
+        @functools.wraps(function)
+        def checked_and_compiled(*args, **kwargs):
+            given = signature.bind(*args, **kwargs).arguments
+            return compiled(*(checks[name](name, value) for name, value in given.items()))
+
+        return checked_and_compiled
+
+    return decorate
+
+
+def _with_kept_derivatives(function: Callable) -> Callable:
+    compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
+    one = differentiable(lambda values: function(*values), name=f"{function.__module__}.{function.__qualname__}")
+
+    def at_elements(*values):
+        values = jnp.broadcast_arrays(*values)
+        shape = values[0].shape
+        if shape == ():
+            return one(values)
+        found = jax.vmap(lambda *values: one(values))(*(x.ravel() for x in values))
+        return jax.tree.map(lambda x: x.reshape(shape), found)
+
+    @jax.custom_jvp
+    def run(*values):
+        return compiled(*values)
+
+    @functools.partial(jax.jit, static_argnums=2)  # else each of its operations is a program of its own
+    def pushed(values, changes, moves):
+        def of_moving(*moving):
+            rest = iter(moving)
+            return at_elements(*(next(rest) if moved else x for x, moved in zip(values, moves)))
+
+        return jax.jvp(of_moving, [x for x, moved in zip(values, moves) if moved], changes)
+
+    @functools.partial(run.defjvp, symbolic_zeros=True)
+    def _(values, changes):
+        moves = tuple(not isinstance(change, SymbolicZero) for change in changes)
+        return pushed(values, [change for change, moved in zip(changes, moves) if moved], moves)
+
+    return run
