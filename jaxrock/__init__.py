@@ -67,6 +67,7 @@ from jaxrock.inverse.history_fit import (
     fit_history as fit_history,
 )
 from jaxrock.inverse.likelihood import Likelihood as Likelihood
+from jaxrock.inverse.log_density import LogDensity as LogDensity, log_density as log_density
 from jaxrock.inverse.observation_files import read_observations as read_observations
 from jaxrock.inverse.observations import Observations as Observations
 from jaxrock.inverse.posterior import (

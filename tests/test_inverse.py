@@ -146,14 +146,6 @@ def test_slopes_that_were_not_computed_are_refused(what):
         )
 
 
-def test_second_derivatives_are_refused():
-    likelihood = rk.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
-    with pytest.raises(NotImplementedError, match="first derivatives only"):
-        jax.eval_shape(
-            jax.hessian(lambda x: likelihood.log_terms(dict(amplitude=x[0], period=x[1])).sum()), jnp.ones(2)
-        )
-
-
 def truth(seed, scatter=SCATTER):
     """What twelve rocks do under the true motion, with all that scatters."""
     e = np.random.default_rng(seed).normal(size=(3, 12))

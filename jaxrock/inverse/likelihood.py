@@ -43,6 +43,7 @@ from jaxrock.status import Status
 from jaxrock.transforms.user_function import ByIdentity, current_function
 
 Real = Inexact[Array, "..."]
+_Found = tuple[Real, Bool[Array, "..."], Bool[Array, "..."]]  # margin and rotation, overturned, known
 _NO_STRENGTH = 1e-30  # [g]
 _FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
 
@@ -98,9 +99,8 @@ class Likelihood(eqx.Module):
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
         For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
-        [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has first
-        derivatives if `slopes`, and is computed faster without; those of second order raise NotImplementedError (take
-        differences of slopes). Many motions at once take less time than `jax.vmap` of one.
+        [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has derivatives
+        if `slopes`, and is computed faster without. Many motions at once take less time than `jax.vmap` of one.
         """
         return self._terms(*self._possible(values, slopes))
 
@@ -171,22 +171,6 @@ class Likelihood(eqx.Module):
         levels, where = levels_around(seen, self.scatter, strength)
         shape = (*levels.strength.shape[:-1], *seen.ways.shape)
 
-        def one(parameters, level, way, block):
-            def results(parameters):
-                with put_down():  # those of the motion are looked at before, and the rocks are known to be good
-                    motion = self.motion(**dict(zip(names, parameters)))
-                    motion = _of_strength(motion, level, way)
-                    result = outcome(block, motion, self.model, engine=self.engine)
-                rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
-                real = jnp.stack([result.margin, rotation])
-                return real, (real, result.overturned, result.status == Status.successful)
-
-            if not slopes:
-                return None, results(parameters)[1]
-            # The product of a small Jacobian: in reverse it is computed once, with the values.
-            _, back, found = jax.vjp(results, parameters, has_aux=True)
-            return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
-
         def lanes(x):
             return jnp.broadcast_to(x[..., None, :], shape).ravel()
 
@@ -194,10 +178,13 @@ class Likelihood(eqx.Module):
         blocks = jax.tree.map(lanes, seen.blocks_at(levels.alpha, levels.p, levels.restitution))
         ways = jnp.broadcast_to(seen.ways, shape).ravel()
         # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
+        scene = _Scene(self.motion, self.model, self.engine, names)
         fixed, level = jax.lax.stop_gradient((parameters, lanes(levels.strength)))
-        rows, (real, lost, known) = jax.vmap(one)(fixed, level, ways, blocks)
         if slopes:
-            real = _sloping(real, jnp.where(jnp.isfinite(rows), rows, 0.0), parameters)
+            rows, (real, lost, known) = scene.rows(fixed, level, ways, blocks)
+            real = _sloping(real, rows, parameters, scene, level, ways, blocks)
+        else:
+            real, lost, known = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
         margin, rotation, lost, known = (x.reshape(shape) for x in (*real.T, lost, known))
         verge = jnp.broadcast_to((levels.alpha * seen.weaker_alpha / seen.alpha)[..., None, :], shape)
         rotation = jnp.where(known, rotation, 0.0)
@@ -226,22 +213,58 @@ def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> Abstract
     return motion * (way * jnp.exp(logarithm - _log_strength(motion)))
 
 
-@jax.custom_jvp
-def _sloping(values: Real, rows: Real, parameters: Real) -> Real:
-    """Values, (..., results), with the rows of their Jacobian by parameters, (..., results, parameters)."""
+class _Scene(eqx.Module):
+    """What becomes of one rock in one possible scene."""
+
+    motion: Callable[..., AbstractMotion]
+    model: AbstractEquation
+    engine: AbstractEngine | None
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def results(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
+        """Margin and rotation; and these again, whether it overturned, and whether that is known."""
+        with put_down():  # those of the motion are looked at before, and the rocks are known to be good
+            motion = self.motion(**dict(zip(self.names, parameters)))
+            result = outcome(block, _of_strength(motion, level, way), self.model, engine=self.engine)
+        rotation = jnp.where(result.overturned, 0.0, result.max_rotation)
+        real = jnp.stack([result.margin, rotation])
+        return real, (real, result.overturned, result.status == Status.successful)
+
+    def rows(self, parameters: Real, level: Real, way: Real, block) -> tuple[Real, _Found]:
+        """Of many lanes, the rows of the Jacobian by the parameters, with the values; zero where there is none."""
+
+        def one(parameters, *lane):
+            _, back, found = jax.vjp(lambda x: self.results(x, *lane), parameters, has_aux=True)
+            return jnp.stack([back(row)[0] for row in jnp.eye(2)]), found
+
+        rows, found = jax.vmap(one)(parameters, level, way, block)
+        return jnp.where(jnp.isfinite(rows), rows, 0.0), found
+
+
+@eqx.filter_custom_jvp
+def _sloping(values: Real, rows: Real, parameters: Real, *lanes) -> Real:
+    """Values, (lanes, results), with the rows of their Jacobian by parameters, (lanes, results, parameters)."""
     return values
 
 
-@_sloping.defjvp
+@_sloping.def_jvp
 def _(primals, tangents):
-    values, rows, parameters = primals
-    return values, jnp.einsum("...ij,...j->...i", _constant(rows, parameters), tangents[2])
+    _, rows, parameters, *lanes = primals
+    rows = _bending(rows, parameters, *lanes)
+    values = _sloping(*primals)  # the values alone would have no derivatives of higher order
+    return values, jnp.einsum("...ij,...j->...i", rows, tangents[2])
 
 
-@jax.custom_jvp
-def _constant(rows: Real, parameters: Real) -> Real:
-    """Rows that are known at these parameters only."""
+@eqx.filter_custom_jvp
+def _bending(rows: Real, parameters: Real, scene: _Scene, *lanes) -> Real:
+    """Rows, with their derivatives by parameters: only who asks for second derivatives has them computed."""
     return rows
+
+
+@_bending.def_jvp
+def _(primals, tangents):
+    _, parameters, scene, *lanes = primals
+    return _bending(*primals), jax.jvp(lambda x: scene.rows(x, *lanes)[0], (parameters,), (tangents[1],))[1]
 
 
 @jax.custom_jvp
@@ -253,8 +276,3 @@ def _without_slopes(parameters: Real) -> Real:
 @_without_slopes.defjvp
 def _(primals, tangents):
     raise NotImplementedError("This was computed without derivatives: use `log_terms(values)`, which has them.")
-
-
-@_constant.defjvp
-def _(primals, tangents):
-    raise NotImplementedError("A likelihood has first derivatives only: for second ones take differences of slopes.")

@@ -1,0 +1,104 @@
+"""What rocks say about a motion, as a function for optimisers and samplers of any library."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Inexact
+from scipy.stats import qmc
+
+from jaxrock._checks import as_real, whole
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.observations import Observations
+from jaxrock.inverse.unknowns import Problem, Unknown
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+
+Real = Inexact[Array, "..."]
+
+
+class LogDensity(eqx.Module):
+    """Log-density of a motion's unknown parameters, given rocks, over points of the whole real line.
+
+    Coordinate i of a point leads into the range of parameter i: its share of the range (of the range of logarithms, if
+    it is searched in them) is 1/(1 + exp(-x)). Made by `log_density`; a pytree, for `jit`, `vmap` and derivatives of
+    every order.
+    """
+
+    problem: Problem
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters, in the order of coordinates."""
+        return self.problem.names
+
+    def __call__(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
+        """Log-density of points, (..., parameters), with respect to the points themselves, but for a constant: what a
+        sampler takes. Many points at once take less time than `jax.vmap` of one."""
+        return _at_points(self, jnp.asarray(point), True)
+
+    def objective(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
+        """Log-likelihood and log-prior: what `estimate_motion` makes as large as it can. It does not depend on the
+        coordinates."""
+        return _at_points(self, jnp.asarray(point), False)
+
+    def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
+        """Parameters by name, in their units, at points."""
+        return self.problem.values(self._place(jnp.asarray(point)))
+
+    def point(self, values: dict[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
+        """The point of parameters; infinite at the ends of their ranges, not a number outside."""
+        low, high = self.problem.ends.T
+        given = [as_real(name, values[name]) for name in self.names]
+        logs = [unknown.log for unknown in self.problem.unknowns.values()]
+        place = jnp.stack(jnp.broadcast_arrays(*(jnp.log(x) if log else x for x, log in zip(given, logs))), axis=-1)
+        return jnp.log(place - low) - jnp.log(high - place)
+
+    def starts(self, count: int, seed: int = 0) -> Float[Array, "count parameters"]:
+        """So many points, spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
+        whole("count", count, 1)
+        share = jnp.asarray(qmc.Halton(len(self.names), seed=seed).random(count), self.problem.ends.dtype)
+        return jnp.log(share) - jnp.log1p(-share)
+
+    def _place(self, point: Real) -> Real:
+        low, high = self.problem.ends.T
+        return low + (high - low) * jax.nn.sigmoid(point)
+
+
+@eqx.filter_jit
+def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
+    problem = density.problem
+    if point.shape[-1:] != (len(problem.names),):
+        raise ValueError(
+            f"Argument `point` must end with an axis of {len(problem.names)}, but has shape {point.shape}."
+        )
+    value = problem.log_density(density._place(point))
+    volume = jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point)
+    return value + jnp.sum(volume, axis=-1) if by_point else value
+
+
+def log_density(
+    observations: Observations,
+    motion: Callable,
+    unknowns: dict[str, Unknown],
+    scatter: ArrayLike = 0.3,
+    *,
+    lapse: ArrayLike = 0.02,
+    model: AbstractEquation = Housner(),
+    engine: AbstractEngine | None = None,
+) -> LogDensity:
+    """The log-density of a motion's parameters, for any optimiser or sampler: recipes in `docs/inverse.md`.
+
+    **Arguments:** as in `estimate_motion`. `motion` and `model` are taken as they are now.
+
+    **Returns:** a `LogDensity`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    if not unknowns:
+        raise ValueError("Argument `unknowns` must name at least one parameter.")
+    return LogDensity(
+        Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns)).current()
+    )
