@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock.sweeps.grid import shape_of
+from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
