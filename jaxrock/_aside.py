@@ -1,11 +1,13 @@
 """Files and folders that are there whole or not at all: they are written aside, and renamed."""
 
+import concurrent.futures
 import contextlib
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -67,3 +69,23 @@ def _rename(aside: Path, path: Path, replace: bool) -> None:
 
 def _taken(path: Path) -> FileExistsError:
     return FileExistsError(f"{path} was made by somebody else meanwhile.")
+
+
+def uninterrupted(function: Callable, *given: Any, stop: Callable[[BaseException], None] = lambda error: None) -> Any:
+    """Call a function to its end, whoever interrupts: then it is waited for, and what came is raised.
+
+    It runs in a thread of its own, as interrupts come to the main thread. Libraries in C, and those with threads of
+    their own, go on writing after an exception, or cannot close what they were writing.
+
+    **Arguments:**
+
+    - `stop`: called with what came, while the function is still running.
+    """
+    with concurrent.futures.ThreadPoolExecutor(1) as alone:
+        running = alone.submit(function, *given)
+        try:
+            return running.result()
+        except BaseException as error:
+            if not running.done():
+                stop(error)
+            raise

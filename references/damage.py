@@ -15,8 +15,8 @@ import numpy as np
 
 import jaxrock as rk
 
-AXES = {"alpha": np.linspace(0.1, 0.3, 5), "p": np.linspace(1.5, 4.0, 7)}
-BLOCK = 8  # points: five blocks, the last of them smaller
+AXES = {"alpha": np.linspace(0.1, 0.3, 3), "p": np.linspace(1.5, 4.0, 7)}
+BLOCK = 4  # points: six blocks, every other of them smaller
 
 
 def record() -> rk.Record:
@@ -25,12 +25,12 @@ def record() -> rk.Record:
     return rk.Record(0.5 * np.sin(2 * np.pi * time / 0.7) * np.exp(-((time - 2) ** 2)), 0.02)
 
 
-def swept(store: Path | None = None, **options) -> rk.Grid | None:
+def swept(store: Path | None = None, *, axes: dict = AXES, block: int = BLOCK, load: bool = True) -> rk.Grid | None:
     """Outcomes of blocks under a record."""
     motion = record()
     return rk.sweep(
-        lambda alpha, p: rk.outcome(rk.Block(alpha, p), motion), store=store, block=BLOCK, progress=False,
-        **AXES, **options,
+        lambda alpha, p: rk.outcome(rk.Block(alpha, p), motion),
+        store=store, load=load, block=block, progress=False, **axes,
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import jaxrock as rk
 from jaxrock.sweeps.plan import Plan, layout
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.sweep import surface
+from jaxrock.transforms import batching
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.fingerprint import Traced
 
@@ -127,6 +128,13 @@ def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
     monkeypatch.setattr("jaxrock.sweeps.runner.layout", lambda *_: shape)
     x = np.arange(float(points))
     np.testing.assert_array_equal(Runner(lambda x, _: x**2, (x,), (), points)([x])[0], x**2)
+
+
+@pytest.mark.parametrize("points", [1, 64, 65, 100, 128, 129, 5000, 10**6])
+def test_whether_scenes_are_few_is_not_told_by_their_devices(points):
+    """Few of them go without a quick pass, which leaves other last digits."""
+    few = {layout(points, devices, "cpu")[2] <= batching._FEW for devices in (1, 2, 3, 8, 64, 500)}
+    assert few == {points <= batching._FEW}
 
 
 def test_what_fills_a_batch_up_is_one_of_its_points():

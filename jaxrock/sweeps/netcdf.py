@@ -4,11 +4,10 @@ The whole file is verified before HDF5 sees it: the C library may end the proces
 it cannot write.
 """
 
-import concurrent.futures
 import hashlib
 from pathlib import Path
 
-from jaxrock._aside import written_aside
+from jaxrock._aside import uninterrupted, written_aside
 from jaxrock.sweeps.labels import needed
 
 _MARK = b"\njaxrock sha256 "
@@ -24,12 +23,16 @@ class _Patient:
     def __init__(self, file):
         self._file, self.error = file, None
 
+    def stop(self, error: BaseException) -> None:
+        """Let nothing be written any more."""
+        self.error = self.error or error
+
     def _try(self, does, *given):
         if self.error is None:
             try:
                 return does(*given)
             except BaseException as error:
-                self.error = error
+                self.stop(error)
         return None
 
     def _write(self, at: int, data) -> None:
@@ -92,12 +95,10 @@ def write(dataset, path: Path) -> None:
 
     with written_aside(path) as aside, aside.open("w+b", buffering=0) as file:
         patient = _Patient(file)
-        # Interrupts come to the main thread: none of them gets between HDF5 and its file.
-        with concurrent.futures.ThreadPoolExecutor(1) as alone:
-            try:
-                alone.submit(written, patient).result()
-            except BaseException as error:
-                patient.error = patient.error or error
+        try:
+            uninterrupted(written, patient, stop=patient.stop)
+        except BaseException as error:
+            patient.stop(error)
         if patient.error is not None:
             raise patient.error
         file.seek(0)

@@ -1,8 +1,8 @@
 """Long sweeps on disk: a Zarr store of finished blocks, which many processes write, and which outlives them.
 
-A block is finished when its record is there: a checksum for each of its results, written after all of them, in a file
-of its own. Whatever is read is held against it. What a store is made of is told by its description, and every file is
-written aside and renamed.
+A block is finished when its record is there: a checksum for each of its results, and one for these, written after all
+of them in a file of its own. Whatever is read is held against it. What a store is made of is told by its description,
+and every file is written aside and renamed.
 """
 
 import hashlib
@@ -11,11 +11,12 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxrock._aside import written_aside
+from jaxrock._aside import uninterrupted, written_aside
 from jaxrock.sweeps.description import Description, described, digest_of_axis
 from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, needed, shape_of
 from jaxrock.sweeps.plan import Plan
@@ -26,7 +27,7 @@ _MANY = 5  # files that a message names
 _AXIS_CHUNK = 2**20
 
 
-def local(argument: str, path: str | Path) -> Path:
+def local(argument: str, path: Any) -> Path:
     """A path of a file system, or ValueError."""
     told = os.fspath(path) if isinstance(path, (str, os.PathLike)) else path
     if not isinstance(told, str) or not told or "\0" in told:
@@ -100,11 +101,14 @@ class Store:
 
     def write(self, number: int, leaves: list[np.ndarray]) -> None:
         """Write one block: its results, and when all are there, its record."""
+        uninterrupted(self._write, number, leaves)
+
+    def _write(self, number: int, leaves: list[np.ndarray]) -> None:
         place = self._plan.place(number)
         for array, leaf in zip(self._arrays, leaves):
             array[place] = leaf.view(np.int8) if leaf.dtype == bool else leaf
-        digests = [self._digest(number, name, leaf) for name, leaf in zip(self.names, leaves)]
-        self._records[self._index(number)] = np.frombuffer(b"".join(digests), np.uint8).reshape(-1, _DIGEST)
+        told = np.stack([self._digest(number, name, leaf) for name, leaf in zip(self.names, leaves)])
+        self._records[self._index(number)] = np.stack([*told, self._digest(number, RECORDS, told)])
 
     def read(self) -> list[np.ndarray]:
         """All results.
@@ -135,15 +139,15 @@ class Store:
     def _read(self, number: int) -> tuple[list[np.ndarray] | None, list[Path]]:
         """Results of a block, None if they are not there, and its files that are damaged."""
         record = self._part(self._records, self._index(number))
-        if record is None:
-            return None, [self._file(RECORDS, number)]
-        if not record.any():
+        if record is not None and not record.any():
             return None, []
+        if record is None or (record[-1] != self._digest(number, RECORDS, record[:-1])).any():
+            return None, [self._file(RECORDS, number)]
         leaves, damaged = [], []
         for name, array, kind, told in zip(self.names, self._arrays, self._types, record):
             part = self._part(array, self._plan.place(number))
             leaves.append(part if part is None else part.view(kind))
-            if part is None or self._digest(number, name, part) != told.tobytes():
+            if part is None or (self._digest(number, name, part) != told).any():
                 damaged.append(self._file(name, number))
         return None if damaged else leaves, damaged
 
@@ -162,11 +166,11 @@ class Store:
         more = len(self._metadata[name]["shape"]) - len(self._plan.blocks)
         return self.path.joinpath(name, "c", *map(str, (*self._index(number), *(0,) * more)))
 
-    def _digest(self, number: int, name: str, leaf: np.ndarray) -> bytes:
+    def _digest(self, number: int, name: str, leaf: np.ndarray) -> np.ndarray:
         """What a result of a block must be like, in this store and at this place."""
         told = hashlib.sha256(f"{self._description.checksum} {number} {name} ".encode())
         told.update(leaf.tobytes())
-        return told.digest()
+        return np.frombuffer(told.digest(), np.uint8)
 
 
 def listed(files: list[Path]) -> str:
@@ -250,6 +254,10 @@ def create(
     made_by: dict[str, str],
 ) -> Store:
     """Make a store of which no block is done. `leaves`: results by name, as of one point."""
+    return uninterrupted(_create, path, axes, outer, leaves, block, made_by)
+
+
+def _create(path, axes, outer, leaves, block, made_by) -> Store:
     zarr = needed("zarr")
     for name, values in (axes | leaves).items():
         if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):
@@ -277,8 +285,8 @@ def create(
     # Its own chunk for every block: two processes never write the same file.
     blocks = Plan(tuple(axes.values()), outer, block).blocks
     group.create_array(
-        RECORDS, shape=(*blocks, len(leaves), _DIGEST), dtype=np.uint8, fill_value=0,
-        chunks=(*(1,) * len(blocks), len(leaves), _DIGEST),
+        RECORDS, shape=(*blocks, len(leaves) + 1, _DIGEST), dtype=np.uint8, fill_value=0,
+        chunks=(*(1,) * len(blocks), len(leaves) + 1, _DIGEST),
         dimension_names=dimensions((), True, RECORDS, len(blocks) + 2), **usual,
     )  # fmt: skip
     metadata = {name: json.loads((path / name / "zarr.json").read_text()) for name in (*axes, *leaves, RECORDS)}
