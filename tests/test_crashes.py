@@ -4,6 +4,7 @@ import concurrent.futures
 import errno
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -319,6 +320,35 @@ def test_killed_at_random(number, count, block):
     assert found["kills"] >= number and found["stores compared"] > 0
 
 
+SAVING = """
+import itertools, sys
+import numpy as np
+import jaxrock as rk
+grid = rk.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
+for number in itertools.count():
+    for ending in (".nc", ".zarr"):
+        grid.save(f"{sys.argv[1]}/{number}{ending}")
+"""
+
+
+def test_a_killed_save_leaves_all_or_nothing(tmp_path, grid):
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {"JAX_PLATFORMS": "cpu"}
+    root, rng = Path(rk.__file__).parents[1], np.random.default_rng(4)
+    for attempt in range(2):
+        folder = tmp_path / f"{attempt}"
+        folder.mkdir()
+        with subprocess.Popen([sys.executable, "-c", SAVING, folder], env=environment, cwd=root) as process:
+            try:
+                end = time.monotonic() + 100
+                while not (folder / "1.zarr").exists() and time.monotonic() < end:
+                    time.sleep(0.01)
+                time.sleep(0.2 * rng.random())
+            finally:
+                process.kill()
+        there = [path for path in folder.iterdir() if not path.name.endswith(".partial")]
+        assert len(there) >= 4 and all(damage.bits(rk.Grid.load(path)) == damage.bits(grid) for path in there)
+
+
 # Two writers, and threads.
 
 
@@ -478,3 +508,12 @@ def test_a_description_is_told_from_one_that_was_changed(store):
     (store / "zarr.json").write_text(json.dumps(text))
     with pytest.raises(ValueError, match=f"is damaged: {store / 'zarr.json'}"):
         rk.Grid.load(store)
+
+
+def test_the_table_of_promises_names_tests_that_are_there():
+    tests = Path(__file__).parent
+    text = (tests.parent / "docs" / "crashes.md").read_text()
+    named = re.findall(r"`(?:(test_\w+\.py)::)?(test_\w+)`", text)
+    assert len(named) > 25
+    for file, name in named:
+        assert f"def {name}(" in (tests / (file or "test_crashes.py")).read_text(), name
