@@ -36,8 +36,10 @@ def chaotic(alpha, p):
     )
     return {"x": jnp.sin(x), "steps": steps, "above": x > 0.5, "pair": jnp.stack([x, alpha])}
 
+motion = rk.Record(0.4 * np.sin(np.linspace(0, 14, 120)), 0.02)
+
 def outcome(alpha, p):
-    return rk.outcome(rk.Block(alpha, p), rk.SinePulse(0.5, 1.0))
+    return rk.outcome(rk.Block(alpha, p), motion)
 
 store = None if folder == "-" else folder
 if kill >= 0:
@@ -53,7 +55,8 @@ if kill >= 0:
     Store.write = dying
 axes = dict(alpha=np.linspace(0.05, 0.3, 23), p=np.linspace(1.0, 3.9, 31))
 for _ in range(2 if store is None else 1):
-    grid = rk.sweep(globals()[kind], store=store, block=100, progress=False, **axes)
+    # Results of the job that dies stay in the store.
+    grid = rk.sweep(globals()[kind], store=store, block=100, load=kill < 0, progress=False, **axes)
 leaves = {f"a{k}": leaf for k, leaf in enumerate(jax.tree.leaves(grid.values))}
 np.savez(f"{sys.argv[7]}/{own}.npz", resumed=grid.resumed, processes=jax.process_count(), **leaves)
 """
@@ -106,17 +109,32 @@ def test_processes_share_a_sweep(tmp_path, alone, count):
         assert bits(results) == alone
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_a_killed_job_goes_on(tmp_path, alone, count):
+@pytest.mark.parametrize("count, kind", [(2, "outcome"), pytest.param(4, "chaotic", marks=pytest.mark.slow)])
+def test_a_killed_job_goes_on(tmp_path, count, kind):
     """The last process dies in the middle of its second block; started again, the job computes only what is missing."""
     pytest.importorskip("zarr")
+    alone = bits(job(1, "-", tmp_path / "alone", kind)[0])
     store = tmp_path / "a.zarr"
-    job(count, store, tmp_path / "first", kill=1)
-    for results in job(count, store, tmp_path / "second"):
+    job(count, store, tmp_path / "first", kind, kill=1)
+    for results in job(count, store, tmp_path / "second", kind):
         assert bits(results) == alone
         assert 0 < int(results["resumed"]) < 23 * 31
-    for results in job(1, store, tmp_path / "third"):
+    for results in job(1, store, tmp_path / "third", kind):
         assert bits(results) == alone and int(results["resumed"]) == 23 * 31
+
+
+def test_a_job_verifies_its_store_together(tmp_path, alone):
+    """Each process looks at some of the blocks; all hear which are damaged, and the first names them."""
+    pytest.importorskip("zarr")
+    store = tmp_path / "a.zarr"
+    job(1, store, tmp_path / "first")
+    for number in (0, 1, 4):
+        (store / "x" / "c" / str(number) / "0").unlink()
+    for own, results in enumerate(job(2, store, tmp_path / "second")):
+        assert bits(results) == alone
+        said = (tmp_path / "second" / f"{own}.log").read_text()
+        assert all((str(store / "x" / "c" / f"{number}" / "0") in said) == (own == 0) for number in (0, 1, 4))
+        assert int(results["resumed"]) == 23 * 31 - 3 * 93
 
 
 @pytest.mark.slow

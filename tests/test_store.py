@@ -54,12 +54,12 @@ def written(monkeypatch):
     """The blocks that are written, and at which to die: between its first array and its second."""
     blocks, write, kill_at = [], Store.write, []
 
-    def noting(self, place, leaves):
+    def noting(self, number, leaves):
         if len(blocks) in kill_at:
             kill_at.clear()
             self._arrays[1] = Deadly()
-        write(self, place, leaves)
-        blocks.append(tuple(part.start for part in place))
+        write(self, number, leaves)
+        blocks.append(number)
 
     monkeypatch.setattr(Store, "write", noting)
     return blocks, kill_at

@@ -285,3 +285,47 @@ def test_figures_come_when_they_are_asked_for():
 def test_unknown_names_raise():
     with pytest.raises(AttributeError, match="module 'jaxrock' has no attribute 'rock'"):
         jaxrock.rock  # noqa: B018
+
+
+# What a module holds and changes while the program runs: every thread sees it. Why that is safe:
+SHARED = {
+    "native.machine._registered": "under a lock",
+    "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
+    "sweeps.grid._examples": "changed at import only",
+    "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",
+}
+CHANGES = {"add", "append", "clear", "discard", "extend", "insert", "pop", "popitem", "remove", "setdefault", "update"}
+
+
+def changed_within_functions(tree: ast.Module) -> set[str]:
+    """Names of a module whose values its functions change or take the next of; or which they give another value."""
+    own = {
+        name.id
+        for node in tree.body
+        if isinstance(node, (ast.Assign, ast.AnnAssign))
+        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+        for name in ast.walk(target)
+        if isinstance(name, ast.Name)
+    }
+    found = set()
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        local = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and type(node.ctx) is ast.Store}
+        for node in ast.walk(function):
+            if isinstance(node, ast.Global):
+                found |= set(node.names)
+            part = None
+            if isinstance(node, (ast.Subscript, ast.Attribute)) and not isinstance(node.ctx, ast.Load):
+                part = node.value
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CHANGES:
+                part = node.func.value
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "next" and node.args:
+                part = node.args[0]
+            if isinstance(part, ast.Name) and part.id in own - local:
+                found.add(part.id)
+    return found
+
+
+def test_what_threads_share_is_known():
+    """Nothing else at the level of a module changes; `functools.cache` is safe, and what is there once has a lock."""
+    found = {f"{name}.{each}" for name, tree in TREES.items() for each in changed_within_functions(tree)}
+    assert found == set(SHARED)

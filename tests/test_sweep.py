@@ -14,6 +14,7 @@ import jaxrock as rk
 from jaxrock.sweeps.plan import Plan, layout
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.sweep import surface
+from jaxrock.transforms import batching
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.fingerprint import Traced
 
@@ -129,6 +130,13 @@ def test_a_gpu_takes_all_lanes_at_once(monkeypatch, points, lanes):
     np.testing.assert_array_equal(Runner(lambda x, _: x**2, (x,), (), points)([x])[0], x**2)
 
 
+@pytest.mark.parametrize("points", [1, 64, 65, 100, 128, 129, 5000, 10**6])
+def test_whether_scenes_are_few_is_not_told_by_their_devices(points):
+    """Few of them go without a quick pass, which leaves other last digits."""
+    few = {layout(points, devices, "cpu")[2] <= batching._FEW for devices in (1, 2, 3, 8, 64, 500)}
+    assert few == {points <= batching._FEW}
+
+
 def test_what_fills_a_batch_up_is_one_of_its_points():
     """Any other point might take for ever."""
     runner, seen = Runner(lambda x, _: x, (np.ones(1),), (), 0), []
@@ -147,7 +155,7 @@ def test_what_fills_a_batch_up_is_one_of_its_points():
         ({"alpha": [[0.1]]}, "`alpha` must be a list"),
         ({"alpha": ["a"]}, "`alpha` must be a list .* type <U1"),
         ({"alpha": [0.1], "p": [1.0, 2.0], "outer": False}, "one length, but alpha has 1, p has 2"),
-        ({"alpha": [0.1], "p": [1.0], "block": 0}, "`block` must be at least 1, but is 0"),
+        ({"alpha": [0.1], "p": [1.0], "block": 0}, "`block` must be a whole number, at least 1, but is 0"),
         ({"alpha": [0.1], "p": [1.0], "load": False}, "`load` must be True"),
         ({"sum": [0.1]}, "other names than the axes"),
     ],

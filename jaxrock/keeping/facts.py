@@ -49,23 +49,30 @@ _AT_IMPORT = _files()
 
 
 @functools.cache
-def versions() -> str:
-    """Digest of the package's own code, the versions of what it stands on, and the kind of this machine.
-
-    Where the code on disk is not what this process has imported, it is something that is never asked for again.
-    """
+def code() -> str:
+    """Digest of the package's own code; where the code on disk is not what this process has imported, something that is
+    never asked for again."""
     if _files() != _AT_IMPORT:
         return uuid.uuid4().hex
-    told = [platform.machine(), platform.system(), platform.python_version()]
-    for name in _VERSIONS:
-        try:
-            told.append(f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:
-            told.append(f"no {name}")
     root = Path(__file__).parents[1]
-    for path, *_ in _AT_IMPORT:
-        told.append(f"{path.relative_to(root)} {hashlib.sha256(path.read_bytes()).hexdigest()}")
-    return name_of(*told)
+    return name_of(
+        *(f"{path.relative_to(root)} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path, *_ in _AT_IMPORT)
+    )
+
+
+def version_of(name: str) -> str:
+    """The version of a distribution, or that there is none."""
+    try:
+        return f"{name} {importlib.metadata.version(name)}"
+    except importlib.metadata.PackageNotFoundError:
+        return f"no {name}"
+
+
+@functools.cache
+def versions() -> str:
+    """Digest of the package's own code, the versions of what it stands on, and the kind of this machine."""
+    kind = (platform.machine(), platform.system(), platform.python_version())
+    return name_of(*kind, *map(version_of, _VERSIONS), code())
 
 
 def settings() -> str:

@@ -7,11 +7,12 @@ folder has grown too large, what has not been used for longest goes first.
 import contextlib
 import hashlib
 import os
-import tempfile
 import time
 from pathlib import Path
 
 import platformdirs
+
+from jaxrock._aside import written_aside
 
 LARGEST = 2**30  # bytes
 OF_JAX = "xla"  # the part that JAX looks after (see `compiled`)
@@ -56,17 +57,11 @@ def write(kind: str, name: str, content: bytes) -> None:
     place = folder()
     if place is None:
         return
-    aside = None
     try:
         (place / kind).mkdir(parents=True, exist_ok=True)
-        handle, aside = tempfile.mkstemp(prefix=".", dir=place / kind)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(content).digest() + content)
-        os.replace(aside, place / kind / name)
+        with written_aside(place / kind / name, replace=True, lasting=False) as aside:
+            aside.write_bytes(hashlib.sha256(content).digest() + content)
     except OSError:
-        if aside is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(aside)
         return
     with contextlib.suppress(OSError):  # somebody may be deleting all of it
         prune(LARGEST)

@@ -1,9 +1,11 @@
 """The devices a surface is spread over: CPU cores or GPUs of this process, and the other processes of a job."""
 
+import contextlib
 import functools
 import itertools
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 
 import jax
 import numpy as np
@@ -79,6 +81,24 @@ def process() -> tuple[int, int]:
 
 
 _meetings = itertools.count()
+_sharing = threading.RLock()
+
+
+@contextlib.contextmanager
+def shared_out() -> Iterator[None]:
+    """What many processes share: one at a time in each of them, as they meet by the order of what they share.
+
+    **Raises:** RuntimeError where another thread is at it.
+    """
+    if jax.process_count() == 1:
+        yield
+        return
+    if not _sharing.acquire(blocking=False):
+        raise RuntimeError("A job of many processes shares one sweep at a time, but another thread is at one.")
+    try:
+        yield
+    finally:
+        _sharing.release()
 
 
 def meet() -> None:

@@ -1,6 +1,6 @@
 """Results over labelled axes, and their way into files and xarray."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Num
 
-POINT = "point"  # the one dimension of axes that go side by side
+from jaxrock._aside import written_aside
+from jaxrock.sweeps import netcdf
+from jaxrock.sweeps.description import fingerprint
+from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, needed, own_names, shape_of
+from jaxrock.sweeps.plan import Plan
+from jaxrock.sweeps.store import create, local, opened
 
 
 class Grid(eqx.Module):
@@ -41,40 +46,71 @@ class Grid(eqx.Module):
 
         **Returns:** the dataset; `status` is a number there, the position of its message in `Status`.
 
-        **Raises:** ImportError without xarray.
+        **Raises:** ImportError without xarray; ValueError where two of axes, results and dimensions are called the
+        same, or files have no such names.
         """
         xarray = needed("xarray")
         variables = {
-            name: (dimensions(self.axes, self.outer, name, np.ndim(leaf) - len(self.shape)), np.asarray(leaf))
-            for name, leaf in zip(names_of(self.values), jax.tree.leaves(self.values))
+            name: (dimensions(self.axes, self.outer, name, np.ndim(leaf) - len(self.shape)), leaf)
+            for name, leaf in self._leaves().items()
         }
         coordinates = {
             name: ((name,) if self.outer else (POINT,), np.asarray(values)) for name, values in self.axes.items()
         }
         return xarray.Dataset(variables, coordinates, {"layout": layout_name(self.outer)})
 
+    def _leaves(self) -> dict[str, np.ndarray]:
+        """Results by names that files can have."""
+        names = own_names(list(self.axes), self.outer, self.values, len(self.shape))
+        found = {name: np.asarray(leaf) for name, leaf in zip(names, jax.tree.leaves(self.values))}
+        for name, leaf in found.items():
+            if leaf.shape[: len(self.shape)] != self.shape:
+                raise ValueError(f"The result {name!r} must begin with shape {self.shape}, but has {leaf.shape}.")
+        return found
+
     def save(self, path: str | Path) -> None:
-        """Write the results to a new file.
+        """Write the results to a new file, all of it or nothing; with checksums, which `load` verifies.
 
         **Arguments:**
 
-        - `path`: ends with .nc for NetCDF, with .zarr for Zarr.
+        - `path`: ends with .nc for NetCDF, with .zarr for Zarr. In Zarr, whole numbers and booleans are marked as such
+          that may be missing: xarray reads them as floating-point numbers.
 
-        **Raises:** ValueError for another ending; FileExistsError; ImportError without xarray, h5netcdf or zarr.
+        **Raises:** ValueError for another ending, for object stores (`s3://...`), and for results with names that files
+        cannot have; FileExistsError; OSError where it cannot be written, on a full disk, say: then nothing is left of
+        it; ImportError without xarray, h5netcdf or zarr.
         """
-        kind = _kind(path)
-        if Path(path).exists():
+        write = {".nc": self._to_netcdf, ".zarr": self._to_zarr}
+        path = local("path", path)
+        if path.suffix not in write:
+            raise ValueError(f"Argument `path` must end with .nc or .zarr, but is {str(path)!r}.")
+        if path.exists():
             raise FileExistsError(f"Argument `path` must be a new file, but {path} exists.")
-        if kind == "zarr":
-            needed("zarr")
-            self.to_xarray().to_zarr(path, mode="w-", consolidated=False)
-        else:
-            needed("h5netcdf")
-            self.to_xarray().to_netcdf(path, engine="h5netcdf")
+        try:
+            write[path.suffix](path)
+        except FileExistsError:
+            raise
+        except OSError as error:
+            raise OSError(error.errno, f"{error.strerror or error}. Nothing was saved", str(path)) from error
+
+    def _to_netcdf(self, path: Path) -> None:
+        for name, leaf in (self.axes | self._leaves()).items():
+            if leaf.dtype.kind not in "biuf" or leaf.dtype == np.float16:
+                raise ValueError(f"NetCDF has no {leaf.dtype}, which {name!r} is: take a path that ends with .zarr.")
+        netcdf.write(self.to_xarray(), path)
+
+    def _to_zarr(self, path: Path) -> None:
+        axes, leaves = {name: np.asarray(values) for name, values in self.axes.items()}, self._leaves()
+        plan = Plan.of(tuple(axes.values()), self.outer)
+        like = {name: jax.ShapeDtypeStruct(x.shape[len(self.shape) :], x.dtype) for name, x in leaves.items()}
+        with written_aside(path) as aside:
+            store = create(aside, axes, self.outer, like, plan.block, fingerprint(axes, self.outer, "saved results"))
+            for number in range(store.count):
+                store.write(number, [leaf[plan.place(number)] for leaf in leaves.values()])
 
     @classmethod
     def load(cls, path: str | Path) -> "Grid":
-        """Read results that were saved, or the store of a sweep that has finished.
+        """Read results that were saved, or the store of a sweep that has finished; all checksums are verified.
 
         **Arguments:**
 
@@ -82,71 +118,17 @@ class Grid(eqx.Module):
 
         **Returns:** a `Grid`. Values are an `Outcome` again, or a dictionary by names.
 
-        **Raises:** ValueError for a store that is not finished; ImportError without xarray.
+        **Raises:** ValueError for a store that is not finished, and for what is damaged, with the path of it;
+        FileNotFoundError; ImportError without xarray, h5netcdf or zarr.
         """
-        xarray = needed("xarray")
-        if Path(path).is_dir():
-            needed("zarr")
-            opened = xarray.open_dataset(path, engine="zarr", chunks=None, consolidated=False)
-        else:
-            needed("h5netcdf")
-            opened = xarray.open_dataset(path, engine="h5netcdf")
-        with opened as data:
-            if FINISHED in data:
-                done = np.asarray(data[FINISHED])
-                if not done.all():
-                    raise ValueError(
-                        f"The store {path} is not finished: {done.sum()} of {done.size} blocks. Run the same sweep "
-                        "with it again."
-                    )
-                data = data.drop_vars(FINISHED)
+        path = local("path", path)
+        if path.is_dir():
+            store = opened(path)
+            return cls(store.axes(), _rebuilt(dict(zip(store.names, store.read()))), store.outer)
+        with netcdf.opened(path) as data:
             axes = {str(name): np.asarray(values) for name, values in data.coords.items()}
             values = {str(name): np.asarray(values) for name, values in data.data_vars.items()}
             return cls(axes, _rebuilt(values), data.attrs["layout"] == layout_name(True))
-
-
-FINISHED = "finished"  # the array of a store that tells which blocks are done
-
-
-def shape_of(axes: Iterable[np.ndarray], outer: bool) -> tuple[int, ...]:
-    """Shape of the grid that axes span."""
-    sizes = tuple(np.size(values) for values in axes)
-    return sizes if outer else sizes[:1]
-
-
-def layout_name(outer: bool) -> str:
-    """How files call it."""
-    return "outer" if outer else "side by side"
-
-
-def dimensions(axes: dict[str, np.ndarray], outer: bool, name: str, more: int) -> tuple[str, ...]:
-    """Names of the dimensions of a result that has some more than the grid."""
-    return (*(axes if outer else (POINT,)), *(f"{name}.{k}" for k in range(more)))
-
-
-def names_of(values: Any) -> list[str]:
-    """A name for every array of a pytree: its path, such as `max_rotation` or `outcome.status`."""
-    paths = [
-        jax.tree_util.keystr(p, simple=True, separator=".") for p, _ in jax.tree_util.tree_leaves_with_path(values)
-    ]
-    return [path.removesuffix("._value") or "value" for path in paths]
-
-
-def needed(module: str):
-    """Import a module of the extra `store`, or say how to get it."""
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f'This needs {module}: `pip install "jaxrock[store]"`.') from error
-
-
-def _kind(path: str | Path) -> str:
-    kind = {".nc": "netcdf", ".zarr": "zarr"}.get(Path(path).suffix)
-    if kind is None:
-        raise ValueError(f"Argument `path` must end with .nc or .zarr, but is {str(path)!r}.")
-    return kind
 
 
 _examples: list[Callable[[], Any]] = []

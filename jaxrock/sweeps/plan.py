@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock.sweeps.grid import shape_of
+from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
@@ -67,9 +67,13 @@ class Plan(NamedTuple):
 
 def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
     """Shape of a batch: rows, devices, lanes. As many lanes at once as there are points, in few different numbers,
-    each of which is compiled."""
+    each of which is compiled.
+
+    Few scenes go without a quick pass (`transforms.batching`), which leaves other last digits: whether these are few
+    is told by the points, not by how many devices share them.
+    """
     share = -(-points // devices)
-    least, most = (64, 16384) if platform == "cpu" else (1024, 65536)
+    least, most = (_CHUNK if points <= _CHUNK else 2 * _CHUNK, 16384) if platform == "cpu" else (1024, 65536)
     lanes = 2 ** (min(max(share, least), most) - 1).bit_length()
     rows = min(_ROWS, 2 ** (max(-(-share // lanes), 1) - 1).bit_length())
     return rows, devices, lanes

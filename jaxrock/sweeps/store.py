@@ -1,129 +1,296 @@
-"""Long sweeps on disk: a Zarr store of finished blocks, which many processes write, and which outlives them."""
+"""Long sweeps on disk: a Zarr store of finished blocks, which many processes write, and which outlives them.
+
+A block is finished when its record is there: a checksum for each of its results, and one for these, written after all
+of them in a file of its own. Whatever is read is held against it. What a store is made of is told by its description,
+and every file is written aside and renamed.
+"""
 
 import hashlib
-import importlib.metadata
 import json
+import math
 import os
-import shutil
-import uuid
+import re
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxrock.sweeps.grid import FINISHED, POINT, dimensions, layout_name, needed, shape_of
+from jaxrock._aside import uninterrupted, written_aside
+from jaxrock.sweeps.description import Description, described, digest_of_axis
+from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, needed, shape_of
+from jaxrock.sweeps.plan import Plan
 
-_FINGERPRINT = "jaxrock_fingerprint"
+_DIGEST = hashlib.sha256().digest_size
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:(/|:)")  # a letter alone is a drive
+_MANY = 5  # files that a message names
+_AXIS_CHUNK = 2**20
 
 
-def fingerprint(axes: dict[str, np.ndarray], outer: bool, program: str) -> dict[str, str]:
-    """What tells a sweep from others, part by part."""
-    hashes = {f"axis `{k}`": hashlib.sha256(f"{v.dtype}".encode() + v.tobytes()).hexdigest() for k, v in axes.items()}
-    return hashes | {
-        "order of the axes": ", ".join(axes),
-        "layout": layout_name(outer),
-        "precision": "double" if jax.config.jax_enable_x64 else "single",
-        "function, or what it holds": program,
-        "version of jaxrock": importlib.metadata.version("jaxrock"),
-        "version of JAX": jax.__version__,
-    }
+def local(argument: str, path: Any) -> Path:
+    """A path of a file system, or ValueError."""
+    told = os.fspath(path) if isinstance(path, (str, os.PathLike)) else path
+    if not isinstance(told, str) or not told or "\0" in told:
+        raise ValueError(f"Argument `{argument}` must be a path, but is {path!r}.")
+    if _URL.match(told):
+        raise ValueError(
+            f"Argument `{argument}` must be a path of a file system, but is {told!r}. Object stores cannot rename, on "
+            "which it depends that nothing is lost: write to a disk, and copy what is finished."
+        )
+    return Path(told)
 
 
 class Store:
-    """A Zarr group: axes, one array for every result with one chunk for every block, and `finished`, written last."""
+    """A Zarr group: axes, one array for every result with one chunk for every block, and a record of every block."""
 
-    def __init__(self, path: str | Path, names: list[str], made_by: dict[str, str]):
-        """Open it.
+    def __init__(self, path: Path, description: Description):
+        self.path, self._description, self._about = path, description, description.about
+        self.mended: list[Path] = []  # files that were damaged when it was taken up
+        self.outer = self._about["made_by"]["layout"] == layout_name(True)
+        self.names = list(self._about["results"])
+        self._types = [np.dtype(kind) for kind in self._about["results"].values()]
+        self._metadata = description.metadata
+        self._arrays, self._records = [self._array(name) for name in self.names], self._array(RECORDS)
+        axes = [np.broadcast_to(0.0, self._metadata[name]["shape"]) for name in self._about["axes"]]
+        self._plan = Plan(tuple(axes), self.outer, tuple(self._about["block"]))  # where blocks lie
 
-        **Raises:** ValueError for a store of another sweep, or anything else at this path.
-        """
-        self.path, self.names = Path(path), names
-        _check(self.path, made_by)
-        self._group = needed("zarr").open_group(str(path), mode="r+")
-        self._arrays = [self._group[name] for name in names]
+    def _array(self, name: str):
+        """An array of this store as its description has it; blocks are written even where they hold nothing new."""
+        zarr = needed("zarr")
+        place = zarr.storage.StorePath(zarr.storage.LocalStore(self.path), name)
+        return zarr.Array(zarr.AsyncArray(self._metadata[name], place, {"write_empty_chunks": True}))
 
     @property
     def block(self) -> tuple[int, ...]:
         """Points of a block along every axis of the grid."""
-        return tuple(self._group.attrs["jaxrock_block"])
+        return self._plan.block
 
-    def finished(self) -> np.ndarray:
-        """Whether every block is done, in the order of the blocks."""
-        return np.asarray(self._group[FINISHED][...]).ravel()
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return math.prod(self._plan.blocks)
 
-    def write(self, place: tuple[slice, ...], leaves: list[np.ndarray]) -> None:
-        """Write one block: its results, and when all are there, that it is done."""
+    def axis(self, name: str) -> np.ndarray | None:
+        """Values of an axis; None if they are damaged."""
+        values = self._part(self._array(name), ...)
+        good = values is not None and digest_of_axis(values) == self._about["made_by"][f"axis `{name}`"]
+        return values if good else None
+
+    def axes(self) -> dict[str, np.ndarray]:
+        """All axes.
+
+        **Raises:** ValueError where one is damaged.
+        """
+        found = {name: self.axis(name) for name in self._about["axes"]}
+        _refuse(self.path, [self.path / name for name, values in found.items() if values is None])
+        return found
+
+    def mend(self, axes: dict[str, np.ndarray]) -> list[Path]:
+        """Write again what is damaged of axes and description; which files these were."""
+        damaged = self._description.damaged(self.path)
+        self._description.write(self.path)
+        lost = [name for name in axes if self.axis(name) is None]
+        for name in lost:
+            self._array(name)[...] = axes[name]
+        return damaged + [self.path / name for name in lost]
+
+    def look(self, number: int) -> tuple[bool, list[Path]]:
+        """Whether a block is finished and good, and its files that are damaged."""
+        leaves, damaged = self._read(number)
+        return leaves is not None, damaged
+
+    def write(self, number: int, leaves: list[np.ndarray]) -> None:
+        """Write one block: its results, and when all are there, its record."""
+        uninterrupted(self._write, number, leaves)
+
+    def _write(self, number: int, leaves: list[np.ndarray]) -> None:
+        place = self._plan.place(number)
         for array, leaf in zip(self._arrays, leaves):
-            array[place] = leaf
-        number = tuple(part.start // size for part, size in zip(place, self.block))
-        self._group[FINISHED][number] = True
+            array[place] = leaf.view(np.int8) if leaf.dtype == bool else leaf
+        told = np.stack([self._digest(number, name, leaf) for name, leaf in zip(self.names, leaves)])
+        self._records[self._index(number)] = np.stack([*told, self._digest(number, RECORDS, told)])
 
     def read(self) -> list[np.ndarray]:
-        """All results."""
-        return [np.asarray(array[...]) for array in self._arrays]
+        """All results.
 
-
-def create(
-    path: str | Path,
-    axes: dict[str, np.ndarray],
-    outer: bool,
-    names: list[str],
-    leaves: list[jax.ShapeDtypeStruct],
-    block: tuple[int, ...],
-    made_by: dict[str, str],
-) -> None:
-    """Make a store of a sweep, of which no block is done."""
-    path = Path(path)
-    zarr = needed("zarr")
-    # Made elsewhere and moved: a job that is killed meanwhile leaves no half of a store.
-    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        group = zarr.open_group(str(aside), mode="w-", zarr_format=3)
-        shape = shape_of(axes.values(), outer)
-        for name, leaf in zip(names, leaves):
-            group.create_array(
-                name,
-                shape=(*shape, *leaf.shape),
-                dtype=leaf.dtype,
-                chunks=(*block, *(max(n, 1) for n in leaf.shape)),
-                dimension_names=dimensions(axes, outer, name, len(leaf.shape)),
-                fill_value=np.nan if np.issubdtype(leaf.dtype, np.inexact) else 0,
+        **Raises:** ValueError for a store that is not finished, or damaged.
+        """
+        records = [self._part(self._records, self._index(number)) for number in range(self.count)]
+        missing = sum(record is not None and not record.any() for record in records)
+        if missing:
+            raise ValueError(
+                f"The store {self.path} is not finished: {self.count - missing} of {self.count} blocks. Run the same "
+                "sweep with it again."
             )
-        for name, values in axes.items():
-            array = group.create_array(
-                name, shape=values.shape, dtype=values.dtype, dimension_names=(name if outer else POINT,)
-            )
-            array[...] = values
-        # Its own chunk for every block: two processes never write the same file.
-        blocks = tuple(-(-n // part) for n, part in zip(shape, block))
-        group.create_array(
-            FINISHED,
-            shape=blocks,
-            dtype=bool,
-            chunks=(1,) * len(blocks),
-            dimension_names=[f"{name}.block" for name in dimensions(axes, outer, FINISHED, 0)],
-            fill_value=False,
-        )
-        group.attrs.update(
-            {"layout": layout_name(outer), "jaxrock_block": list(block), _FINGERPRINT: json.dumps(made_by)}
-        )
-        os.rename(aside, path)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        shape, damaged = self._plan.shape, []
+        more = [array.shape[len(shape) :] for array in self._arrays]
+        results = [np.empty((*shape, *sizes), kind) for sizes, kind in zip(more, self._types)]
+        for number in range(self.count):
+            leaves, bad = self._read(number)
+            damaged += bad
+            for whole, leaf in zip(results, leaves or []):
+                whole[self._plan.place(number)] = leaf
+        _refuse(self.path, damaged)
+        return results
+
+    def _index(self, number: int) -> tuple[int, ...]:
+        return tuple(int(i) for i in np.unravel_index(number, self._plan.blocks))
+
+    def _read(self, number: int) -> tuple[list[np.ndarray] | None, list[Path]]:
+        """Results of a block, None if they are not there, and its files that are damaged."""
+        record = self._part(self._records, self._index(number))
+        if record is not None and not record.any():
+            return None, []
+        if record is None or (record[-1] != self._digest(number, RECORDS, record[:-1])).any():
+            return None, [self._file(RECORDS, number)]
+        leaves, damaged = [], []
+        for name, array, kind, told in zip(self.names, self._arrays, self._types, record):
+            part = self._part(array, self._plan.place(number))
+            leaves.append(part if part is None else part.view(kind))
+            if part is None or (self._digest(number, name, part) != told).any():
+                damaged.append(self._file(name, number))
+        return None if damaged else leaves, damaged
+
+    @staticmethod
+    def _part(array, place) -> np.ndarray | None:
+        """A part of an array; None where it cannot be read."""
+        try:
+            return np.asarray(array[place])
+        except (OSError, MemoryError):
+            raise
+        except Exception:  # whatever a codec says of it
+            return None
+
+    def _file(self, name: str, number: int) -> Path:
+        """The file of a block."""
+        more = len(self._metadata[name]["shape"]) - len(self._plan.blocks)
+        return self.path.joinpath(name, "c", *map(str, (*self._index(number), *(0,) * more)))
+
+    def _digest(self, number: int, name: str, leaf: np.ndarray) -> np.ndarray:
+        """What a result of a block must be like, in this store and at this place."""
+        told = hashlib.sha256(f"{self._description.checksum} {number} {name} ".encode())
+        told.update(leaf.tobytes())
+        return np.frombuffer(told.digest(), np.uint8)
 
 
-def _check(path: Path, made_by: dict[str, str]) -> None:
-    zarr = needed("zarr")
-    try:
-        known = json.loads(zarr.open_group(str(path), mode="r").attrs[_FINGERPRINT])
-    except Exception as error:  # whatever is there, it is none of ours
+def listed(files: list[Path]) -> str:
+    """The first of some files, and how many more there are."""
+    return ", ".join(map(str, files[:_MANY])) + (f", and {len(files) - _MANY} more" if len(files) > _MANY else "")
+
+
+def _refuse(path: Path, damaged: list[Path]) -> None:
+    if damaged:
         raise ValueError(
-            f"Argument `store` must be a new path or the store of a sweep, but {path} is neither."
-        ) from error
+            f"The store {path} is damaged: {listed(damaged)}. A sweep that is called with its store computes again "
+            "what is damaged."
+        )
+
+
+def opened(path: Path) -> Store:
+    """A store that is there to be read.
+
+    **Raises:** ValueError where there is none, or one that does not say of itself what it should.
+    """
+    description = described(path, "Argument `path` must be the store of a sweep or a saved grid")
+    _refuse(path, description.damaged(path))
+    return Store(path, description)
+
+
+def of_sweep(path: Path, made_by: dict[str, str]) -> Store:
+    """The store of a sweep.
+
+    **Raises:** ValueError for a store of another sweep, or anything else at this path.
+    """
+    description = described(path, "Argument `store` must be a new path or the store of a sweep")
+    known = description.about["made_by"]
     parts = [part for part in {**known, **made_by} if known.get(part) != made_by.get(part)]
     if parts:
         raise ValueError(
             f"The store {path} was made by another sweep: other {'; other '.join(parts)}. Take another path, or the "
             "same sweep."
         )
+    return Store(path, description)
+
+
+def made_or_mended(
+    path: Path,
+    axes: dict[str, np.ndarray],
+    outer: bool,
+    leaves: dict[str, jax.ShapeDtypeStruct],
+    block: tuple[int, ...],
+    made_by: dict[str, str],
+) -> list[Path]:
+    """See that there is a store of a sweep, whose axes and description are good; which files were damaged."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with written_aside(path) as aside:
+                create(aside, axes, outer, leaves, block, made_by)
+            return []
+        except FileExistsError:  # somebody was faster
+            pass
+    return of_sweep(path, made_by).mend(axes)
+
+
+def _empty(kind: np.dtype) -> tuple[np.dtype, object, dict]:
+    """How a result is stored, what stands where nothing was computed, and the attributes that say so.
+
+    Readers of NetCDF's conventions, such as xarray, take whole numbers and verdicts as what is not a number there.
+    """
+    if kind.kind in "fc":
+        return kind, np.nan, {}
+    if kind.kind == "b":
+        return np.dtype(np.int8), -1, {"_FillValue": -1}
+    empty = int(np.iinfo(kind).min if kind.kind == "i" else np.iinfo(kind).max)
+    return kind, empty, {"_FillValue": empty}
+
+
+def create(
+    path: Path,
+    axes: dict[str, np.ndarray],
+    outer: bool,
+    leaves: dict[str, jax.ShapeDtypeStruct],
+    block: tuple[int, ...],
+    made_by: dict[str, str],
+) -> Store:
+    """Make a store of which no block is done. `leaves`: results by name, as of one point."""
+    return uninterrupted(_create, path, axes, outer, leaves, block, made_by)
+
+
+def _create(path, axes, outer, leaves, block, made_by) -> Store:
+    zarr = needed("zarr")
+    for name, values in (axes | leaves).items():
+        if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):
+            raise ValueError(
+                f"A store takes numbers and booleans, and axes of real numbers, but `{name}` is {values.dtype}."
+            )
+    group = zarr.open_group(zarr.storage.LocalStore(path), mode="w-", zarr_format=3)
+    # Damaged bytes are found before anything decompresses them.
+    usual = {"compressors": (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())}
+    usual["config"] = {"write_empty_chunks": True}
+    shape = shape_of(axes.values(), outer)
+    for name, leaf in leaves.items():
+        kind, empty, attributes = _empty(np.dtype(leaf.dtype))
+        group.create_array(
+            name, shape=(*shape, *leaf.shape), dtype=kind, chunks=(*block, *(max(n, 1) for n in leaf.shape)),
+            dimension_names=dimensions(axes, outer, name, len(leaf.shape)), fill_value=empty, attributes=attributes,
+            **usual,
+        )  # fmt: skip
+    for name, values in axes.items():
+        array = group.create_array(
+            name, shape=values.shape, dtype=values.dtype, chunks=(min(values.size, _AXIS_CHUNK),),
+            dimension_names=(name if outer else POINT,), fill_value=_empty(values.dtype)[1], **usual,
+        )  # fmt: skip
+        array[...] = values
+    # Its own chunk for every block: two processes never write the same file.
+    blocks = Plan(tuple(axes.values()), outer, block).blocks
+    group.create_array(
+        RECORDS, shape=(*blocks, len(leaves) + 1, _DIGEST), dtype=np.uint8, fill_value=0,
+        chunks=(*(1,) * len(blocks), len(leaves) + 1, _DIGEST),
+        dimension_names=dimensions((), True, RECORDS, len(blocks) + 2), **usual,
+    )  # fmt: skip
+    metadata = {name: json.loads((path / name / "zarr.json").read_text()) for name in (*axes, *leaves, RECORDS)}
+    kinds = {name: np.dtype(leaf.dtype).str for name, leaf in leaves.items()}
+    description = Description.of(list(axes), kinds, block, made_by, metadata)
+    description.write(path)
+    return Store(path, description)

@@ -7,6 +7,7 @@ dealt to the processes as a whole. A point's result depends on nobody else's, so
 
 import math
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from jaxrock._checks import whole
 from jaxrock._progress import Progress
-from jaxrock.sweeps.devices import exchange, meet, process
-from jaxrock.sweeps.grid import Grid, names_of
+from jaxrock.sweeps.description import fingerprint
+from jaxrock.sweeps.devices import exchange, meet, process, shared_out
+from jaxrock.sweeps.grid import Grid
+from jaxrock.sweeps.labels import own_names
 from jaxrock.sweeps.plan import Plan, tiles
 from jaxrock.sweeps.runner import Runner
-from jaxrock.sweeps.store import Store, create, fingerprint
+from jaxrock.sweeps.store import Store, listed, local, made_or_mended, of_sweep
 from jaxrock.transforms.fingerprint import Traced
 
 
@@ -46,7 +50,8 @@ def sweep(
     - `axes`: (n,) values of each axis, at least one. Neighbours along the last axis are computed together.
     - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
     - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
-      it is called again. All processes of a job use the same path. Needs `pip install "jaxrock[store]"`.
+      it is called again. What is there is held against its checksums first; what is damaged is named in a warning, and
+      computed again. All processes of a job use the same path. Needs `pip install "jaxrock[store]"`.
     - `load`: whether to return the results. They can stay in the store, if they are too many for the memory.
     - `block`: points that are computed, written and dealt to a process at a time; None: as many as fit well, between
       65,536 and 262,144. Besides the results, memory is needed for one block. A killed job loses one block per process.
@@ -56,50 +61,80 @@ def sweep(
 
     **Returns:** a `Grid`, the same in every process; None if the results stay in the store.
 
-    **Raises:** ValueError for axes that are not lists of numbers, for values that the function refuses, or for a store
-    of another sweep; ImportError for a store without zarr.
+    **Raises:** ValueError for axes that are not lists of numbers, for values that the function refuses, for results
+    without names of their own, for a store of another sweep, or one that is no path of a file system (`s3://...`);
+    OSError where the store cannot be written, on a full disk, say; RuntimeError for a second sweep at a time in a job
+    of many processes; ImportError for a store without zarr.
     """
     if not axes:
         raise ValueError("A sweep needs at least one axis, such as `p=[1.0, 2.0]`.")
-    if store is None and not load:
+    path = None if store is None else local("store", store)
+    if path is None and not load:
         raise ValueError("Argument `load` must be True where there is no `store`.")
     lists = {name: _axis(name, values) for name, values in axes.items()}
     if not outer and len({values.size for values in lists.values()}) > 1:
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
-    if block is not None and block < 1:
-        raise ValueError(f"Argument `block` must be at least 1, but is {block}.")
+    whole("block", block, 1)
 
     traced = Traced(function, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
-    names = names_of(traced.shapes)
-    if not names or set(names) & set(axes):
-        raise ValueError(f"The function must return arrays with other names than the axes, but returns {names}.")
+    names = own_names(list(axes), outer, traced.shapes, 0)
     plan = Plan.of(tuple(lists.values()), outer, block)
-    keeper = None
-    if store is not None:
-        if version is None and traced.program.calls_back:
-            raise ValueError(
-                "Argument `version` must be given for a function that calls back to Python: a store cannot tell "
-                "whether what it calls has changed."
-            )
-        keeper = _keeper(store, plan, lists, traced, version)
-        plan = plan._replace(block=keeper.block)
-    values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
+    with shared_out():
+        keeper = None
+        if path is not None:
+            if version is None and traced.program.calls_back:
+                raise ValueError(
+                    "Argument `version` must be given for a function that calls back to Python: a store cannot tell "
+                    "whether what it calls has changed."
+                )
+            leaves = dict(zip(names, jax.tree.leaves(traced.shapes)))
+            keeper = _keeper(path, plan, lists, leaves, traced.fingerprint, version)
+            plan = plan._replace(block=keeper.block)
+        values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
     return Grid(lists, values, outer, resumed) if load else None
 
 
-def _keeper(path: str | Path, plan: "Plan", axes: dict[str, np.ndarray], traced: Traced, version) -> Store:
-    """The store at a path: made by the first process, if there is none; a sweep's own, in every process."""
-    made_by = fingerprint(axes, plan.outer, traced.fingerprint)
+def _keeper(
+    path: Path, plan: Plan, axes: dict[str, np.ndarray], leaves: dict, program: str, version: str | None
+) -> Store:
+    """The store at a path: made or mended by the first process; a sweep's own, in every process."""
+    made_by = fingerprint(axes, plan.outer, program)
     if version is not None:
-        made_by["argument `version`"] = version
-    names, leaves = names_of(traced.shapes), jax.tree.leaves(traced.shapes)
+        made_by["argument `version`"] = str(version)
+    damaged = []
     try:
-        if process()[0] == 0 and not Path(path).exists():
-            create(path, axes, plan.outer, names, leaves, plan.block, made_by)
+        if process()[0] == 0:
+            damaged = made_or_mended(path, axes, plan.outer, leaves, plan.block, made_by)
     finally:
         meet()  # whatever became of it
-    return Store(path, names, made_by)
+    store = of_sweep(path, made_by)
+    store.mended += damaged
+    return store
+
+
+def _there(store: Store) -> np.ndarray:
+    """Whether every block of a store is finished: each is verified by one of the processes, and all hear of it.
+
+    What is damaged is named in a warning, and not there.
+    """
+    own, count = process()
+    found = np.zeros(store.count, np.uint8)
+    damaged = []
+    for number in range(own, store.count, count):
+        good, files = store.look(number)
+        damaged += files
+        found[number] = 2 if files else good
+    if count > 1:
+        meet()
+        found = exchange(found).max(axis=0)
+        others = [number for number in np.flatnonzero(found == 2) if number % count != own]
+        damaged += [file for number in others if own == 0 for file in store.look(number)[1]]
+    if own == 0 and (files := store.mended + damaged):
+        warnings.warn(
+            f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.", stacklevel=4
+        )
+    return found == 1
 
 
 def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
@@ -139,6 +174,7 @@ def _traced_surface(function: Callable, axes: tuple, scene, outer: bool):
     return jax.tree.map(lambda x: x.reshape(*points[0].shape, *x.shape[1:]), results)
 
 
+@shared_out()
 def compute(
     function: Callable,
     plan: Plan,
@@ -156,17 +192,15 @@ def compute(
     """
     run = Runner(function, plan.axes, scene, math.prod(plan.block))
     own, count = process()
-    done = store.finished() if store else np.zeros(math.prod(plan.blocks), bool)
-    if store:
-        meet()  # all have seen the same blocks before one of them writes more
+    done = _there(store) if store else np.zeros(math.prod(plan.blocks), bool)
     left = np.flatnonzero(~done).tolist()
     mine = left[own::count]
     resumed = int(plan.sizes[done].sum())
     if resumed and own == 0 and progress is not False:
         print(f"{label}: {resumed:,} of {math.prod(plan.shape):,} points come from {store.path}", file=sys.stderr)
     bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
-    whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
-    results = None if store or whole else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
+    is_whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
+    results = None if store or is_whole else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
     for number in mine:
         place = plan.place(number)
@@ -174,8 +208,8 @@ def compute(
         leaves = run(plan.points(number), bar.add, tiles(shape, columns))
         leaves = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in leaves]
         if store:
-            store.write(place, leaves)
-        elif whole:
+            _write(store, number, leaves)
+        elif is_whole:
             results = leaves
         else:
             for leaf, part in zip(results, leaves):
@@ -187,6 +221,14 @@ def compute(
     if store:
         results = store.read() if load else None
     return None if results is None else jax.tree.unflatten(run.tree, results), resumed
+
+
+def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:
+    try:
+        store.write(number, leaves)
+    except OSError as error:
+        said = f"{error.strerror or error}. Blocks that are finished are kept: the same sweep goes on from there"
+        raise OSError(error.errno, said, str(store.path)) from error
 
 
 def _gather(results: list[np.ndarray], plan: Plan, numbers: list[int]) -> None:

@@ -1,0 +1,91 @@
+"""Files and folders that are there whole or not at all: they are written aside, and renamed."""
+
+import concurrent.futures
+import contextlib
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+
+@contextlib.contextmanager
+def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) -> Iterator[Path]:
+    """Where to write what shall be at `path`: it gets there when all is written, and nothing remains where that fails.
+
+    **Arguments:**
+
+    - `replace`: whether it takes the place of a file that is there.
+    - `lasting`: whether it has reached the disk before it is renamed, so that it outlives a loss of power.
+
+    **Raises:** FileExistsError where somebody else was faster, unless it replaces.
+    """
+    aside = path.with_name(f".{path.name[:64]}.{uuid.uuid4().hex}.partial")
+    try:
+        yield aside
+        if lasting:
+            for file in [aside, *aside.rglob("*")]:
+                _reach_the_disk(file)
+        _rename(aside, path, replace)
+        if lasting:
+            _reach_the_disk(path.parent)
+    finally:
+        if aside.is_dir():
+            shutil.rmtree(aside, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                aside.unlink(missing_ok=True)
+
+
+def _reach_the_disk(file: Path) -> None:
+    if file.is_dir() and os.name == "nt":  # which opens no folders
+        return
+    handle = os.open(file, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _rename(aside: Path, path: Path, replace: bool) -> None:
+    if replace:
+        os.replace(aside, path)
+    elif aside.is_dir():
+        try:
+            os.rename(aside, path)  # fails where anything is but an empty folder
+        except OSError as error:
+            raise _taken(path) if path.exists() else error from error
+    else:
+        try:
+            os.link(aside, path)  # fails where anything is, which a rename does not
+        except FileExistsError as error:
+            raise _taken(path) from error
+        except OSError as error:  # a file system without links
+            if path.exists():
+                raise _taken(path) from error
+            os.rename(aside, path)
+
+
+def _taken(path: Path) -> FileExistsError:
+    return FileExistsError(f"{path} was made by somebody else meanwhile.")
+
+
+def uninterrupted(function: Callable, *given: Any, stop: Callable[[BaseException], None] = lambda error: None) -> Any:
+    """Call a function to its end, whoever interrupts: then it is waited for, and what came is raised.
+
+    It runs in a thread of its own, as interrupts come to the main thread. Libraries in C, and those with threads of
+    their own, go on writing after an exception, or cannot close what they were writing.
+
+    **Arguments:**
+
+    - `stop`: called with what came, while the function is still running.
+    """
+    with concurrent.futures.ThreadPoolExecutor(1) as alone:
+        running = alone.submit(function, *given)
+        try:
+            return running.result()
+        except BaseException as error:
+            if not running.done():
+                stop(error)
+            raise

@@ -1,0 +1,122 @@
+"""What a store says of itself: one text with its own checksum, twice on disk, by which all else in it is judged."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxrock._aside import written_aside
+from jaxrock.keeping.facts import code, version_of
+from jaxrock.sweeps.labels import RECORDS, layout_name
+
+TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and the same once more
+_ABOUT, _CHECKSUM = "jaxrock_store", "jaxrock_checksum"  # attributes
+
+
+def fingerprint(axes: dict[str, np.ndarray], outer: bool, program: str) -> dict[str, str]:
+    """What tells a sweep from others, part by part."""
+    hashes = {f"axis `{name}`": digest_of_axis(values) for name, values in axes.items()}
+    return hashes | {
+        "order of the axes": ", ".join(axes),
+        "layout": layout_name(outer),
+        "precision": "double" if jax.config.jax_enable_x64 else "single",
+        "function, or what it holds": program,
+        "version of jaxrock": version_of("jaxrock"),
+        "code of jaxrock": code(),
+        "version of JAX": f"{version_of('jax')}, {version_of('jaxlib')}",
+        "version of llvmlite": version_of("llvmlite"),
+    }
+
+
+def digest_of_axis(values: np.ndarray) -> str:
+    """What tells an axis."""
+    return hashlib.sha256(f"{values.dtype}".encode() + values.tobytes()).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """The root of a store, all of it: it holds what all of its arrays say of themselves.
+
+    - `root`: as in the file.
+    """
+
+    root: dict
+
+    @classmethod
+    def of(cls, axes: list[str], results: dict[str, str], block: tuple[int, ...], made_by: dict[str, str], metadata):
+        """From names of axes, results with their types, and what Zarr says of every array."""
+        about = {"axes": axes, "results": results, "block": block, "made_by": made_by}
+        root = {
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": {"layout": made_by["layout"], _ABOUT: json.dumps(about)},
+            "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": metadata},
+        }
+        root["attributes"][_CHECKSUM] = _checksum(root)
+        return cls(root)
+
+    @property
+    def about(self) -> dict:
+        """Names of axes, types of results by their names, points of a block, what the store was made by."""
+        return json.loads(self.root["attributes"][_ABOUT])
+
+    @property
+    def metadata(self) -> dict[str, dict]:
+        """What Zarr says of every array."""
+        return self.root["consolidated_metadata"]["metadata"]
+
+    @property
+    def checksum(self) -> str:
+        """What tells this store from others."""
+        return self.root["attributes"][_CHECKSUM]
+
+    def files(self) -> dict[str, dict]:
+        """Every file, below the path of the store, that says something of it, and what it says."""
+        return {name: self.root for name in TWINS} | {f"{name}/zarr.json": said for name, said in self.metadata.items()}
+
+    def damaged(self, path: Path) -> list[Path]:
+        """Those of the files that do not say what they should."""
+        return [path / name for name, said in self.files().items() if _read(path / name) != said]
+
+    def write(self, path: Path) -> None:
+        """Write the files that do not say what they should."""
+        for file in self.damaged(path):
+            file.parent.mkdir(exist_ok=True)
+            with written_aside(file, replace=True) as aside:
+                aside.write_text(json.dumps(self.files()[str(file.relative_to(path).as_posix())], indent=1))
+
+
+def described(path: Path, wanted: str) -> Description:
+    """What is described at a path; `wanted`: the argument and what it must be, in words.
+
+    **Raises:** ValueError where there is no store, or one whose description is lost.
+    """
+    for name in TWINS:
+        root = _read(path / name)
+        try:
+            told = root["attributes"].pop(_CHECKSUM)
+            if told == _checksum(root):
+                root["attributes"][_CHECKSUM] = told
+                return Description(root)
+        except (TypeError, KeyError, AttributeError):
+            continue
+    if (path / TWINS[1]).exists():
+        raise ValueError(
+            f"The store {path} is damaged: nothing can be known of it without one of {path / TWINS[0]} and "
+            f"{path / TWINS[1]}."
+        )
+    raise ValueError(f"{wanted}, but {path} is neither.")
+
+
+def _checksum(root: dict) -> str:
+    return hashlib.sha256(json.dumps(root, sort_keys=True).encode()).hexdigest()
+
+
+def _read(file: Path):
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
+        return None

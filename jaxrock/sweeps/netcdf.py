@@ -1,0 +1,138 @@
+"""NetCDF files that end with a checksum of all that stands before it; readers of NetCDF do not look there.
+
+The whole file is verified before HDF5 sees it: the C library may end the process over a damaged file, and over one that
+it cannot write.
+"""
+
+import hashlib
+from pathlib import Path
+
+from jaxrock._aside import uninterrupted, written_aside
+from jaxrock.sweeps.labels import needed
+
+_MARK = b"\njaxrock sha256 "
+_DIGEST = hashlib.sha256().digest_size
+
+
+class _Patient:
+    """A file that HDF5 can always write and close: the first error is kept, and the rest goes nowhere.
+
+    HDF5 cannot close a file that it could not write, and Python ends with a segmentation fault when it tries again.
+    """
+
+    def __init__(self, file):
+        self._file, self.error = file, None
+
+    def stop(self, error: BaseException) -> None:
+        """Let nothing be written any more."""
+        self.error = self.error or error
+
+    def _try(self, does, *given):
+        if self.error is None:
+            try:
+                return does(*given)
+            except BaseException as error:
+                self.stop(error)
+        return None
+
+    def _write(self, at: int, data) -> None:
+        self._file.seek(at)
+        view = memoryview(data).cast("B")
+        while view:  # a disk that is nearly full takes a part
+            view = view[self._file.write(view) :]
+
+    def _read(self, at: int, buffer) -> int:
+        self._file.seek(at)
+        return self._file.readinto(buffer)
+
+    # What h5py calls.
+
+    _at = 0
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to a place, counted from the beginning, from here or from the end."""
+        end = (self._try(self._file.seek, 0, 2) or 0) if whence == 2 else 0
+        self._at = offset + (0, self._at, end)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Where it is."""
+        return self._at
+
+    def read(self, size: int = -1) -> bytes:
+        """Only to be known as a file: h5py reads into its own memory."""
+        raise NotImplementedError
+
+    def readinto(self, buffer) -> int:
+        """Read what was written."""
+        count = self._try(self._read, self._at, buffer) or 0
+        self._at += count
+        return count
+
+    def write(self, data) -> int:
+        """Write, or remember why not."""
+        size = memoryview(data).nbytes
+        self._try(self._write, self._at, data)
+        self._at += size
+        return size
+
+    def truncate(self, size: int) -> int:
+        """Cut or lengthen the file."""
+        self._try(self._file.truncate, size)
+        return size
+
+    def flush(self) -> None:
+        """Nothing waits in memory."""
+
+
+def write(dataset, path: Path) -> None:
+    """Write an `xarray.Dataset` to a new file, all of it or nothing."""
+    h5netcdf, backends = needed("h5netcdf"), needed("xarray.backends")
+
+    def written(file):
+        with h5netcdf.File(file, "w") as opened:
+            dataset.dump_to_store(backends.H5NetCDFStore(opened))
+
+    with written_aside(path) as aside, aside.open("w+b", buffering=0) as file:
+        patient = _Patient(file)
+        try:
+            uninterrupted(written, patient, stop=patient.stop)
+        except BaseException as error:
+            patient.stop(error)
+        if patient.error is not None:
+            raise patient.error
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").digest()
+        patient._write(file.seek(0, 2), _MARK + digest)
+
+
+def opened(path: Path):
+    """The `xarray.Dataset` of a file that is as it was written.
+
+    **Raises:** ValueError for one that is not.
+    """
+    xarray = needed("xarray")
+    needed("h5netcdf")
+    _verify(path)
+    return xarray.open_dataset(path, engine="h5netcdf", mask_and_scale=False)
+
+
+def _verify(path: Path) -> None:
+    with path.open("rb") as file:
+        size = file.seek(0, 2) - len(_MARK) - _DIGEST
+        file.seek(max(size, 0))
+        mark, told = file.read(len(_MARK)), file.read()
+        file.seek(0)
+        found, left = hashlib.sha256(), size
+        while left > 0:
+            part = file.read(min(left, 2**24))
+            if not part:
+                break
+            found.update(part)
+            left -= len(part)
+    if mark != _MARK:
+        raise ValueError(
+            f"The file {path} is damaged, or was not saved by a `Grid`: the checksum at its end is missing."
+        )
+    if told != found.digest():
+        raise ValueError(f"The file {path} is damaged: it does not agree with its checksum.")
