@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, not_negative, positive, share
+from jaxrock._checks import checked, not_negative, share, size
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -87,7 +87,7 @@ class Constant(AbstractRestitution):
     value: Real = parameter("-", share, symbol="e", argument="restitution")
 
     def __init__(self, value: ArrayLike):
-        self.value = share("restitution", value)
+        set_parameters(self, value=value)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """The value."""
@@ -178,7 +178,7 @@ class SpeedDependent(AbstractRestitution):
 
     gentle: Real = parameter("-", share)
     violent: Real = parameter("-", share)
-    scale: Real = parameter("rad/s", positive)
+    scale: Real = parameter("rad/s", size)
 
     def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)

@@ -16,6 +16,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
+from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, checked, positive, scalar, share
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, beside, rising
 from jaxrock.numerics.gauss_legendre import gauss_legendre
@@ -54,6 +55,7 @@ class HazardCurve(eqx.Module):
     rates: Inexact[Array, "*batch n"]
     measure: str = eqx.field(static=True)
 
+    @arguments
     def __init__(self, levels: Values, rates: Values, measure: str = ""):
         self.levels = rising("levels", levels)
         rates = beside("rates", as_real("rates", rates), self.levels)
@@ -67,6 +69,7 @@ class HazardCurve(eqx.Module):
         self.measure = measure
 
     @classmethod
+    @arguments
     def from_probabilities(
         cls, levels: Values, probabilities: Values, investigation_time: ArrayLike, measure: str = ""
     ) -> "HazardCurve":
@@ -136,6 +139,7 @@ class HazardCurve(eqx.Module):
         return HazardCurve(levels, inner, self.measure)
 
 
+@arguments
 def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     """Annual rate of shakings that topple a rock: the fragility integrated over the rates of the hazard curve.
 
@@ -156,6 +160,7 @@ def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     return _toppling_rate(fragility, curve)
 
 
+@arguments
 def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Number:
     """Probability that all rocks of a site have stood since they became fragile, under the shakings they share.
 
@@ -177,6 +182,7 @@ def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCu
     return jnp.exp(-_topplings(*_rocks(fragilities, ages), curve))
 
 
+@arguments
 def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches"]:
     """Weights of the branches of a logic tree after rocks were found standing (Bayes).
 
@@ -200,6 +206,7 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
     return weights / checked("survival", total, "be above 0 for a branch that has weight", lambda x: x > 0)
 
 
+@arguments
 def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Number:
     """The factor on the intensity of every shaking at which the survival of all rocks falls to a given probability.
 

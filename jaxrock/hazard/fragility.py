@@ -10,6 +10,7 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Values, as_real, checked, positive, share
+from jaxrock._parameters import parameter, set_parameters
 
 Real = Inexact[Array, "..."]
 
@@ -41,12 +42,11 @@ class LogNormalFragility(AbstractFragility):
     **Raises:** ValueError for a value outside its range.
     """
 
-    median: Real
-    dispersion: Real
+    median: Real = parameter("-", positive)
+    dispersion: Real = parameter("-", positive)
 
     def __init__(self, median: ArrayLike, dispersion: ArrayLike):
-        self.median = positive("median", median)
-        self.dispersion = positive("dispersion", dispersion)
+        set_parameters(self, median=median, dispersion=dispersion)
 
     def __call__(self, level: Values) -> Real:
         z = jnp.log(jnp.asarray(level) / self.median) / self.dispersion

@@ -6,6 +6,7 @@ pushed: together they say most of what a motion does to a rock.
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
 
+from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, as_real, checked, positive
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -75,6 +77,7 @@ class SurfaceFit(eqx.Module):
     status: FitStatus
 
 
+@arguments
 def fit_surface(
     acceleration: Values,
     ratio: Values,
@@ -144,6 +147,7 @@ def _fit(acceleration, ratio, toppled, survived):
     return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T
 
 
+@arguments
 def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFit:
     """The two-measure fragility of scaled motions, each of which has a PGV/PGA of its own.
 
@@ -223,9 +227,10 @@ class SimulatedSurface(eqx.Module):
         return fit_surface(acceleration, ratio, toppled.ravel(), float(len(self.verdict)), draws)
 
 
+@arguments
 def simulated_surface(
     block: Block,
-    pulses: Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]],
+    pulses: Annotated[Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]], list_of(callable, "functions")],
     acceleration: Values,
     ratio: Values,
     model: AbstractEquation = Housner(),

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxrock._arguments import path_of
 from jaxrock._text import file_error, text_lines
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY
@@ -63,7 +64,7 @@ def read_observations(path: str | Path) -> Observations:
 
     **Raises:** ValueError, with the number of the line, for a file that is wrong, or a rock that cannot be.
     """
-    path = Path(path)
+    path = path_of("path", path)
     lines = text_lines(path)
     rows = [
         (number, [field.strip() for field in next(csv.reader([line]))])

@@ -1,6 +1,7 @@
 """What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, as_real, checked, put_down
 from jaxrock._label import Label
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -70,11 +72,12 @@ class Observations(eqx.Module):
     other: OtherSide | None
     label: Label = eqx.field(static=True)
 
+    @arguments
     def __init__(
         self,
         alpha: Values,
         p: Values,
-        seen: Sequence[str],
+        seen: Annotated[Sequence[str], list_of(str, "words")],
         restitution: Values | None = None,
         *,
         alpha_sd: Values = 0.0,
@@ -82,7 +85,7 @@ class Observations(eqx.Module):
         restitution_sd: Values = 0.0,
         rotation: Values | None = None,
         rotation_sd: Values | None = None,
-        names: Sequence[str] | None = None,
+        names: Annotated[Sequence[str] | None, list_of(object, "names")] = None,
         other: OtherSide | None = None,
     ):
         alpha = as_real("alpha", alpha)
@@ -113,10 +116,11 @@ class Observations(eqx.Module):
             raise ValueError(f"Argument `names` must have {count} names, but has {len(self.names)}.")
 
     @classmethod
+    @arguments
     def asymmetric(
         cls,
         blocks: AsymmetricBlock,
-        seen: Sequence[str],
+        seen: Annotated[Sequence[str], list_of(str, "words")],
         restitution: Values | None = None,
         *,
         facing: Values = 0.0,

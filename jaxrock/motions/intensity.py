@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock._arguments import arguments
+from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.gauss_legendre import gauss_legendre
@@ -13,6 +15,7 @@ _PARTS = 256  # of every smooth piece, where there are few
 _FEW = 32
 
 
+@arguments
 def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
     """Peak ground acceleration (PGA) [g].
 
@@ -22,9 +25,11 @@ def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
 
     **Returns:** the largest |acceleration|: exact for records and straight lines, to about 1e-9 for smooth pulses.
     """
+    check_single(motion=motion)
     return _peaks(motion)[0]
 
 
+@arguments
 def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     """Peak ground velocity (PGV) [m/s], of a ground that is at rest at first, under 9.81 m/s^2.
 
@@ -34,6 +39,7 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
 
     **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses.
     """
+    check_single(motion=motion)
     return _peaks(motion)[1]
 
 

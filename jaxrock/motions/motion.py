@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import Values, finite, instance, not_negative
+from jaxrock._arguments import arguments
+from jaxrock._checks import Values, as_real, delay, factor
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
@@ -108,19 +109,18 @@ class AbstractMotion(eqx.Module):
         **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
         value after it.
         """
-        time = jnp.asarray(time, self.knots.dtype)
+        time = as_real("time", time).astype(self.knots.dtype)
         knots = self.knots
 
         def at(t):
             piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
             value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
-            return jnp.where((t >= 0) & (t < knots[-1]), value, 0.0)
+            return jnp.where((t >= 0) & (t < knots[-1]), value, jnp.where(jnp.isnan(t), t, 0.0))
 
         return jax.vmap(at)(time.ravel()).reshape(time.shape)
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
-        instance("vertical", vertical, AbstractMotion, "a motion")
         return WithVertical(self, vertical)
 
     def shifted(self, delay: ArrayLike) -> "Shifted":
@@ -149,8 +149,9 @@ class Scaled(AbstractMotion):
     """A motion times a factor (`factor * motion`)."""
 
     motion: AbstractMotion
-    factor: Inexact[Array, "..."] = parameter("-", finite, is_free=False)  # the motion's amplitude says the same
+    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude says the same
 
+    @arguments
     def __init__(self, motion: AbstractMotion, factor: ArrayLike):
         self.motion = motion
         set_parameters(self, factor=factor)
@@ -184,8 +185,9 @@ class Shifted(AbstractMotion):
     """A motion after `delay` seconds of quiet (`motion.shifted(delay)`)."""
 
     motion: AbstractMotion
-    delay: Inexact[Array, "..."] = parameter("s", not_negative)
+    delay: Inexact[Array, "..."] = parameter("s", delay)
 
+    @arguments
     def __init__(self, motion: AbstractMotion, delay: ArrayLike):
         self.motion = motion
         set_parameters(self, delay=delay)
@@ -263,6 +265,10 @@ class Summed(AbstractMotion):
     first: AbstractMotion
     second: AbstractMotion
 
+    @arguments
+    def __init__(self, first: AbstractMotion, second: AbstractMotion):
+        self.first, self.second = first, second
+
     @property
     def knots(self):
         return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
@@ -308,6 +314,10 @@ class WithVertical(AbstractMotion):
 
     horizontal: AbstractMotion
     vertical: AbstractMotion
+
+    @arguments
+    def __init__(self, horizontal: AbstractMotion, vertical: AbstractMotion):
+        self.horizontal, self.vertical = horizontal, vertical
 
     @property
     def knots(self):

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
+from jaxrock._arguments import arguments
 from jaxrock._checks import checked
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -50,6 +51,7 @@ class Contact(eqx.Module):
         return self.keeps_contact & (jnp.asarray(friction) >= needed)
 
 
+@arguments
 def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_ratio: ArrayLike = 0.75) -> Contact:
     """Compute the forces between block and ground along a response.
 

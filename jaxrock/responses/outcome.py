@@ -1,10 +1,13 @@
 """What becomes of a block under a motion: peak, verdict, margin."""
 
+from typing import Annotated
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._arguments import arguments, pair
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -71,12 +74,13 @@ class Outcome(eqx.Module):
     status: Status
 
 
+@arguments
 def outcome(
     block: AnyBlock,
     motion: AbstractMotion,
     model: AbstractEquation = USUAL,
     *,
-    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    initial: Annotated[tuple[ArrayLike, ArrayLike], pair] = (0.0, 0.0),
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
 ) -> Outcome | FlexibleOutcome:

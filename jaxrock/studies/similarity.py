@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
+from jaxrock._arguments import arguments
 from jaxrock._checks import one_of, positive
 from jaxrock.blocks.rigid import Block
 
@@ -46,6 +47,7 @@ class Scales(eqx.Module):
     velocity: Real
 
 
+@arguments
 def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str = "rigid") -> Groups:
     """The groups of a block under a motion.
 
@@ -68,6 +70,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3
 
 
+@arguments
 def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """The slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
 
@@ -79,6 +82,7 @@ def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     return Block(alpha, positive("frequency", frequency) / groups.frequency_ratio, groups.restitution)
 
 
+@arguments
 def motion(groups: Groups, block: Block, form: Callable):
     """The motion under which a block has these groups.
 
@@ -94,6 +98,7 @@ def motion(groups: Groups, block: Block, form: Callable):
     return form(threshold / groups.strength, 2 * jnp.pi / (groups.frequency_ratio * block.p))
 
 
+@arguments
 def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid") -> Scales:
     """The units in which responses of similar blocks are one curve.
 
@@ -113,6 +118,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
     return Scales(1 / block.p, rotation, block.p * rotation)
 
 
+@arguments
 def master_curve(response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
     """Rotation and velocity of a response in dimensionless terms.
 
