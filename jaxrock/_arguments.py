@@ -186,7 +186,10 @@ def list_of(kind: type | Callable, words: str) -> Check:
     def check(name: str, value: Any) -> list:
         if isinstance(value, (str, bytes, dict)) or not isinstance(value, collections.abc.Iterable):
             raise ValueError(f"Argument `{name}` must be a list of {words}, but is {shown(value)}.")
-        values = list(value)
+        try:
+            values = list(value)
+        except TypeError:  # an array without axes
+            raise ValueError(f"Argument `{name}` must be a list of {words}, but is {shown(value)}.") from None
         for each in values:
             if not (isinstance(each, kind) if isinstance(kind, type) else kind(each)):
                 raise ValueError(f"Argument `{name}` must be a list of {words}, but holds {shown(each)}.")

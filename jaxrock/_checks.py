@@ -63,6 +63,8 @@ def shown(value: Any) -> str:
     if callable(value):
         return f"the function {getattr(value, '__name__', type(value).__name__)}"
     text = " ".join(repr(value).split())
+    if " at 0x" in text:  # Python's own, which says where it lies in memory
+        return f"an object of type {type(value).__name__}"
     return text if len(text) <= _LONG else f"{text[: _LONG - 3]}..."
 
 
@@ -82,7 +84,7 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     good = holds(np.asarray(array))
     if isinstance(good, jax.core.Tracer):
         return watched(array, message, ~jnp.all(good))
-    known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
+    known, good = np.broadcast_arrays(array, good)
     if not good.all():
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
@@ -144,6 +146,7 @@ class Range(NamedTuple):
 positive = Range("be positive and finite", 0.0, np.inf, lambda x: (x > 0) & (x < np.inf))
 not_negative = Range("be 0 or more and finite", 0.0, np.inf, lambda x: (x >= 0) & (x < np.inf))
 finite = Range("be finite", -np.inf, np.inf, lambda x: (x > -np.inf) & (x < np.inf))
+level = Range("be 0 or more", 0.0, np.inf, lambda x: x >= 0)  # of a shaking; infinite: any
 not_nan = Range("be a number", -np.inf, np.inf, lambda x: x == x)  # some may be infinite
 share = Range("be in [0, 1]", 0.0, 1.0, lambda x: (x >= 0) & (x <= 1))
 inner_share = Range("be in (0, 1)", 0.0, 1.0, lambda x: (x > 0) & (x < 1))
@@ -165,6 +168,22 @@ RANGES = {
     "positive": positive, "not_negative": not_negative, "finite": finite, "not_nan": not_nan, "acute": acute,
     "share": share, "size": size, "rate": rate, "ratio": ratio, "strength": strength,
 }  # fmt: skip
+
+
+def if_known(allowed: Range, name: str, value: Values) -> Inexact[Array, "..."]:
+    """Return `value` as an array, of numbers in a range where they are known; what is traced is not looked at."""
+    array = as_real(name, value)
+    return array if isinstance(array, jax.core.Tracer) else allowed(name, array)
+
+
+def together(**arrays: Array | None) -> None:
+    """Raise ValueError for arguments whose shapes do not go together."""
+    shapes = {name: jnp.shape(array) for name, array in arrays.items() if array is not None}
+    try:
+        jnp.broadcast_shapes(*shapes.values())
+    except ValueError:
+        names, given = (" and ".join(words) for words in ([f"`{n}`" for n in shapes], map(str, shapes.values())))
+        raise ValueError(f"Arguments {names} must have shapes that go together, but have {given}.") from None
 
 
 def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
@@ -201,7 +220,9 @@ def elementwise(**checks: Callable) -> Callable:
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
             given = signature.bind(*args, **kwargs).arguments
-            return compiled(*(checks[name](name, value) for name, value in given.items()))
+            given = {name: checks[name](name, value) for name, value in given.items()}
+            together(**given)
+            return compiled(*given.values())
 
         return checked_and_compiled
 

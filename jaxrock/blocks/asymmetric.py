@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength
+from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of
@@ -17,7 +17,7 @@ from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
 
-_ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
+ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
 _gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e9))
 
 
@@ -49,7 +49,7 @@ class AsymmetricBlock(eqx.Module):
     alpha1: Real = parameter("rad", acute)
     alpha2: Real = parameter("rad", acute)
     p1: Real = parameter("rad/s", rate)
-    inertia_ratio: Real = parameter("-", _ratio_of_inertia)
+    inertia_ratio: Real = parameter("-", ratio_of_inertia)
     given_radius_ratio: Real | None = parameter("-", ratio, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
 
@@ -95,6 +95,7 @@ class AsymmetricBlock(eqx.Module):
         """
         first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
         gyration = _gyration("gyration_radius", gyration_radius)
+        together(R1=first, R2=second, gyration_radius=gyration, gravity=gravity)
         kappa = first**2 / (first**2 + gyration**2)
         return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
 
@@ -121,10 +122,12 @@ class AsymmetricBlock(eqx.Module):
         **Raises:** ValueError for a value outside its range, or a p2 that no distance of the second corner gives.
         """
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
-        square = (rate("p2", p2) / rate("p1", p1)) ** 2
+        p1, p2 = rate("p1", p1), rate("p2", p2)
+        together(p1=p1, p2=p2, inertia_ratio=kappa)
+        square = (p2 / p1) ** 2
         inner = 1 - 4 * square**2 * kappa * (1 - kappa)
         largest = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
-        checked("p2", p2, largest, lambda _: inner >= 0)
+        checked("p2", jnp.broadcast_to(p2, inner.shape), largest, lambda _: inner >= 0)
         return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
 
     @classmethod

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, not_negative, share, size
+from jaxrock._checks import checked, not_negative, share, size, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -150,6 +150,7 @@ class PerSide(AbstractRestitution):
 
     def __init__(self, first: ArrayLike, second: ArrayLike):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
+        together(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
         checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
 

@@ -110,7 +110,7 @@ def outcome_flexible(
     motion: AbstractMotion,
     *,
     duration: ArrayLike | None = None,
-    max_steps: Annotated[int, at_least(1, 2**30)] = 4096,
+    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
 ) -> FlexibleOutcome:
     """Tell what becomes of a flexible block under a motion.
 
@@ -136,7 +136,7 @@ def simulate_flexible(
     *,
     duration: ArrayLike | None = None,
     samples: Annotated[int, at_least(2)] = 2001,
-    max_steps: Annotated[int, at_least(1, 2**30)] = 4096,
+    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
 ) -> FlexibleResponse:
     """Compute the history of a flexible block under a motion.
 

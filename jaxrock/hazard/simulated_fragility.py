@@ -39,7 +39,7 @@ def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
         raise ValueError(
             f"Argument `bound` must be 'lower' or 'upper', because {undecided} of {verdict.size} scenes are undecided."
         )
-    upper = one_of("bound", bound or "lower", ("lower", "upper")) == "upper"
+    upper = bound is not None and one_of("bound", bound, ("lower", "upper")) == "upper"
     return np.sum(verdict != STOOD if upper else verdict == TOPPLED, axis=-1).astype(float)
 
 

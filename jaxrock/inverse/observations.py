@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, as_real, checked, put_down
+from jaxrock._checks import Values, as_real, checked, put_down, shown
 from jaxrock._label import Label
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Corners, Housner, PerSide
@@ -208,7 +208,7 @@ class Observations(eqx.Module):
 
     def of(self, which: ArrayLike) -> "Observations":
         """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
-        index = np.arange(self.alpha.size)[np.asarray(which)]
+        index = _chosen(which, self.alpha.size)
         known = {
             name: getattr(self, name)[index]
             for name in ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
@@ -218,6 +218,20 @@ class Observations(eqx.Module):
         names = [self.names[i] for i in index]
         other = jax.tree.map(lambda x: x[..., index], self.other)
         return Observations(self.alpha[index], self.p[index], words, restitution, **known, names=names, other=other)
+
+
+def _chosen(which: ArrayLike, count: int) -> np.ndarray:
+    """Numbers of the rocks that are meant."""
+    given = np.asarray(which) if isinstance(which, (list, tuple, np.ndarray, jax.Array, int, np.integer)) else None
+    good = given is not None and given.ndim == 1 and given.size
+    if good and given.dtype == bool:
+        good = given.size == count and given.any()
+    elif good:
+        good = given.dtype.kind in "iu" and (given >= -count).all() and (given < count).all()
+    if not good:
+        said = f"be numbers of some of {count} rocks, or a truth value for each"
+        raise ValueError(f"Argument `which` must {said}, but is {shown(which)}.")
+    return np.arange(count)[given]
 
 
 def _in_share(x):

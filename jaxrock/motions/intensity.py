@@ -51,6 +51,7 @@ def _peaks(motion: AbstractMotion):
     passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
     """
     knots = motion.knots
+    nodes, weights = (jnp.asarray(values, knots.dtype) for values in (_NODES, _WEIGHTS))
     parts = _PARTS if knots.size - 1 <= _FEW else 1
 
     def in_piece(piece, length):
@@ -64,8 +65,8 @@ def _peaks(motion: AbstractMotion):
 
         def gain(begin, width):
             """Velocity that is gained."""
-            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(_NODES)
-            return values @ _WEIGHTS * width / 2
+            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(nodes)
+            return values @ weights * width / 2
 
         begins = step * jnp.arange(parts)
         ends = jax.vmap(lambda local: jet(local)[0])(step * jnp.arange(parts + 1))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, as_real, delay, factor
+from jaxrock._checks import Values, delay, factor, if_known, not_nan
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
@@ -109,13 +109,13 @@ class AbstractMotion(eqx.Module):
         **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
         value after it.
         """
-        time = as_real("time", time).astype(self.knots.dtype)
+        time = if_known(not_nan, "time", time).astype(self.knots.dtype)
         knots = self.knots
 
         def at(t):
             piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
             value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
-            return jnp.where((t >= 0) & (t < knots[-1]), value, jnp.where(jnp.isnan(t), t, 0.0))
+            return jnp.where((t >= 0) & (t < knots[-1]), value, 0.0)
 
         return jax.vmap(at)(time.ravel()).reshape(time.shape)
 

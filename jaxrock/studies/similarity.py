@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import one_of, positive
+from jaxrock._checks import as_real, one_of, positive
 from jaxrock.blocks.rigid import Block
+from jaxrock.responses.history import Response
 
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
@@ -119,7 +120,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
 
 
 @arguments
-def master_curve(response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
+def master_curve(response: Response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
     """Rotation and velocity of a response in dimensionless terms.
 
     **Arguments:**
@@ -132,5 +133,5 @@ def master_curve(response, scales: Scales, dimensionless_time: ArrayLike) -> tup
 
     **Source:** Dimitrakopoulos & DeJong (2012), figures 6 and 11.
     """
-    rotation, velocity = response(jnp.asarray(dimensionless_time) * scales.time)
+    rotation, velocity = response(as_real("dimensionless_time", dimensionless_time) * scales.time)
     return rotation / scales.rotation, velocity / scales.velocity

@@ -9,13 +9,14 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from jaxrock._arguments import arguments, at_least
 from jaxrock._progress import Progress
 from jaxrock.sweeps.devices import exchange, meet, process
 from jaxrock.sweeps.grid import Grid, names_of
@@ -25,6 +26,7 @@ from jaxrock.sweeps.store import Store, create, fingerprint
 from jaxrock.transforms.fingerprint import Traced
 
 
+@arguments
 def sweep(
     function: Callable,
     /,
@@ -32,7 +34,7 @@ def sweep(
     outer: bool = True,
     store: str | Path | None = None,
     load: bool = True,
-    block: int | None = None,
+    block: Annotated[int | None, at_least(1)] = None,
     progress: bool | None = None,
     version: str | None = None,
     **axes: ArrayLike | Sequence,
@@ -67,8 +69,6 @@ def sweep(
     if not outer and len({values.size for values in lists.values()}) > 1:
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
-    if block is not None and block < 1:
-        raise ValueError(f"Argument `block` must be at least 1, but is {block}.")
 
     traced = Traced(function, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
     names = names_of(traced.shapes)

@@ -90,7 +90,7 @@ class Diffrax(AbstractEngine):
         atol: Annotated[float | None, known(inner_share)] = None,
         controller: diffrax.AbstractStepSizeController | None = None,
         adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),
-        max_solves: Annotated[int | None, at_least(1, 2**30)] = None,
+        max_solves: Annotated[int | None, at_least(1, 10**9)] = None,
     ):
         self._solver, self._controller, self._adjoint = Held.of(solver), Held.of(controller), Held.of(adjoint)
         self.rtol, self.atol, self.max_solves = rtol, atol, max_solves

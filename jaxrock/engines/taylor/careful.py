@@ -67,7 +67,7 @@ class Series(AbstractEngine):
 
     order: Annotated[int | None, at_least(4, 64)] = eqx.field(static=True, default=None)
     tolerance: Annotated[float | None, known(inner_share)] = eqx.field(static=True, default=None)
-    max_steps: Annotated[int | None, at_least(1, 2**30)] = eqx.field(static=True, default=None)
+    max_steps: Annotated[int | None, at_least(1, 10**9)] = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         check_fields(self)
