@@ -110,7 +110,7 @@ class Scene(eqx.Module):
             far_reset=far_reset,
             motion=motion,
             knots=knots,
-            lengths=jnp.concatenate([jnp.diff(knots), infinity]),
+            lengths=jnp.concatenate([motion.lengths, infinity]),
             scales=jnp.concatenate([scales, infinity]),
             ceilings=_running_maximum(bounds),
             vertical_ceilings=None if vertical is None else _running_maximum(jnp.pad(vertical, (0, 1))),

@@ -13,7 +13,7 @@ from jaxtyping import Array, Inexact
 
 from jaxrock._arguments import arguments, list_of, path_of
 from jaxrock._checks import whole
-from jaxrock._text import file_error, text_lines
+from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.hazard.curves import HazardCurve
 
 _FRONT = {"custom_site_id", "lon", "lat", "depth"}
@@ -113,7 +113,7 @@ def _read(path: Path) -> dict:
     columns = next(csv.reader(lines[1:2]), [])
     levels = _levels(name, columns)
     front = columns[: -levels.size]
-    names, positions, probabilities = [], [], []
+    names, positions, probabilities, printed = [], [], [], []
     for number, line in enumerate(lines[2:], 3):
         if not line.strip():
             continue
@@ -123,8 +123,11 @@ def _read(path: Path) -> dict:
         site = dict(zip(front, fields))
         names.append(site.pop("custom_site_id", ""))
         positions.append(_numbers(name, number, [site["lon"], site["lat"], site.get("depth", "0")]))
+        printed.append(fields[-1])
         probabilities.append(_falling(name, number, _numbers(name, number, fields[len(front) :])))
-    if not names:
+    if names:
+        check_end(name, lines, printed)
+    else:
         raise file_error(name, "holds no sites.")
     with np.errstate(divide="ignore"):
         rates = -np.log1p(-np.array(probabilities)) / time

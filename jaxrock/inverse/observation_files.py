@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxrock._arguments import path_of
-from jaxrock._text import file_error, text_lines
+from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.inverse.observations import SEEN, Observations
@@ -87,6 +87,8 @@ def read_observations(path: str | Path) -> Observations:
         except ValueError as error:
             raise file_error(path.name, f"line {number}: {error}") from None
         rocks.append(rock)
+    if header[-1] not in ("name", "observed"):
+        check_end(path.name, lines, [fields[-1] for _, fields in rows[1:]])
     return _observations(rocks, [rock["name"] or f"line {number}" for rock, (number, _) in zip(rocks, rows[1:])])
 
 

@@ -100,7 +100,8 @@ class Observations(eqx.Module):
         self.alpha, self.p = block.alpha, block.p
         if other is None:
             own = np.asarray(alpha)[np.asarray(self.follows)]
-            Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
+            if own.size:
+                Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
         self.restitution = jnp.where(self.follows, self.by_momentum(self.alpha), given)
         deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
         self.alpha_sd, self.p_sd, self.restitution_sd = (

@@ -89,7 +89,7 @@ def _peaks(motion: AbstractMotion):
         peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(jet(top)[0]))
         return peak, jax.vmap(gain, (0, None))(begins, step), turning
 
-    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), jnp.diff(knots))
+    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), motion.lengths)
     velocity = jnp.cumsum(gains.ravel())
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings.ravel())))

@@ -68,6 +68,18 @@ class AbstractMotion(eqx.Module):
         """Times that bound the smooth pieces, from 0 to the end of the motion [s], never decreasing."""
 
     @property
+    def lengths(self) -> Inexact[Array, " pieces"]:
+        """How long each piece lasts [s]. Blocks are followed by the time since the last knot: a motion that begins late
+        tells lengths that differences of rounded knots would not."""
+        return jnp.diff(self.knots)
+
+    @property
+    def lateness(self) -> Scalar | None:
+        """By how much parts of the motion may come too early or too late, one beside another, because their times are
+        rounded [s]; None: by nothing that the length of a piece does not tell."""
+        return None
+
+    @property
     @abc.abstractmethod
     def scales(self) -> Inexact[Array, " pieces"]:
         """Time in which the acceleration of each piece changes [s]; infinite for a straight line."""
@@ -161,6 +173,14 @@ class Scaled(AbstractMotion):
         return self.motion.knots
 
     @property
+    def lengths(self):
+        return self.motion.lengths
+
+    @property
+    def lateness(self):
+        return self.motion.lateness
+
+    @property
     def scales(self):
         return self.motion.scales
 
@@ -196,6 +216,15 @@ class Shifted(AbstractMotion):
     def knots(self):
         knots = self.motion.knots + self.delay
         return jnp.concatenate([jnp.zeros_like(knots[:1]), knots])
+
+    @property
+    def lengths(self):
+        inner = self.motion.lengths
+        return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
+
+    @property
+    def lateness(self):
+        return self.motion.lateness
 
     @property
     def scales(self):
@@ -259,6 +288,17 @@ def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> li
     return [a + b for a, b in zip(longer, shorter)] + longer[len(shorter) :]
 
 
+def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
+    """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
+
+    def is_shifted(node):
+        return isinstance(node, Shifted)
+
+    if not any(map(is_shifted, jax.tree.leaves(parts, is_leaf=is_shifted))):
+        return None
+    return sum((part.lateness for part in parts if part.lateness is not None), jnp.finfo(knots.dtype).eps * knots[-1])
+
+
 class Summed(AbstractMotion):
     """The sum of two motions (`motion + motion`); its pieces end wherever a piece of either ends."""
 
@@ -272,6 +312,10 @@ class Summed(AbstractMotion):
     @property
     def knots(self):
         return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
+
+    @property
+    def lateness(self):
+        return _lateness(self.knots, self.first, self.second)
 
     @property
     def _parts(self) -> tuple[_Pieces, _Pieces]:
@@ -322,6 +366,10 @@ class WithVertical(AbstractMotion):
     @property
     def knots(self):
         return jnp.sort(jnp.concatenate([self.horizontal.knots, self.vertical.knots]))
+
+    @property
+    def lateness(self):
+        return _lateness(self.knots, self.horizontal, self.vertical)
 
     @property
     def _parts(self) -> tuple[_Pieces, _Pieces]:

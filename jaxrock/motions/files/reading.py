@@ -10,7 +10,7 @@ from typing import Annotated
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least, path_of, word_of
-from jaxrock._checks import scalar, size
+from jaxrock._checks import one_of, scalar, size
 from jaxrock._text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
@@ -32,11 +32,15 @@ _COLUMNS = Columns(_WITH_HEADERS)
 FORMATS = {each.name: each for each in (*_WITH_HEADERS, _COLUMNS)}
 
 
+def _known_format(name: str, value: str) -> str:
+    return one_of(name, value, tuple(FORMATS))  # as the table is then
+
+
 @arguments
 def read_record(
     path: str | os.PathLike,
     *,
-    format: Annotated[str | None, word_of(*FORMATS)] = None,
+    format: Annotated[str | None, _known_format] = None,
     dt: ArrayLike | None = None,
     unit: Annotated[str | None, word_of(*PER_G)] = None,
     column: Annotated[int | None, at_least(0)] = None,
