@@ -230,7 +230,7 @@ CALLS: dict[str, Call] = {
         True,
         "derivative|value|intensity",
     ),
-    "sensitivity": Call(rk.sensitivity, SCENE, True, "distance|derivative|elasticity|condition"),
+    "sensitivity": Call(rk.sensitivity, SCENE, True, ".*"),
     "sensitivity_map": Call(
         rk.sensitivity_map,
         {"uplift_strength": [0.5], "pulse_duration": [2.0], "shape": 0.0, "alpha": 0.2, "restitution": 0.9, **QUICK},
@@ -244,7 +244,7 @@ CALLS: dict[str, Call] = {
         rk.self_similar_spectrum, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
     ),
     "overturning_map": Call(
-        rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
+        rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True, "max_rotation"
     ),
     "similarity.groups": Call(
         rk.similarity.groups, {"block": block(), "amplitude": 0.5, "frequency": 6.0, "kind": "rigid"}
@@ -484,7 +484,7 @@ NOT_CALLED = {
 
 def public_names() -> set[str]:
     """All that `import jaxrock` offers."""
-    names = {name for name in vars(rk) if not name.startswith("_")} | {"Diffrax", "plot"}
+    names = {name for name in vars(rk) if not name.startswith("_")} - {"TYPE_CHECKING"} | {"Diffrax", "plot"}
     return {name for name in names if not inspect.ismodule(getattr(rk, name))} | {
         name for name in names if name in ("closed_form", "restitution", "similarity", "plot")
     }

@@ -481,12 +481,37 @@ def test_wrong_kinds_are_named():
     """Where annotations are not checked, as tests do."""
     code = """
 import math, jaxrock as rk
+block, pulse = rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8)
 for make, words in (
     (lambda: rk.Series(order=8.0), "Argument `order` must be a whole number from 4 to 64, but is 8.0."),
     (lambda: rk.Series(order=math.nan), "Argument `order` must be a whole number from 4 to 64, but is nan."),
     (lambda: rk.Series(max_steps=1.5), "Argument `max_steps` must be a whole number from 1 to 1000000000, but is 1.5."),
     (lambda: rk.Suite([1.0]), "Argument `motions` must be a list of motions, but holds 1.0."),
     (lambda: rk.SinePulse(0.3, 0.8).with_vertical(0.1), "Argument `vertical` must be a motion, but is 0.1."),
+    (lambda: rk.Equation("x"), "Argument `restoring` must be a function, but is 'x'."),
+    (lambda: rk.Diffrax(solver="x"), "Argument `solver` must be a solver, but is 'x'."),
+    (lambda: rk.Unknown(0.1, 1.0, log="no"), "Argument `log` must be True or False, but is 'no'."),
+    (lambda: rk.Block([], 1.0), "Argument `alpha` must hold at least one number, but has shape (0,)."),
+    (lambda: rk.Block(0.1, True), "Argument `p` must be a number or an array of numbers, but is True."),
+    (lambda: rk.Block(0.1, "2"), "Argument `p` must be a number or an array of numbers, but is '2'."),
+    (lambda: rk.Block([0.1, 0.2], [1.0] * 3),
+     "Arguments `alpha` and `p` must have shapes that go together, but have (2,) and (3,)."),
+    (lambda: rk.outcome(block, pulse, "linear"),
+     "Argument `model` must be an equation of motion, such as Housner(), but is 'linear'."),
+    (lambda: rk.outcome(block, pulse, rk.Linear), "Argument `model` must be an equation of motion, such as Housner(), "
+     "but is the class Linear (without parentheses)."),
+    (lambda: rk.outcome(pulse, block),
+     "Argument `block` must be a Block, an AsymmetricBlock or a FlexibleBlock, but is a SinePulse."),
+    (lambda: rk.outcome(None, pulse),
+     "Argument `block` must be a Block, an AsymmetricBlock or a FlexibleBlock, but is None."),
+    (lambda: rk.outcome(block, pulse, initial=0.1), "Argument `initial` must be a pair, but is 0.1."),
+    (lambda: rk.outcome(block, pulse, engine="x"), "Argument `engine` must be an engine, but is 'x'."),
+    (lambda: rk.sweep(abs, p=[1.0], block=1.5), "Argument `block` must be a whole number, at least 1, but is 1.5."),
+    (lambda: rk.critical_amplitudes(block, 0 * pulse),
+     "Argument `motion` must move the ground, but its peak is 0 g."),
+    (lambda: rk.LogNormalFragility(0.3, 0.4)(-1.0), "Argument `level` must be 0 or more, but is -1.0."),
+    (lambda: rk.HazardCurve([0.1, 0.2], [0.02, 0.01]).rate(math.nan),
+     "Argument `level` must be 0 or more, but is nan."),
 ):
     try:
         make()

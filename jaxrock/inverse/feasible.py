@@ -146,5 +146,5 @@ def unexceeded_motion(
     by_rock = critical.lowest.reshape(*ways.shape, count).max(axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
-    complete = critical.complete.reshape(-1, size).all(axis=0)
+    complete = critical.complete.reshape(-1, count).all(axis=0)
     return Unexceeded(durations, amplitude, by_rock, weakest, complete)

@@ -193,6 +193,9 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
         return jnp.where(overturned, jnp.inf, value)
 
     tie = final.peak - final.second <= 1e-9 * final.peak
+    # A block that stands still in balance goes nowhere, however many steps it takes.
+    eps = jnp.finfo(state.closeness.dtype).eps
+    unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
     graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
     return Outcome(
         differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
@@ -204,5 +207,5 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
         overturned=overturned,
         margin=jnp.where(overturned, -final.closeness_beyond, final.closeness),
         error=unless_overturned(final.error),
-        status=Status.where(state.done, final.status, Status.step_budget_exhausted),
+        status=Status.where(state.done, final.status, unfinished),
     )

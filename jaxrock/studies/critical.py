@@ -33,6 +33,7 @@ from jaxrock.sweeps.sweep import surface
 
 _FIRST = 256  # intervals of the first sampling
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
+_LEAST = 1e-12  # [g]; amplitudes are factors on a motion
 _TIGHT = 4e-15  # width of a bracket, relative
 
 
@@ -178,7 +179,10 @@ class _Scenes(eqx.Module):
                 jnp.abs(named(block_, motion_)["amplitude"]),
             )
 
-        return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
+        found = cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
+        if not (found.peak > _LEAST).all():
+            raise ValueError(f"Argument `motion` must move the ground, but its peak is {found.peak.min():g} g.")
+        return found
 
 
 # What is varied: z is the logarithm of a factor.
