@@ -27,22 +27,25 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 
 
 def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
-    numbers = f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}."
     if _holds_no_number(value):
-        raise ValueError(numbers)
+        raise _no_number(name, value)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(numbers) from error
+        raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise ValueError(f"Argument `{name}` must be real, but is {shown(value)}.")
     if array.dtype == bool:
-        raise ValueError(numbers)
+        raise _no_number(name, value)
     usual = jnp.result_type(float)
     if not jnp.issubdtype(array.dtype, jnp.floating) or array.dtype.itemsize < usual.itemsize // 2:
         array = array.astype(usual)  # of integers, and of half precision
     # A Python float leaves a weak type behind, which would recompile every function it meets.
     return jax.lax.convert_element_type(array, array.dtype)
+
+
+def _no_number(name: str, value: Any) -> ValueError:
+    return ValueError(f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}.")
 
 
 def _holds_no_number(value: Any) -> bool:
@@ -81,11 +84,12 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     message = f"Argument `{name}` must {allowed}"
     if isinstance(array, jax.core.Tracer):
         return watched(array, message, _failed(holds)(array))
-    good = holds(np.asarray(array))
+    known = np.asarray(array)
+    good = holds(known)
     if isinstance(good, jax.core.Tracer):
         return watched(array, message, ~jnp.all(good))
-    known, good = np.broadcast_arrays(array, good)
-    if not good.all():
+    if not np.all(good):
+        known, good = np.broadcast_arrays(known, good)
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
 
@@ -178,9 +182,11 @@ def if_known(allowed: Range, name: str, value: Values) -> Inexact[Array, "..."]:
 
 def together(**arrays: Array | None) -> None:
     """Raise ValueError for arguments whose shapes do not go together."""
-    shapes = {name: jnp.shape(array) for name, array in arrays.items() if array is not None}
+    shapes = {name: array.shape for name, array in arrays.items() if array is not None}
+    if len({*shapes.values(), ()}) <= 2:
+        return
     try:
-        jnp.broadcast_shapes(*shapes.values())
+        np.broadcast_shapes(*shapes.values())
     except ValueError:
         names, given = (" and ".join(words) for words in ([f"`{n}`" for n in shapes], map(str, shapes.values())))
         raise ValueError(f"Arguments {names} must have shapes that go together, but have {given}.") from None

@@ -432,7 +432,7 @@ import warnings
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import jaxrock as rk
-    block, quick = rk.Block(0.2, 2.0), {"model": rk.Linear(), "engine": rk.Series(order=4)}
+    block, quick = BLOCK
     before = len(caught)
     results = [rk.outcome(block, rk.SinePulse(amplitude, 1.1), **quick) for amplitude in (0.5, 0.6)]
 for warning in caught:
@@ -441,9 +441,17 @@ print(before, len(caught), results[0].max_rotation.dtype)
 """
 
 
-def test_single_precision_warns_once():
+@pytest.mark.parametrize(
+    "block",
+    [
+        'rk.Block(0.2, 2.0), {"model": rk.Linear(), "engine": rk.Series(order=4)}',
+        "rk.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}",
+    ],
+    ids=["rigid", "flexible"],
+)
+def test_single_precision_warns_once(block):
     done = subprocess.run(
-        [sys.executable, "-c", SINGLE],
+        [sys.executable, "-c", SINGLE.replace("BLOCK", block)],
         cwd=Path(rk.__file__).parents[1],
         env=os.environ | {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": "cpu"},
         capture_output=True,

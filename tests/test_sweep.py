@@ -147,7 +147,7 @@ def test_what_fills_a_batch_up_is_one_of_its_points():
         ({"alpha": [[0.1]]}, "`alpha` must be a list"),
         ({"alpha": ["a"]}, "`alpha` must be a list .* type <U1"),
         ({"alpha": [0.1], "p": [1.0, 2.0], "outer": False}, "one length, but alpha has 1, p has 2"),
-        ({"alpha": [0.1], "p": [1.0], "block": 0}, "`block` must be at least 1, but is 0"),
+        ({"alpha": [0.1], "p": [1.0], "block": 0}, "`block` must be a whole number, at least 1, but is 0"),
         ({"alpha": [0.1], "p": [1.0], "load": False}, "`load` must be True"),
         ({"sum": [0.1]}, "other names than the axes"),
     ],
@@ -279,7 +279,7 @@ def test_cpu_devices_come_too_late():
     assert jax.device_count() == 2
     with pytest.raises(RuntimeError, match="already computes with 2 CPU devices: call `use_cpu_devices` before"):
         rk.use_cpu_devices(3)
-    with pytest.raises(ValueError, match="`count` must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="`count` must be a whole number from 1 to 65536, but is 0"):
         rk.use_cpu_devices(0)
 
 
