@@ -26,16 +26,51 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 
 
 def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
+    if _holds_no_number(value):
+        raise _no_number(name, value)
     try:
         array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"Argument `{name}` must be a number or an array of numbers, but is {value!r}.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise ValueError(f"Argument `{name}` must be real, but is {value!r}.")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
+        raise ValueError(f"Argument `{name}` must be real, but is {shown(value)}.")
+    if array.dtype == bool:
+        raise _no_number(name, value)
+    usual = jnp.result_type(float)
+    if not jnp.issubdtype(array.dtype, jnp.floating) or array.dtype.itemsize < usual.itemsize // 2:
+        array = array.astype(usual)  # of integers, and of half precision
     # A Python float leaves a weak type behind, which would recompile every function it meets.
     return jax.lax.convert_element_type(array, array.dtype)
+
+
+def _no_number(name: str, value: Any) -> ValueError:
+    return ValueError(f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}.")
+
+
+def _holds_no_number(value: Any) -> bool:
+    """Whether it holds what NumPy or JAX would take for a number: True, None."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_holds_no_number, value))
+    return value is None or isinstance(value, (bool, np.bool_, str, bytes))
+
+
+def shown(value: Any) -> str:
+    """What a message says that an argument is, in one short line."""
+    if isinstance(value, jax.core.Tracer):
+        return f"a traced array of shape {value.shape}"
+    if isinstance(value, type):
+        return f"the class {value.__name__} (without parentheses)"
+    if hasattr(type(value), "__dataclass_fields__"):
+        return f"a {type(value).__name__}"
+    if callable(value):
+        return f"the function {getattr(value, '__name__', type(value).__name__)}"
+    text = " ".join(repr(value).split())
+    if " at 0x" in text:  # Python's own, which says where it lies in memory
+        return f"an object of type {type(value).__name__}"
+    return text if len(text) <= _LONG else f"{text[: _LONG - 3]}..."
+
+
+_LONG = 80  # characters of a value in a message
 
 
 def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[Array, "..."]:
@@ -48,11 +83,12 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     message = f"Argument `{name}` must {allowed}"
     if isinstance(array, jax.core.Tracer):
         return watched(array, message, _failed(holds)(array))
-    good = holds(np.asarray(array))
+    known = np.asarray(array)
+    good = holds(known)
     if isinstance(good, jax.core.Tracer):
         return watched(array, message, ~jnp.all(good))
-    known, good = np.asarray(array), np.broadcast_to(np.asarray(good), array.shape)
-    if not good.all():
+    if not np.all(good):
+        known, good = np.broadcast_arrays(known, good)
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array
 
@@ -113,13 +149,46 @@ class Range(NamedTuple):
 positive = Range("be positive and finite", 0.0, np.inf, lambda x: (x > 0) & (x < np.inf))
 not_negative = Range("be 0 or more and finite", 0.0, np.inf, lambda x: (x >= 0) & (x < np.inf))
 finite = Range("be finite", -np.inf, np.inf, lambda x: (x > -np.inf) & (x < np.inf))
+level = Range("be 0 or more", 0.0, np.inf, lambda x: x >= 0)  # of a shaking; infinite: any
 not_nan = Range("be a number", -np.inf, np.inf, lambda x: x == x)  # some may be infinite
-acute = Range("be in (0, pi/2)", 0.0, np.pi / 2, lambda x: (x > 0) & (x < np.pi / 2))  # an angle below a right one
 share = Range("be in [0, 1]", 0.0, 1.0, lambda x: (x >= 0) & (x <= 1))
+inner_share = Range("be in (0, 1)", 0.0, 1.0, lambda x: (x > 0) & (x < 1))
+below_one = Range("be in [0, 1)", 0.0, 1.0, lambda x: (x >= 0) & (x < 1))
+
+# Of what blocks and motions are made. A block of 1e-9 rad is 1 m wide and a million kilometres high; one of p = 1e6
+# rad/s is smaller than an atom, one of 1e-6 rad/s as large as the solar system; 1e9 s are thirty years. Beyond, squares
+# of these numbers, and products of several, come to where floating-point numbers end (in single precision first), or
+# p times a duration to where rounding is all. Where a fit moves them the ends are open.
+acute = Range("be in (0, pi/2), and not below 1e-9", 0.0, np.pi / 2, lambda x: (x >= 1e-9) & (x < np.pi / 2))
+size = Range("be positive and finite, from 1e-9 to 1e9", 0.0, np.inf, lambda x: (x >= 1e-9) & (x <= 1e9))
+rate = Range("be positive and finite, from 1e-6 to 1e6", 0.0, np.inf, lambda x: (x >= 1e-6) & (x <= 1e6))
+ratio = Range("be positive and finite, from 1e-6 to 1e6", 0.0, np.inf, lambda x: (x >= 1e-6) & (x <= 1e6))
+strength = Range("be finite, and at most 1e9 in size", -np.inf, np.inf, lambda x: (x >= -1e9) & (x <= 1e9))
+factor = Range("be finite, and at most 1e30 in size", -np.inf, np.inf, lambda x: (x >= -1e30) & (x <= 1e30))
+span = Range("be positive and finite, and at most 1e12", 0.0, np.inf, lambda x: (x > 0) & (x <= 1e12))
+delay = Range("be 0 or more and finite, and at most 1e12", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e12))
 RANGES = {
     "positive": positive, "not_negative": not_negative, "finite": finite, "not_nan": not_nan, "acute": acute,
-    "share": share,
+    "share": share, "size": size, "rate": rate, "ratio": ratio, "strength": strength,
 }  # fmt: skip
+
+
+def if_known(allowed: Range, name: str, value: Values) -> Inexact[Array, "..."]:
+    """Return `value` as an array, of numbers in a range where they are known; what is traced is not looked at."""
+    array = as_real(name, value)
+    return array if isinstance(array, jax.core.Tracer) else allowed(name, array)
+
+
+def together(**arrays: Array | None) -> None:
+    """Raise ValueError for arguments whose shapes do not go together."""
+    shapes = {name: array.shape for name, array in arrays.items() if array is not None}
+    if len({*shapes.values(), ()}) <= 2:
+        return
+    try:
+        np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        names, given = (" and ".join(words) for words in ([f"`{n}`" for n in shapes], map(str, shapes.values())))
+        raise ValueError(f"Arguments {names} must have shapes that go together, but have {given}.") from None
 
 
 def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
@@ -129,22 +198,18 @@ def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
     return array
 
 
-def whole(name: str, value: int | None, least: int) -> None:
-    """Raise ValueError for what is no whole number from `least` on, or None."""
+def whole(name: str, value: Any, least: int | None = None, most: int | None = None) -> int:
+    """Return `value` if it is a whole number, from `least` up to `most`."""
     good = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if value is not None and not (good and value >= least):
-        raise ValueError(f"Argument `{name}` must be a whole number, at least {least}, but is {value!r}.")
-
-
-def instance(name: str, value: Any, kind: type, words: str) -> None:
-    """Raise ValueError for what is not of a kind."""
-    if not isinstance(value, kind):
-        raise ValueError(f"Argument `{name}` must be {words}, but is {value!r}.")
+    if not (good and (least is None or value >= least) and (most is None or value <= most)):
+        ends = "" if least is None else f", at least {least}" if most is None else f" from {least} to {most}"
+        raise ValueError(f"Argument `{name}` must be a whole number{ends}, but is {shown(value)}.")
+    return int(value)
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return `value` if it is one of the allowed words."""
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         words = ", ".join(repr(word) for word in allowed)
-        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {shown(value)}.")
     return value

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxrock._checks import RANGES, Range, finite, one_of
+from jaxrock._checks import RANGES, Range, finite, one_of, together
 
 
 class Parameter(NamedTuple):
@@ -52,7 +52,8 @@ def parameter(
 
     - `unit`: such as "rad", "s", "g", or "-".
     - `range`: the numbers that are allowed: "positive", "not_negative" (0 or more), "finite", "acute" (in (0, pi/2)),
-      "share" (in [0, 1]), or "not_nan".
+      "share" (in [0, 1]), or "not_nan"; "size" (1e-9 to 1e9: lengths, times), "rate" (1e-6 to 1e6: frequency
+      parameters), "ratio" (the same), or "strength" (up to 1e9 in size: accelerations).
     - `symbol`: as formulas write it; empty: the name.
     - `axes`: 0 for a number, 1 for a list that belongs to the whole (samples of a record).
     - `follows`: name of the property that tells its value where the field is None.
@@ -79,7 +80,12 @@ def set_parameters(owner: eqx.Module, **values) -> None:
     """
     known = declared(type(owner))
     for name, value in values.items():
-        setattr(owner, name, known[name].range(name, value))
+        called = known[name].argument or name
+        array = known[name].range(called, value)
+        if array.size == 0:
+            raise ValueError(f"Argument `{called}` must hold at least one number, but has shape {array.shape}.")
+        setattr(owner, name, array)
+    together(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
 
 
 class Leaf(NamedTuple):

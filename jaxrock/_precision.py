@@ -1,6 +1,7 @@
 """A word, once, where numbers are single precision by default."""
 
 import functools
+import sys
 import warnings
 
 import jax
@@ -17,8 +18,13 @@ def _say() -> None:
     warnings.warn(
         "jaxrock runs in single precision here: expect 5 digits. For 13, put "
         '`jax.config.update("jax_enable_x64", True)` before the first computation.',
-        stacklevel=_LEVEL,
+        stacklevel=_frames_of_the_package() + 1,
     )
 
 
-_LEVEL = 5  # from here to who called `outcome` or `simulate`
+def _frames_of_the_package() -> int:
+    """Of those that lead to the caller of this: after them comes who called the package."""
+    frame, count = sys._getframe(1), 0
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
+        frame, count = frame.f_back, count + 1
+    return count

@@ -9,6 +9,28 @@ def file_error(name: str, text: str) -> ValueError:
     return ValueError(f"File `{name}`: {text}")
 
 
+def check_end(name: str, lines: list[str], numbers: list[str], by_program: bool = False) -> None:
+    """Raise ValueError where a file may have been cut within its last number.
+
+    It is whole where a line end comes after it, or where it is printed as all others are: with as many digits after the
+    point and as long an exponent. What is written `by_program` in one form must be so even before a line end.
+    `numbers`: as they are printed, or the last column of them.
+    """
+    *before, last = map(_shape, numbers)
+    alike = len(before) > 1 and len(set(before)) == 1 and before[0] != (0, 0)
+    ended = not lines[-1].strip()
+    if alike and last != before[0] and (by_program or not ended):
+        raise file_error(name, f"the last number, {numbers[-1]!r}, is not printed as all others: the file is cut off.")
+    if not ended and not alike:
+        raise file_error(name, "ends without a line end, so that its last number may be cut off: add one if it is not.")
+
+
+def _shape(text: str) -> tuple[int, int]:
+    """Digits after the point, and characters of the exponent."""
+    mantissa, exponent, power = text.strip().upper().replace("D", "E").partition("E")
+    return len(mantissa.partition(".")[2]), len(exponent + power)
+
+
 def text_lines(path: Path) -> list[str]:
     """The lines of a text file, without their ends."""
     data = path.read_bytes()

@@ -25,7 +25,7 @@ def cosine(opening, block):
     [
         ({"rtol": 0.0}, "Argument `rtol` must be in (0, 1), but is 0.0."),
         ({"atol": -1.0}, "Argument `atol` must be in (0, 1), but is -1.0."),
-        ({"max_solves": 0}, "Argument `max_solves` must be at least 1, but is 0."),
+        ({"max_solves": 0}, "Argument `max_solves` must be a whole number from 1 to 1000000000, but is 0."),
         ({"adjoint": diffrax.BacksolveAdjoint()}, "Argument `adjoint` must be one of"),
     ],
 )

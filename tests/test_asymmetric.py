@@ -257,7 +257,7 @@ BAD = {
     "a tip": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (-1, 1)]), "must have a flat base"),
     "position": (
         lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 0), (1, 2), (0, 2)], supports=(1, 4)),
-        "must be positions in the outline",
+        "`supports` must be a whole number from -4 to 3, but is",
     ),
 }
 

@@ -114,7 +114,7 @@ def test_a_file_of_rocks_with_two_sides(tmp_path):
         (HEADER, "a,10,95,0.5,1,1,0,,,toppled", r"line 2: Argument `alpha2` must be in \(0, pi/2\)"),
         (HEADER, "a,10,,0.5,1,1,0,,,toppled", "line 2: `alpha2` is empty"),
         (HEADER, "a,10,12,0.5,1,0,0,,,toppled", "line 2: `radius2_m` must be positive"),
-        (HEADER, "a,10,12,0.5,1,1,0,1.2,,toppled", r"line 2: Argument `inertia_ratio` must be in \(0, 1\]"),
+        (HEADER, "a,10,12,0.5,1,1,0,1.2,,toppled", r"line 2: `inertia_ratio` must be in \(0, 1\]"),
         (HEADER, "a,10,12,0.5,1,1,0,,2,toppled", "line 2: Argument `facing` must be 1, -1 or 0"),
         ("alpha1_deg,radius1_m,radius2_m,observed", "10,1,1,toppled", "must have both columns alpha1_deg and alpha2_d"),
         ("alpha1_deg,alpha2_deg,half_diagonal_m,observed", "10,12,1,toppled", "columns of both sides"),

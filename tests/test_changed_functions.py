@@ -352,7 +352,9 @@ def test_a_model_that_holds_an_equation():
 
 
 def test_checks_of_a_users_pulse_tell_the_point():
-    with pytest.raises(ValueError, match=r"`period` must be positive and finite, but is not at the point \(2, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"`period` must be positive and finite, from 1e-9 to 1e9, but is not at the point \(2, 3\)"
+    ):
         rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, -t), progress=False)
     rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, t), progress=False)
 

@@ -44,7 +44,7 @@ def at2(tmp_path):
 def column(tmp_path):
     """The same record as a column of cm/s2."""
     path = tmp_path / "motion.csv"
-    path.write_text("acceleration\n" + "\n".join(repr(float(a) * 980.665) for a in SAMPLES))
+    path.write_text("acceleration\n" + "".join(f"{float(a) * 980.665!r}\n" for a in SAMPLES))
     return str(path)
 
 
@@ -262,20 +262,20 @@ BAD = {
     "no unit": (["run", "motion.txt", "--dt", "0.02"], "Argument `unit` must be 'g', 'm/s2' or 'cm/s2'"),
     "wrong unit": ([*FILE, "--unit", "ft/s2"], "Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft/s2'"),
     "no dt": (["run", "motion.txt", "--unit", "g"], "Argument `dt` must be given"),
-    "dt 0": ([*FILE, "--dt", "0"], "Argument `dt` must be positive and finite, but is 0.0"),
-    "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `dt` must be positive and finite, but is -0.01"),
-    "dt NaN": ([*FILE, "--dt", "nan"], "Argument `dt` must be positive and finite, but is nan"),
+    "dt 0": ([*FILE, "--dt", "0"], "Argument `dt` must be positive and finite, .*, but is 0.0"),
+    "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `dt` must be positive and finite, .*, but is -0.01"),
+    "dt NaN": ([*FILE, "--dt", "nan"], "Argument `dt` must be positive and finite, .*, but is nan"),
     "column 3": ([*FILE, "--column", "3"], "Argument `column` must be 0 to 0, .*, but is 3"),
-    "column -1": ([*FILE, "--column", "-1"], "Argument `column` must be an integer, 0 or more, but is -1"),
+    "column -1": ([*FILE, "--column", "-1"], "Argument `column` must be a whole number, at least 0, but is -1"),
     "dt without file": (["run", "--dt", "0.01"], "Option --dt describes a file, but no RECORD is given"),
     "unit without file": (["spectrum", "--unit", "g"], "Option --unit describes a file, but no RECORD is given"),
-    "width negative": (["run", "--width", "-0.6"], "Argument `width` must be positive and finite, but is -0.6"),
-    "width 0": (["run", "--width", "0"], "Argument `width` must be positive and finite, but is 0.0"),
-    "height NaN": (["run", "--height", "nan"], "Argument `height` must be positive and finite, but is nan"),
+    "width negative": (["run", "--width", "-0.6"], "Argument `width` must be positive and finite, .*, but is -0.6"),
+    "width 0": (["run", "--width", "0"], "Argument `width` must be positive and finite, .*, but is 0.0"),
+    "height NaN": (["run", "--height", "nan"], "Argument `height` must be positive and finite, .*, but is nan"),
     "stocky": (["run", "--width", "6"], "Argument `alpha` must be at most 0.955"),
     "restitution 2": (["run", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
-    "duration 0": (["run", "--duration", "0"], "Argument `duration` must be positive and finite, but is 0.0"),
-    "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, but is nan"),
+    "duration 0": (["run", "--duration", "0"], "Argument `duration` must be positive and finite, .*, but is 0.0"),
+    "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, .*, but is nan"),
     "spectrum, missing file": (["spectrum", "missing.AT2"], "No such file or directory"),
     "spectrum, points 0": (["spectrum", "--points", "0"], "Argument `--points` must be at least 1, but is 0"),
     "spectrum, slenderness 0": (
@@ -294,7 +294,7 @@ BAD = {
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
     "map, restitution 2": (["map", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
     "map, shape of a sine": (["map", "--shape", "1"], "Argument `--shape` is not a parameter of the pulse sine"),
-    "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), but is 2.0"),
+    "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), .*, but is 2.0"),
     "map, ratio from 0": (
         ["map", "--frequency-ratio", "0", "8"],
         "`--frequency-ratio` must be positive, finite and in order, but is 0 to 8",
@@ -311,7 +311,7 @@ BAD = {
 @pytest.mark.parametrize("words, error", BAD.values(), ids=BAD)
 def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
     """Exit status 2, one line on the error stream, nothing else printed, nothing written."""
-    (tmp_path / "motion.txt").write_text("\n".join(map(str, SAMPLES)))
+    (tmp_path / "motion.txt").write_text("".join(f"{a}\n" for a in SAMPLES))
     (tmp_path / "words.txt").write_text("shaken, not stirred\n")
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
@@ -329,7 +329,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
         (["map", "--points", "many"], "argument --points: invalid int value: 'many'"),
         (["map", "--pulse", "wave"], "argument --pulse: invalid choice: 'wave'"),
         (["map", "--intensity", "2"], "argument --intensity: expected 2 arguments"),
-        (["run", "--width", "wide"], "argument --width: invalid float value: 'wide'"),
+        (["run", "--width", "wide"], "argument --width: invalid number value: 'wide'"),
         (["run", "--colour", "red"], "unrecognized arguments: --colour"),
     ],
 )

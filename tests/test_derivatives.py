@@ -11,7 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
-from jaxrock.motions.motion import Shaking
+from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
 from references.in_jaxrock import MODELS, PULSES
 

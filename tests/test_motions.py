@@ -451,3 +451,40 @@ def test_a_batch_of_motions_is_made_at_once():
         found = jax.jit(jax.vmap(lambda m: m.acceleration(TIMES)))(many)
         expected = np.stack([acceleration(one(i), TIMES) for i in range(3)])
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
+
+
+# ------------------------------------------------------------------------------------------ late motions
+
+LATE = rk.SinePulse(0.3, 0.8)
+
+
+@pytest.mark.parametrize("delay", [1e3, 1e6, 1e9, 1e12])
+def test_a_late_motion_does_what_it_does_early(delay):
+    """Its knots are rounded to 1e-4 s at 1e12 s; how long its pieces last is not."""
+    block, quick = rk.Block(0.2, 2.0), {"engine": rk.Series(order=8)}
+    early, late = (
+        jax.jit(lambda m: rk.outcome(block, m, **quick))(m) for m in (LATE.shifted(0.0), LATE.shifted(delay))
+    )
+    for name in ("max_rotation", "max_velocity", "margin"):
+        np.testing.assert_allclose(getattr(late, name), getattr(early, name), rtol=1e-15)
+    assert late.impact_count == early.impact_count
+
+
+@pytest.mark.parametrize("delay", [1e6, 1e9, 9e11])
+def test_two_late_motions_say_how_late_they_may_be(delay):
+    """Of a sum the rounded times of the one beside the other count, and `error` knows."""
+    block, quick = rk.Block(0.2, 2.0), {"engine": rk.Series(order=8)}
+    outcome = jax.jit(lambda t: rk.outcome(block, LATE.shifted(t) - 0.1 * LATE.shifted(t + 0.5), **quick))
+    early, late = outcome(0.0), outcome(delay)
+    off = abs(float(late.max_rotation - early.max_rotation))
+    assert off <= float(late.error) <= 1e-14 * delay
+    assert float(early.error) < 1e-13
+
+
+def test_late_in_single_precision():
+    """Where times are rounded to 64 s."""
+    block = rk.Block(np.float32(0.2), np.float32(2.0))
+    motion = rk.SinePulse(np.float32(0.3), np.float32(0.8))
+    early, late = (rk.outcome(block, m).max_rotation for m in (motion, motion.shifted(np.float32(1e9))))
+    assert early.dtype == late.dtype == np.float32
+    np.testing.assert_allclose(late, early, rtol=1e-6)

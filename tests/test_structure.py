@@ -289,6 +289,7 @@ def test_unknown_names_raise():
 
 # What a module holds and changes while the program runs: every thread sees it. Why that is safe:
 SHARED = {
+    "_garbage._pauses": "under its lock",
     "native.machine._registered": "under a lock",
     "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
     "sweeps.grid._examples": "changed at import only",

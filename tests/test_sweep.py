@@ -287,7 +287,7 @@ def test_cpu_devices_come_too_late():
     assert jax.device_count() == 2
     with pytest.raises(RuntimeError, match="already computes with 2 CPU devices: call `use_cpu_devices` before"):
         rk.use_cpu_devices(3)
-    with pytest.raises(ValueError, match="`count` must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="`count` must be a whole number from 1 to 65536, but is 0"):
         rk.use_cpu_devices(0)
 
 

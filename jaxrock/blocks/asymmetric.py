@@ -1,10 +1,14 @@
 """Asymmetric blocks: two corners, each with a slenderness, a frequency parameter and a restitution of its own."""
 
+from typing import Annotated
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, Values, acute, checked, finite, not_negative, positive
+from jaxrock._arguments import arguments, pair
+from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of
@@ -13,7 +17,8 @@ from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
 
-_ratio_of_inertia = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
+ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
+_gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e9))
 
 
 class AsymmetricBlock(eqx.Module):
@@ -43,9 +48,9 @@ class AsymmetricBlock(eqx.Module):
 
     alpha1: Real = parameter("rad", acute)
     alpha2: Real = parameter("rad", acute)
-    p1: Real = parameter("rad/s", positive)
-    inertia_ratio: Real = parameter("-", _ratio_of_inertia)
-    given_radius_ratio: Real | None = parameter("-", positive, follows="radius_ratio", argument="radius_ratio")
+    p1: Real = parameter("rad/s", rate)
+    inertia_ratio: Real = parameter("-", ratio_of_inertia)
+    given_radius_ratio: Real | None = parameter("-", ratio, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
 
     def __init__(
@@ -58,9 +63,11 @@ class AsymmetricBlock(eqx.Module):
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
     ):
         set_parameters(self, alpha1=alpha1, alpha2=alpha2, p1=p1, inertia_ratio=inertia_ratio)
-        self.given_radius_ratio = None if radius_ratio is None else positive("radius_ratio", radius_ratio)
-        pair = isinstance(restitution, (tuple, list))
-        self.law = PerSide(*restitution) if pair else law_of(restitution, AngularMomentum())
+        self.given_radius_ratio = None
+        if radius_ratio is not None:
+            set_parameters(self, given_radius_ratio=radius_ratio)
+        two = isinstance(restitution, (tuple, list))
+        self.law = PerSide(*pair("restitution", restitution)) if two else law_of(restitution, AngularMomentum())
 
     @classmethod
     def from_radii(
@@ -86,10 +93,11 @@ class AsymmetricBlock(eqx.Module):
 
         **Raises:** ValueError for a value outside its range.
         """
-        first, second, gravity = positive("R1", R1), positive("R2", R2), positive("gravity", gravity)
-        gyration = not_negative("gyration_radius", gyration_radius)
-        ratio = first**2 / (first**2 + gyration**2)
-        return cls(alpha1, alpha2, jnp.sqrt(gravity * ratio / first), ratio, second / first, restitution)
+        first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
+        gyration = _gyration("gyration_radius", gyration_radius)
+        together(R1=first, R2=second, gyration_radius=gyration, gravity=gravity)
+        kappa = first**2 / (first**2 + gyration**2)
+        return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
 
     @classmethod
     def from_frequencies(
@@ -114,11 +122,13 @@ class AsymmetricBlock(eqx.Module):
         **Raises:** ValueError for a value outside its range, or a p2 that no distance of the second corner gives.
         """
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
-        rate = (positive("p2", p2) / positive("p1", p1)) ** 2
-        inner = 1 - 4 * rate**2 * kappa * (1 - kappa)
+        p1, p2 = rate("p1", p1), rate("p2", p2)
+        together(p1=p1, p2=p2, inertia_ratio=kappa)
+        square = (p2 / p1) ** 2
+        inner = 1 - 4 * square**2 * kappa * (1 - kappa)
         largest = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
-        checked("p2", p2, largest, lambda _: inner >= 0)
-        return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * rate * kappa), restitution)
+        checked("p2", jnp.broadcast_to(p2, inner.shape), largest, lambda _: inner >= 0)
+        return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
 
     @classmethod
     def from_corners(
@@ -143,24 +153,25 @@ class AsymmetricBlock(eqx.Module):
         **Raises:** ValueError where the block would not stand.
         """
         places = {"corner1": corner1, "corner2": corner2, "centre": centre}
-        right, left, centre = (finite(name, place) for name, place in places.items())
+        right, left, centre = (strength(name, place) for name, place in places.items())
         for name, place in zip(places, (right, left, centre)):
             if place.shape != (2,):
                 raise ValueError(f"Argument `{name}` must have shape (2,), but has {place.shape}.")
-        width1 = positive("corner1[0] - centre[0]", right[0] - centre[0])
-        width2 = positive("centre[0] - corner2[0]", centre[0] - left[0])
-        height1 = positive("centre[1] - corner1[1]", centre[1] - right[1])
-        height2 = positive("centre[1] - corner2[1]", centre[1] - left[1])
+        width1 = size("corner1[0] - centre[0]", right[0] - centre[0])
+        width2 = size("centre[0] - corner2[0]", centre[0] - left[0])
+        height1 = size("centre[1] - corner1[1]", centre[1] - right[1])
+        height2 = size("centre[1] - corner2[1]", centre[1] - left[1])
         alphas = jnp.arctan2(width1, height1), jnp.arctan2(width2, height2)
         radii = jnp.hypot(width1, height1), jnp.hypot(width2, height2)
         return cls.from_radii(*alphas, *radii, gyration_radius, restitution, gravity)
 
     @classmethod
+    @arguments
     def from_outline(
         cls,
         outline: Values,
         *,
-        supports: tuple[int, int] | None = None,
+        supports: Annotated[tuple[int, int] | None, pair] = None,
         centre: Values | None = None,
         gyration_radius: ArrayLike | None = None,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, checked, one_of, positive
+from jaxrock._checks import Range, below_one, checked, one_of, size, whole
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
@@ -14,7 +14,7 @@ from jaxrock.blocks.rigid import GRAVITY
 
 Real = Inexact[Array, "..."]
 
-_damping = Range("be in [0, 1)", 0.0, 1.0, lambda x: (x >= 0) & (x < 1))
+_stiff = Range("be positive and finite, from 1e-9 to 1e30", 0.0, math.inf, lambda x: (x >= 1e-9) & (x <= 1e30))
 
 
 class FlexibleBlock(eqx.Module):
@@ -53,13 +53,13 @@ class FlexibleBlock(eqx.Module):
     figure 3b, or the rigid-plastic law of figure 3c; Vassiliou, Mackie & Stojadinovic (2016).
     """
 
-    width: Real = parameter("m", positive)
-    height: Real = parameter("m", positive)
-    youngs_modulus: Real = parameter("Pa", positive, symbol="E")
-    density: Real = parameter("kg/m^3", positive)
-    damping_ratio: Real = parameter("-", _damping)
+    width: Real = parameter("m", size)
+    height: Real = parameter("m", size)
+    youngs_modulus: Real = parameter("Pa", _stiff, symbol="E")
+    density: Real = parameter("kg/m^3", size)
+    damping_ratio: Real = parameter("-", below_one)
     law: AbstractRestitution
-    gravity: Real = parameter("m/s^2", positive)
+    gravity: Real = parameter("m/s^2", size)
     masses: int = eqx.field(static=True)
     damping: str = eqx.field(static=True)
     impacts: str = eqx.field(static=True)
@@ -84,9 +84,7 @@ class FlexibleBlock(eqx.Module):
         self.impacts = one_of("impacts", impacts, ("alternate", "every"))
         self.base = one_of("base", base, ("linear", "plastic"))
         least = 3 if damping == "rayleigh" else 2
-        if not isinstance(masses, int) or not least <= masses <= 60:
-            raise ValueError(f"Argument `masses` must be a whole number from {least} to 60, but is {masses!r}.")
-        self.masses = masses
+        self.masses = whole("masses", masses, least, 60)
         set_parameters(self, width=width, height=height, youngs_modulus=youngs_modulus, density=density)
         set_parameters(self, damping_ratio=damping_ratio, gravity=gravity)
         self.law = law_of(restitution, Housner())

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._checks import Values, finite
+from jaxrock._checks import Values, strength, whole
 
 
 class Outline(NamedTuple):
@@ -22,7 +22,7 @@ class Outline(NamedTuple):
 
         **Raises:** ValueError where it has fewer than three vertices, no area, or crosses itself.
         """
-        given = np.asarray(finite("outline", outline), float)
+        given = np.asarray(strength("outline", outline), float)
         if given.ndim != 2 or given.shape[1] != 2 or len(given) < 3:
             raise ValueError(f"Argument `outline` must have shape (n, 2) with n at least 3, but has {given.shape}.")
         order = np.arange(len(given))
@@ -43,8 +43,7 @@ class Outline(NamedTuple):
 
     def at(self, position: int) -> np.ndarray:
         """Vertex at a position in the outline as given."""
-        if not -len(self.order) <= position < len(self.order):
-            raise ValueError(f"Argument `supports` must be positions in the outline, but holds {position}.")
+        position = whole("supports", position, -len(self.order), len(self.order) - 1)
         return self.vertices[np.flatnonzero(self.order == position % len(self.order))[0]]
 
     def flat_base(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,14 +1,30 @@
 """Blocks whose parameters are uncertain, as random draws."""
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jaxtyping import ArrayLike
 
+from jaxrock._arguments import arguments, at_least
+from jaxrock._checks import not_negative, scalar
+from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import Block
 
 
+def _deviation(name: str, value: ArrayLike) -> float:
+    return float(scalar(name, not_negative(name, value)))
+
+
+@arguments
 def draw_blocks(
-    block: Block, draws: int, *, alpha: float = 0.0, p: float = 0.0, restitution: float = 0.0, seed: int = 0
+    block: Block,
+    draws: Annotated[int, at_least(1)],
+    *,
+    alpha: Annotated[float, _deviation] = 0.0,
+    p: Annotated[float, _deviation] = 0.0,
+    restitution: Annotated[float, _deviation] = 0.0,
+    seed: Annotated[int, at_least(0, 2**32 - 1)] = 0,
 ) -> Block:
     """Blocks whose parameters are uncertain, as random draws.
 
@@ -25,11 +41,7 @@ def draw_blocks(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
-    if draws < 1:
-        raise ValueError(f"Argument `draws` must be at least 1, but is {draws}.")
-    for name, value in (("alpha", alpha), ("p", p), ("restitution", restitution)):
-        if not 0 <= value < np.inf:
-            raise ValueError(f"Argument `{name}` must be 0 or more and finite, but is {value}.")
+    check_single(block=block)
     keys = jax.random.split(jax.random.key(seed), 3)
     normal = [jax.random.normal(key, (draws,)) for key in keys[:2]]
     alphas, ps = block.alpha * jnp.exp(alpha * normal[0]), block.p * jnp.exp(p * normal[1])

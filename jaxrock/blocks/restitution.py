@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, not_negative, positive, share
+from jaxrock._checks import checked, not_negative, share, size, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -87,7 +87,7 @@ class Constant(AbstractRestitution):
     value: Real = parameter("-", share, symbol="e", argument="restitution")
 
     def __init__(self, value: ArrayLike):
-        self.value = share("restitution", value)
+        set_parameters(self, value=value)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """The value."""
@@ -150,6 +150,7 @@ class PerSide(AbstractRestitution):
 
     def __init__(self, first: ArrayLike, second: ArrayLike):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
+        together(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
         checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
 
@@ -178,7 +179,7 @@ class SpeedDependent(AbstractRestitution):
 
     gentle: Real = parameter("-", share)
     violent: Real = parameter("-", share)
-    scale: Real = parameter("rad/s", positive)
+    scale: Real = parameter("rad/s", size)
 
     def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, positive
+from jaxrock._checks import acute, rate, size, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fitting_alpha, law_of
 
@@ -31,7 +31,7 @@ class Block(eqx.Module):
     """
 
     alpha: Inexact[Array, "..."] = parameter("rad", acute)
-    p: Inexact[Array, "..."] = parameter("rad/s", positive)
+    p: Inexact[Array, "..."] = parameter("rad/s", rate)
     law: AbstractRestitution
 
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None):
@@ -60,9 +60,10 @@ class Block(eqx.Module):
 
         **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.2.
         """
-        width, height = positive("width", width), positive("height", height)
+        width, height, gravity = size("width", width), size("height", height), size("gravity", gravity)
+        together(width=width, height=height, gravity=gravity)
         half_diagonal = jnp.hypot(width, height) / 2
-        frequency = jnp.sqrt(3 * positive("gravity", gravity) / (4 * half_diagonal))
+        frequency = jnp.sqrt(3 * gravity / (4 * half_diagonal))
         return cls(jnp.arctan2(width, height), frequency, restitution)
 
     @property

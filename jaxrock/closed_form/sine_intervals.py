@@ -1,13 +1,18 @@
 """Every interval of intensity that overturns a block under one cycle of a sine; terms as in `sine_pulse`."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxrock._checks import positive, share
+from jaxrock._arguments import arguments, at_least, known
+from jaxrock._checks import Range, share
 from jaxrock.closed_form import _sine_arcs as arcs
 from jaxrock.closed_form.sine_limits import after_pulse_limits, impact_time_limit, no_impact_limit
 
+_above_one = Range("be above 1, and at most 1e6", 1.0, np.inf, lambda x: (x > 1) & (x <= 1e6))
+_ratio = Range("be positive, from 1e-3 to 1e3", 0.0, np.inf, lambda x: (x >= 1e-3) & (x <= 1e3))
 _MOST_DROP = 8  # impacts lost from one sample to the next, where turns are sought one by one
 
 
@@ -25,8 +30,13 @@ class OverturningIntervals(eqx.Module):
     searched_from: float
 
 
+@arguments
 def overturning_intervals(
-    frequency_ratio: float, restitution: float, *, searched_from: float = 1.0001, points: int = 4096
+    frequency_ratio: Annotated[float, known(_ratio)],
+    restitution: Annotated[float, known(share)],
+    *,
+    searched_from: Annotated[float, known(_above_one)] = 1.0001,
+    points: Annotated[int, at_least(2, 10**7)] = 4096,
 ) -> OverturningIntervals:
     """Every interval of intensity that overturns a block, the islands with 3, 5, 7... impacts included.
 
@@ -42,8 +52,7 @@ def overturning_intervals(
     **Source:** D&D 3.10, 3.18, 3.20 and, for more impacts, the same condition after each arc in closed form; what
     the paper calls complete covers frequency ratios above 1.05 only.
     """
-    ratio = float(positive("frequency_ratio", frequency_ratio))
-    restitution = float(share("restitution", restitution))
+    ratio = frequency_ratio
     limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
     samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
     values, impacts = _at(samples, ratio, restitution)

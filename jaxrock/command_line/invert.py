@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import check_points, extent_of, model_of, other_parameters
+from jaxrock.command_line.options import check_points, extent_of, model_of, number, other_parameters
 from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
 
@@ -30,7 +30,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "sides alpha1_deg,alpha2_deg,radius1_m,radius2_m,facing,observed",
     )
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="kind of motion (default sine)")
-    ends = {"type": float, "nargs": 2, "metavar": ("FROM", "TO")}
+    ends = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
     parser.add_argument("--amplitude", default=(0.02, 3.0), help="range of the amplitude [g] (default 0.02 3)", **ends)
     parser.add_argument(
         "--duration", default=(0.1, 5.0), help="range of duration or period [s] (default 0.1 5)", **ends
@@ -41,11 +41,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         shown = "" if known is None else f" (default {known[0]:g} {known[1]:g})"
         parser.add_argument(f"--{name}", default=known, help=f"range of the {name} of the pulse {words}{shown}", **ends)
     parser.add_argument(
-        "--scatter", type=float, default=0.3, help="standard deviation of ln amplitude from rock to rock (default 0.3)"
+        "--scatter", type=number, default=0.3, help="standard deviation of ln amplitude from rock to rock (default 0.3)"
     )
     parser.add_argument(
         "--lapse",
-        type=float,
+        type=number,
         default=0.02,
         help="probability that what was seen of a rock says nothing: moved, misjudged (default 0.02)",
     )
@@ -122,7 +122,7 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
         if name not in known or name in priors:
             raise ValueError(f"Argument `--prior` must name each of {', '.join(known)} at most once, but names {name}.")
         try:
-            priors[name] = float(numbers[0]), float(numbers[1])
+            priors[name] = number(numbers[0]), number(numbers[1])
         except ValueError:
             said = f"{name} {' '.join(numbers)}"
             raise ValueError(f"Argument `--prior` must end with two numbers, but is {said}.") from None

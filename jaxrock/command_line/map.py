@@ -6,15 +6,23 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import add_pulse, add_restitution, check_points, check_range, model_of, pulse_of
+from jaxrock.command_line.options import (
+    add_pulse,
+    add_restitution,
+    check_points,
+    check_range,
+    model_of,
+    number,
+    pulse_of,
+)
 from jaxrock.command_line.output import save, status_of_surface, table, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_restitution(parser)
-    parser.add_argument("--alpha", type=float, default=0.2, help="slenderness angle [rad] (default 0.2)")
-    parser.add_argument("--frequency-ratio", type=float, nargs=2, default=(0.3, 8.0), metavar=("FROM", "TO"))
-    parser.add_argument("--intensity", type=float, nargs=2, default=(1.02, 10.0), metavar=("FROM", "TO"))
+    parser.add_argument("--alpha", type=number, default=0.2, help="slenderness angle [rad] (default 0.2)")
+    parser.add_argument("--frequency-ratio", type=number, nargs=2, default=(0.3, 8.0), metavar=("FROM", "TO"))
+    parser.add_argument("--intensity", type=number, nargs=2, default=(1.02, 10.0), metavar=("FROM", "TO"))
     parser.add_argument("--points", type=int, default=128, help="points along each axis (default 128)")
     add_pulse(parser)
 

@@ -11,6 +11,13 @@ from jaxrock.motions.pulses import PULSES
 from jaxrock.motions.pulses.pulse import AbstractPulse
 
 
+def number(text: str) -> float:
+    """A number in an option; Python reads over underscores in one."""
+    if "_" in text:
+        raise ValueError
+    return float(text)
+
+
 def model_of(arguments: argparse.Namespace) -> rk.AbstractEquation:
     """The equation of motion."""
     return rk.Linear() if arguments.model == "linear" else rk.Housner()
@@ -18,7 +25,7 @@ def model_of(arguments: argparse.Namespace) -> rk.AbstractEquation:
 
 def add_restitution(parser: argparse.ArgumentParser) -> None:
     """Option of the block's restitution."""
-    parser.add_argument("--restitution", type=float, help="angular velocity after/before impact (default: Housner's)")
+    parser.add_argument("--restitution", type=number, help="angular velocity after/before impact (default: Housner's)")
 
 
 def add_record(parser: argparse.ArgumentParser) -> None:
@@ -26,10 +33,10 @@ def add_record(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "record", nargs="?", help="PEER AT2, CSMIP V2, ESM, CSV or text file (default: the built-in record)"
     )
-    parser.add_argument("--dt", type=float, help="time between samples [s], for files that do not say")
+    parser.add_argument("--dt", type=number, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
-    parser.add_argument("--scale", type=float, default=1.0, help="factor on the acceleration (default 1)")
+    parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")
 
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:
@@ -66,7 +73,7 @@ def add_pulse(parser: argparse.ArgumentParser) -> None:
             default = 0.0 if default is Parameter.empty else default
             shown = default if isinstance(default, str) else "its own" if default is None else f"{default:g}"
             meant.setdefault(name, []).append(f"{word} (default {shown})")
-            kinds[name] = str if isinstance(default, str) else float
+            kinds[name] = str if isinstance(default, str) else number
     for name, words in meant.items():
         parser.add_argument(_option(name), type=kinds[name], help=f"of the pulse {', '.join(words)}")
 

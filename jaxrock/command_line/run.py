@@ -8,15 +8,15 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import add_record, add_restitution, model_of, record_of
+from jaxrock.command_line.options import add_record, add_restitution, model_of, number, record_of
 from jaxrock.command_line.output import save, table, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--width", type=float, default=0.6, help="full width [m] (default 0.6)")
-    parser.add_argument("--height", type=float, default=3.0, help="full height [m] (default 3)")
+    parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
+    parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
-        "--duration", type=float, help="how long to follow the block [s] (default: a little past the record)"
+        "--duration", type=number, help="how long to follow the block [s] (default: a little past the record)"
     )
     add_restitution(parser)
     add_record(parser)

@@ -6,14 +6,22 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import add_record, add_restitution, check_points, check_range, model_of, record_of
+from jaxrock.command_line.options import (
+    add_record,
+    add_restitution,
+    check_points,
+    check_range,
+    model_of,
+    number,
+    record_of,
+)
 from jaxrock.command_line.output import save, status_of_surface, table, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--slenderness", type=float, default=5.0, help="height/width of the blocks (default 5)")
-    parser.add_argument("--shortest", type=float, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
-    parser.add_argument("--longest", type=float, default=8.0, help="longest 2 pi/p [s] (default 8)")
+    parser.add_argument("--slenderness", type=number, default=5.0, help="height/width of the blocks (default 5)")
+    parser.add_argument("--shortest", type=number, default=0.5, help="shortest 2 pi/p [s] (default 0.5)")
+    parser.add_argument("--longest", type=number, default=8.0, help="longest 2 pi/p [s] (default 8)")
     parser.add_argument("--points", type=int, default=200, help="number of block sizes (default 200)")
     add_restitution(parser)
     add_record(parser)

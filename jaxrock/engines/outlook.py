@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock.motions.motion import Bounds, Envelope
+from jaxrock.motions.shaking import Bounds, Envelope
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[ArrayLike, ""]

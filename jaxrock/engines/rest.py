@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Bool, Inexact
 
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
-from jaxrock.motions.motion import Shaking
+from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import Watch, first_event, meet, step_length
 
 Scalar = Inexact[ArrayLike, ""]

@@ -13,7 +13,8 @@ from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.outlook import Outlook
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
-from jaxrock.motions.motion import AbstractMotion, Shaking, sum_of_series
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.shaking import Shaking, sum_of_series
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[ArrayLike, ""]
@@ -75,7 +76,10 @@ class Scene(eqx.Module):
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
         block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
         knots, envelope = motion.knots, motion.envelope
-        count = jnp.sum(knots < knots[-1], dtype=jnp.int32) if knots.size > _MANY else None
+        lengths = motion.lengths
+        # Up to the last piece with a length: a late motion's knots may all be one number.
+        lasting = jnp.where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
+        count = jnp.max(lasting) if knots.size > _MANY else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
@@ -95,7 +99,7 @@ class Scene(eqx.Module):
             far_reset=far_reset,
             motion=motion,
             knots=knots,
-            lengths=_endless(jnp.diff(knots), count),
+            lengths=_endless(lengths, count),
             scales=_endless(motion.scales, count),
             count=count,
             outlook=Outlook.of(envelope, _least_threshold(moments, far)),

@@ -44,6 +44,9 @@ class State(eqx.Module):
     steps: Int[Array, ""]
 
 
+_MOST = 1e30  # [g], [rad/s], [s]
+
+
 def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
@@ -60,8 +63,12 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     unlifted = jnp.maximum(2 - scene.outlook.strongest_drive / scene.threshold, 1)
     eps = jnp.finfo(opening.dtype).eps
     finite = jnp.isfinite(rotation) & jnp.isfinite(velocity)
-    # A block whose threshold is not a number would seem to stand for ever.
-    finite = finite & ~jnp.isnan(scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1])
+    # A block whose threshold is not a number would seem to stand for ever; numbers beyond any physics (NaN, too) are
+    # not followed to where squares of them overflow.
+    finite = finite & (scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1] < _MOST)
+    spread = Spread.none(opening).plus(eps * opening, eps * outward)
+    if scene.motion.lateness is not None:  # a push that comes too late: at first a velocity that is missing
+        spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.lateness)
     return State(
         piece=count,
         local=zero,
@@ -83,7 +90,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         clearance=jnp.full_like(opening, jnp.inf),
         peak_clearance=jnp.full_like(opening, jnp.inf),
         second=zero,
-        spread=Spread.none(opening).plus(eps * opening, eps * outward),
+        spread=spread,
         overturned=no,
         done=~finite,
         status=Status.where(finite, Status.successful, Status.not_finite),

@@ -1,12 +1,14 @@
 """What a flexible block does under a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
 
+from typing import Annotated
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import Values, checked, scalar
+from jaxrock._arguments import arguments, at_least
+from jaxrock._checks import Values, scalar, span
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
@@ -102,8 +104,13 @@ class FlexibleResponse(eqx.Module):
         return path.events(path.impacted, path.times, (energies / jnp.where(total > 0, total, 1.0), 0.0))[0]
 
 
+@arguments
 def outcome_flexible(
-    block: FlexibleBlock, motion: AbstractMotion, *, duration: ArrayLike | None = None, max_steps: int = 4096
+    block: FlexibleBlock,
+    motion: AbstractMotion,
+    *,
+    duration: ArrayLike | None = None,
+    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
 ) -> FlexibleOutcome:
     """Tell what becomes of a flexible block under a motion.
 
@@ -122,13 +129,14 @@ def outcome_flexible(
     return _outcome(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
 
 
+@arguments
 def simulate_flexible(
     block: FlexibleBlock,
     motion: AbstractMotion,
     *,
     duration: ArrayLike | None = None,
-    samples: int = 2001,
-    max_steps: int = 4096,
+    samples: Annotated[int, at_least(2)] = 2001,
+    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
 ) -> FlexibleResponse:
     """Compute the history of a flexible block under a motion.
 
@@ -142,8 +150,6 @@ def simulate_flexible(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
-    if samples < 2:
-        raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
     say_if_single()
     result, path = _simulate(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
@@ -157,12 +163,10 @@ def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike 
         )
     if duration is None:
         return motion.end + 10 / block.p
-    return scalar("duration", checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf)))
+    return scalar("duration", span("duration", duration))
 
 
 def _budget(motion: AbstractMotion, max_steps: int) -> int:
-    if max_steps < 1:
-        raise ValueError(f"Argument `max_steps` must be at least 1, but is {max_steps}.")
     return max_steps + 4 * motion.knots.size
 
 

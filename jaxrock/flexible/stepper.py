@@ -115,8 +115,8 @@ class FlexibleScene(eqx.Module):
         piece without length), and whether it ends with the piece."""
         last = self.knots.size - 1
         quiet, inner = state.piece >= last, jnp.minimum(state.piece, last - 1)
-        piece_ends = jnp.where(quiet, jnp.inf, self.knots[jnp.minimum(state.piece + 1, last)])
-        remaining = jnp.minimum(piece_ends, self.stop) - self.knots[state.piece] - state.local
+        lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
+        remaining = jnp.minimum(lasts, self.stop - self.knots[state.piece]) - state.local
         left = jax.lax.stop_gradient(jnp.maximum(remaining, 0.0))
         scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
         unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, 1.0))

@@ -8,6 +8,7 @@ their joint survival is more probable than the product of the single ones.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -16,14 +17,33 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
-from jaxrock._checks import Values, as_real, checked, positive, scalar, share
-from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, beside, rising
+from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import (
+    Values,
+    as_real,
+    checked,
+    if_known,
+    inner_share,
+    level as at_level,
+    not_negative,
+    positive,
+    scalar,
+    share,
+)
+from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, alike, beside, rising
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.roots import search_root
 
 Real = Inexact[Array, "..."]
 Number = Inexact[Array, ""]
-Fragilities = AbstractFragility | Sequence[AbstractFragility]
+_each = list_of(AbstractFragility, "fragilities")
+
+
+def _one_or_many(name: str, value: Any) -> tuple[AbstractFragility, ...]:
+    return (value,) if isinstance(value, AbstractFragility) else tuple(_each(name, value))
+
+
+Fragilities = Annotated[AbstractFragility | Sequence[AbstractFragility], _one_or_many]
 _NODES, _WEIGHTS = gauss_legendre(20)
 
 # Where `allowed_scale` looks for its factor: 20 steps a decade.
@@ -54,9 +74,10 @@ class HazardCurve(eqx.Module):
     rates: Inexact[Array, "*batch n"]
     measure: str = eqx.field(static=True)
 
+    @arguments
     def __init__(self, levels: Values, rates: Values, measure: str = ""):
-        self.levels = rising("levels", levels)
-        rates = beside("rates", as_real("rates", rates), self.levels)
+        self.levels, rates = alike(rising("levels", levels), as_real("rates", rates))
+        rates = beside("rates", rates, self.levels)
 
         def holds(x):
             known = jnp.any((x > 0) & (x < jnp.inf), -1, keepdims=True)
@@ -67,6 +88,7 @@ class HazardCurve(eqx.Module):
         self.measure = measure
 
     @classmethod
+    @arguments
     def from_probabilities(
         cls, levels: Values, probabilities: Values, investigation_time: ArrayLike, measure: str = ""
     ) -> "HazardCurve":
@@ -83,12 +105,17 @@ class HazardCurve(eqx.Module):
         **Raises:** ValueError for values outside their ranges, or of different shapes.
         """
         probabilities = share("probabilities", probabilities)
-        return cls(levels, -jnp.log1p(-probabilities) / positive("investigation_time", investigation_time), measure)
+        time = scalar("investigation_time", positive("investigation_time", investigation_time))
+        return cls(levels, -jnp.log1p(-probabilities) / time, measure)
 
-    @eqx.filter_jit
     def rate(self, level: Values) -> Real:
         """Annual rate of shakings of intensity `level` or more that the curve knows; of the shape of `level`."""
-        level = jnp.maximum(as_real("level", level), self.levels[0])
+        _single(self)
+        return self._rate(if_known(at_level, "level", level))
+
+    @eqx.filter_jit
+    def _rate(self, level: Real) -> Real:
+        level = jnp.maximum(level, self.levels[0])
         after = jnp.clip(jnp.searchsorted(self.levels, level), 1, self.levels.size - 1)
         finite = jnp.isfinite(self.rates)
         start = jnp.where(finite, self.rates, jnp.max(jnp.where(finite, self.rates, 0.0)))[after - 1]
@@ -136,6 +163,7 @@ class HazardCurve(eqx.Module):
         return HazardCurve(levels, inner, self.measure)
 
 
+@arguments
 def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     """Annual rate of shakings that topple a rock: the fragility integrated over the rates of the hazard curve.
 
@@ -156,6 +184,7 @@ def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     return _toppling_rate(fragility, curve)
 
 
+@arguments
 def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Number:
     """Probability that all rocks of a site have stood since they became fragile, under the shakings they share.
 
@@ -177,6 +206,7 @@ def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCu
     return jnp.exp(-_topplings(*_rocks(fragilities, ages), curve))
 
 
+@arguments
 def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches"]:
     """Weights of the branches of a logic tree after rocks were found standing (Bayes).
 
@@ -190,7 +220,7 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
     **Raises:** ValueError for values outside their ranges or of different shapes, and if under every branch that has
     weight the rocks must have toppled: then none of the branches explains them.
     """
-    prior = checked("prior", prior, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+    prior = not_negative("prior", prior)
     survival = share("survival", survival)
     if prior.ndim != 1 or prior.shape != survival.shape:
         both = f"{prior.shape} and {survival.shape}"
@@ -200,6 +230,7 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
     return weights / checked("survival", total, "be above 0 for a branch that has weight", lambda x: x > 0)
 
 
+@arguments
 def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Number:
     """The factor on the intensity of every shaking at which the survival of all rocks falls to a given probability.
 
@@ -221,8 +252,7 @@ def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, pr
     **Source:** Anderson & Brune (1999), the rule of rejection.
     """
     _single(curve)
-    probability = scalar("probability", as_real("probability", probability))
-    probability = checked("probability", probability, "be in (0, 1)", lambda x: (x > 0) & (x < 1))
+    probability = scalar("probability", inner_share("probability", probability))
     return _allowed_scale(*_rocks(fragilities, ages), curve, -jnp.log(probability))
 
 
@@ -233,8 +263,8 @@ def _single(curve: HazardCurve) -> None:
 
 def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragility, ...], Inexact[Array, " rocks"]]:
     """The rocks, all with fragilities of one kind stacked into one, and an age for each in the order of the stacks."""
-    rocks = (fragilities,) if isinstance(fragilities, AbstractFragility) else tuple(fragilities)
-    ages = checked("ages", ages, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+    rocks = _one_or_many("fragilities", fragilities)
+    ages = not_negative("ages", ages)
     if ages.shape not in ((), (len(rocks),)) or not rocks:
         raise ValueError(f"Argument `ages` must be one for each of {len(rocks)} rocks, but has shape {ages.shape}.")
     ages = jnp.broadcast_to(ages, len(rocks))

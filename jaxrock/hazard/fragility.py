@@ -6,10 +6,22 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Values, as_real, checked, positive, share
+from jaxrock._checks import (
+    Values,
+    as_real,
+    checked,
+    if_known,
+    level as at_level,
+    not_negative,
+    positive,
+    share,
+    together,
+)
+from jaxrock._parameters import parameter, set_parameters
 
 Real = Inexact[Array, "..."]
 
@@ -41,15 +53,16 @@ class LogNormalFragility(AbstractFragility):
     **Raises:** ValueError for a value outside its range.
     """
 
-    median: Real
-    dispersion: Real
+    median: Real = parameter("-", positive)
+    dispersion: Real = parameter("-", positive)
 
     def __init__(self, median: ArrayLike, dispersion: ArrayLike):
-        self.median = positive("median", median)
-        self.dispersion = positive("dispersion", dispersion)
+        set_parameters(self, median=median, dispersion=dispersion)
 
     def __call__(self, level: Values) -> Real:
-        z = jnp.log(jnp.asarray(level) / self.median) / self.dispersion
+        level = if_known(at_level, "level", level)
+        together(level=level, median=self.median)
+        z = jnp.log(level / self.median) / self.dispersion
         return jax.lax.erfc(-z / math.sqrt(2)) / 2
 
     @property
@@ -76,11 +89,12 @@ class TabulatedFragility(AbstractFragility):
     probabilities: Inexact[Array, "*batch n"]
 
     def __init__(self, levels: Values, probabilities: Values):
-        self.levels = rising("levels", levels)
-        self.probabilities = beside("probabilities", share("probabilities", probabilities), self.levels)
+        levels = rising("levels", levels)
+        self.levels, probabilities = alike(levels, share("probabilities", probabilities))
+        self.probabilities = beside("probabilities", probabilities, levels)
 
     def __call__(self, level: Values) -> Real:
-        level = jnp.asarray(level)
+        level = if_known(at_level, "level", level)
         between = jnp.interp(jnp.log(level), jnp.log(self.levels), self.probabilities)
         return jnp.where(level < self.levels[0], 0.0, between)
 
@@ -96,6 +110,22 @@ def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
         raise ValueError(f"Argument `{name}` must hold at least two levels, but has shape {array.shape}.")
     allowed = "be positive and finite, and rise from level to level"
     return checked(name, array, allowed, lambda x: (jnp.diff(x, prepend=0.0) > 0) & (x < jnp.inf))
+
+
+def outcomes(toppled: Values, levels: Real, trials: Real) -> Real:
+    """Return `toppled` as numbers, one for each level: how many of `trials`, or a truth value."""
+    if isinstance(toppled, (list, tuple)) and all(isinstance(each, (bool, np.bool_)) for each in toppled):
+        toppled = np.asarray(toppled)
+    if np.dtype(getattr(toppled, "dtype", float)) == bool:
+        toppled = jnp.asarray(toppled, levels.dtype)
+    toppled = beside("toppled", as_real("toppled", toppled), levels)
+    return checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+
+
+def alike(*arrays: Real) -> tuple[Real, ...]:
+    """Arrays in one precision, the highest of theirs."""
+    dtype = jnp.result_type(*arrays)
+    return tuple(array.astype(dtype) for array in arrays)
 
 
 def beside(name: str, array: Real, levels: Real) -> Real:
@@ -158,11 +188,10 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
     levels = positive("levels", levels)
     if levels.ndim != 1 or levels.size == 0:
         raise ValueError(f"Argument `levels` must be a list of at least one value, but has shape {levels.shape}.")
-    trials = checked("trials", trials, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
+    trials = not_negative("trials", trials)
     if trials.shape not in ((), levels.shape):
         raise ValueError(f"Argument `trials` must have shape {levels.shape} or (), but has shape {trials.shape}.")
-    toppled = beside("toppled", as_real("toppled", toppled), levels)
-    toppled = checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+    levels, trials, toppled = alike(levels, trials, outcomes(toppled, levels, trials))
     return _fit(levels, toppled, trials - toppled)
 
 

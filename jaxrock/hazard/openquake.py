@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jaxrock._text import file_error, text_lines
+from jaxrock._arguments import arguments, list_of, path_of
+from jaxrock._checks import whole
+from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.hazard.curves import HazardCurve
 
 _FRONT = {"custom_site_id", "lon", "lat", "depth"}
@@ -48,6 +50,7 @@ class HazardCurves(eqx.Module):
     kinds: tuple[str, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 
+    @arguments
     def at(self, site: int, branch: int | None = None) -> HazardCurve:
         """The curve of one site, in the order of the files.
 
@@ -61,8 +64,7 @@ class HazardCurves(eqx.Module):
         **Raises:** ValueError for a site or branch that is not there.
         """
         for name, index, count in (("site", site, len(self.names)), ("branch", branch or 0, len(self.kinds))):
-            if not 0 <= index < count:
-                raise ValueError(f"Argument `{name}` must be from 0 to {count - 1}, but is {index}.")
+            whole(name, index, 0, count - 1)
         rows = slice(None) if branch is None else branch
         return HazardCurve(self.curves.levels[rows, site], self.curves.rates[rows, site], self.curves.measure)
 
@@ -87,16 +89,17 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
 
     **Source:** the exporters of the OpenQuake engine and the results that its tests expect, 2017 to release 3.26.
     """
-    paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    paths = [paths] if isinstance(paths, str | os.PathLike) else list_of(object, "paths")("paths", paths)
     if not paths:
         raise ValueError("Argument `paths` must be a file or a list of files, but is empty.")
-    files = [_read(Path(path)) for path in paths]
+    paths = [path_of("paths", path) for path in paths]
+    files = [_read(path) for path in paths]
     first = files[0]
     for path, file in zip(paths, files):
         for what in ("measure", "levels", "names", "positions"):
             if not np.array_equal(file[what], first[what]):
                 which = "sites" if what in ("names", "positions") else what
-                raise file_error(Path(path).name, f"differs in its {which} from file `{Path(paths[0]).name}`.")
+                raise file_error(path.name, f"differs in its {which} from file `{paths[0].name}`.")
     rates = jnp.asarray(np.stack([file["rates"] for file in files]))
     curves = HazardCurve(jnp.broadcast_to(jnp.asarray(first["levels"]), rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
@@ -110,7 +113,7 @@ def _read(path: Path) -> dict:
     columns = next(csv.reader(lines[1:2]), [])
     levels = _levels(name, columns)
     front = columns[: -levels.size]
-    names, positions, probabilities = [], [], []
+    names, positions, probabilities, printed = [], [], [], []
     for number, line in enumerate(lines[2:], 3):
         if not line.strip():
             continue
@@ -120,8 +123,11 @@ def _read(path: Path) -> dict:
         site = dict(zip(front, fields))
         names.append(site.pop("custom_site_id", ""))
         positions.append(_numbers(name, number, [site["lon"], site["lat"], site.get("depth", "0")]))
+        printed.append(fields[-1])
         probabilities.append(_falling(name, number, _numbers(name, number, fields[len(front) :])))
-    if not names:
+    if names:
+        check_end(name, lines, printed)
+    else:
         raise file_error(name, "holds no sites.")
     with np.errstate(divide="ignore"):
         rates = -np.log1p(-np.array(probabilities)) / time

@@ -6,6 +6,7 @@ without a verdict bounds the probability from both sides.
 """
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int8
 
+from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, one_of
 from jaxrock._parameters import one_of_many
 from jaxrock.blocks.rigid import Block
@@ -37,7 +39,7 @@ def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
         raise ValueError(
             f"Argument `bound` must be 'lower' or 'upper', because {undecided} of {verdict.size} scenes are undecided."
         )
-    upper = one_of("bound", bound or "lower", ("lower", "upper")) == "upper"
+    upper = bound is not None and one_of("bound", bound, ("lower", "upper")) == "upper"
     return np.sum(verdict != STOOD if upper else verdict == TOPPLED, axis=-1).astype(float)
 
 
@@ -163,13 +165,14 @@ def _clustered(fit: FragilityFit, levels, toppled, draws):
     return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance
 
 
+@arguments
 def simulated_fragility(
     block: Block,
     motions: Suite | Sequence[AbstractMotion],
     levels: Values,
     model: AbstractEquation = Housner(),
     *,
-    measure: str = "PGA",
+    measure: Annotated[str, word_of("PGA", "PGV")] = "PGA",
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SimulatedFragility:
@@ -192,7 +195,7 @@ def simulated_fragility(
     """
     levels = rising("levels", levels)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
-    factors = _factors(levels, suite.peak_acceleration, suite.peak_velocity, one_of("measure", measure, ("PGA", "PGV")))
+    factors = _factors(levels, suite.peak_acceleration, suite.peak_velocity, measure)
     blocks = stacked(block)
     parts, begin = [], 0
     for group in suite.groups:

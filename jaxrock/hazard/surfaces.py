@@ -6,6 +6,7 @@ pushed: together they say most of what a motion does to a rock.
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -13,14 +14,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
 
-from jaxrock._checks import Values, as_real, checked, positive
+from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import (
+    Values,
+    checked,
+    if_known,
+    inner_share,
+    level,
+    not_negative,
+    positive,
+    scalar,
+    together,
+)
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
     FitStatus,
     LogNormalFragility,
     TabulatedFragility,
-    beside,
+    alike,
+    outcomes,
     probit,
     probit_line,
     rising,
@@ -46,7 +59,9 @@ class SurfaceFragility(eqx.Module):
 
     def __call__(self, acceleration: Values, ratio: Values) -> Inexact[Array, "..."]:
         """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
-        z = (jnp.log(as_real("acceleration", acceleration)) - jnp.log(self._median(ratio))) / self.dispersion
+        acceleration, median = if_known(level, "acceleration", acceleration), self._median(ratio)
+        together(acceleration=acceleration, ratio=median)
+        z = (jnp.log(acceleration) - jnp.log(median)) / self.dispersion
         return jax.lax.erfc(-z / math.sqrt(2)) / 2
 
     def _median(self, ratio):
@@ -58,8 +73,9 @@ class SurfaceFragility(eqx.Module):
 
     def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
-        probability = checked("probability", probability, "be in (0, 1)", lambda x: (x > 0) & (x < 1))
-        return self._median(ratio) * jnp.exp(self.dispersion * jax.scipy.special.ndtri(probability))
+        probability, median = inner_share("probability", probability), self._median(ratio)
+        together(probability=probability, ratio=median)
+        return median * jnp.exp(self.dispersion * jax.scipy.special.ndtri(probability))
 
 
 class SurfaceFit(eqx.Module):
@@ -75,6 +91,7 @@ class SurfaceFit(eqx.Module):
     status: FitStatus
 
 
+@arguments
 def fit_surface(
     acceleration: Values,
     ratio: Values,
@@ -100,9 +117,10 @@ def fit_surface(
     if acceleration.ndim != 1 or acceleration.size < 3 or acceleration.shape != ratio.shape:
         both = f"{acceleration.shape} and {ratio.shape}"
         raise ValueError(f"Arguments `acceleration` and `ratio` must be lists of one length above 2, but are {both}.")
-    trials = checked("trials", trials, "be 0 or more and finite", lambda x: (x >= 0) & (x < jnp.inf))
-    toppled = beside("toppled", as_real("toppled", toppled), acceleration)
-    toppled = checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+    trials = not_negative("trials", trials)
+    if trials.shape not in ((), acceleration.shape):
+        raise ValueError(f"Argument `trials` must have shape {acceleration.shape} or (), but has {trials.shape}.")
+    acceleration, ratio, trials, toppled = alike(acceleration, ratio, trials, outcomes(toppled, acceleration, trials))
     labels = (
         np.arange(acceleration.size) if clusters is None else np.unique(np.asarray(clusters), return_inverse=True)[1]
     )
@@ -144,6 +162,7 @@ def _fit(acceleration, ratio, toppled, survived):
     return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T
 
 
+@arguments
 def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFit:
     """The two-measure fragility of scaled motions, each of which has a PGV/PGA of its own.
 
@@ -187,6 +206,7 @@ class SimulatedSurface(eqx.Module):
         """Number of scenes without a verdict."""
         return int(np.sum(self.verdict == UNDECIDED))
 
+    @arguments
     def at(self, ratio: ArrayLike, upper: bool = False) -> TabulatedFragility:
         """The fragility in peak acceleration at one PGV/PGA [s], between columns by straight lines in its logarithm.
 
@@ -199,7 +219,7 @@ class SimulatedSurface(eqx.Module):
         """
         ends = float(self.ratio[0]), float(self.ratio[-1])
         allowed = f"be in [{ends[0]:g}, {ends[1]:g}]"
-        ratio = checked("ratio", ratio, allowed, lambda x: (x >= ends[0]) & (x <= ends[1]))
+        ratio = scalar("ratio", checked("ratio", ratio, allowed, lambda x: (x >= ends[0]) & (x <= ends[1])))
         shares = jnp.asarray(self.upper if upper else self.lower)
         place = jnp.log(ratio)
         row = jax.vmap(lambda share: jnp.interp(place, jnp.log(self.ratio), share))(shares)
@@ -223,9 +243,10 @@ class SimulatedSurface(eqx.Module):
         return fit_surface(acceleration, ratio, toppled.ravel(), float(len(self.verdict)), draws)
 
 
+@arguments
 def simulated_surface(
     block: Block,
-    pulses: Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]],
+    pulses: Annotated[Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]], list_of(callable, "functions")],
     acceleration: Values,
     ratio: Values,
     model: AbstractEquation = Housner(),

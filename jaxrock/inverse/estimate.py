@@ -7,12 +7,14 @@ range that was searched, and say so.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
+from jaxrock._arguments import arguments, at_least
 from jaxrock._progress import Progress
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
@@ -106,6 +108,7 @@ class Estimate(eqx.Module):
         return self.values[self.names.index(name)]
 
 
+@arguments
 def estimate_motion(
     observations: Observations,
     motion: Callable,
@@ -113,7 +116,7 @@ def estimate_motion(
     scatter: ArrayLike = 0.3,
     *,
     lapse: ArrayLike = 0.02,
-    starts: int = 64,
+    starts: Annotated[int, at_least(1)] = 64,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -137,8 +140,6 @@ def estimate_motion(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
-    if starts < 1:
-        raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
     if not unknowns:
         raise ValueError("Argument `unknowns` must name at least one parameter.")
     problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))

@@ -1,6 +1,7 @@
 """Which motions rocks allow, over two parameters: regions of likelihood, and the largest motion nobody has exceeded."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._checks import Values, positive
+from jaxrock._arguments import arguments, pair
+from jaxrock._checks import Values, finite, scalar, size
 from jaxrock._progress import Progress
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
@@ -36,6 +38,7 @@ class FeasibleRegion(eqx.Module):
     allowed: Bool[Array, "rows columns"]
 
 
+@arguments
 def feasible_region(
     likelihood: Likelihood,
     over: dict[str, Values],
@@ -58,12 +61,9 @@ def feasible_region(
     """
     if len(over) != 2:
         raise ValueError(f"Argument `over` must name two parameters, but names {len(over)}.")
-    lists = {name: jnp.asarray(values, float) for name, values in over.items()}
-    for name, values in lists.items():
-        if values.ndim != 1 or values.size == 0 or not bool(jnp.isfinite(values).all()):
-            raise ValueError(f"Argument `over` must hold lists of finite values, but not for `{name}`.")
+    lists = {name: axis(f"over[{name!r}]", values, finite) for name, values in over.items()}
     rows, columns = (x.ravel() for x in jnp.meshgrid(*lists.values(), indexing="ij"))
-    rest = {name: jnp.asarray(x, float) for name, x in (fixed or {}).items()}
+    rest = {name: scalar(f"fixed[{name!r}]", finite(f"fixed[{name!r}]", x)) for name, x in (fixed or {}).items()}
     likelihood = likelihood.current((*lists, *rest))
     bar, terms = Progress(rows.size, "region", progress), []
     for begin in range(0, rows.size, _LANES):
@@ -99,12 +99,13 @@ class Unexceeded(eqx.Module):
     complete: Bool[Array, " n"]
 
 
+@arguments
 def unexceeded_motion(
     observations: Observations,
     motion: Callable,
     durations: Values,
     *,
-    intensity: tuple[float, float] = (1.0, 20.0),
+    intensity: Annotated[tuple[float, float], pair] = (1.0, 20.0),
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -126,24 +127,24 @@ def unexceeded_motion(
 
     **Raises:** ValueError for arguments outside their ranges, or if no rock stands.
     """
-    durations = axis("durations", durations)
+    durations = axis("durations", durations, size)
     standing = np.flatnonzero(np.asarray(observations.seen) != TOPPLED)
     if standing.size == 0:
         raise ValueError("Argument `observations` must hold a rock that stands.")
     seen = observations.of(standing)
-    ways, size = seen.ways, durations.size
-    blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, size), len(ways)), seen.blocks)
+    ways, count = seen.ways, durations.size
+    blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, count), len(ways)), seen.blocks)
     critical = critical_amplitudes(
         blocks,
-        jax.vmap(motion)(jnp.repeat(ways.ravel(), size), jnp.tile(positive("durations", durations), ways.size)),
+        jax.vmap(motion)(jnp.repeat(ways.ravel(), count), jnp.tile(durations, ways.size)),
         model,
         intensity=intensity,
         derivatives=False,
         engine=engine,
         progress=progress,
     )
-    by_rock = critical.lowest.reshape(*ways.shape, size).max(axis=0)
+    by_rock = critical.lowest.reshape(*ways.shape, count).max(axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
-    complete = critical.complete.reshape(-1, size).all(axis=0)
+    complete = critical.complete.reshape(-1, count).all(axis=0)
     return Unexceeded(durations, amplitude, by_rock, weakest, complete)

@@ -6,6 +6,7 @@ begins with a short window of the data and goes on with longer ones, each from w
 """
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -13,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._checks import Values, checked, finite, positive
+from jaxrock._arguments import arguments, at_least, list_of, pair
+from jaxrock._checks import Values, finite, inner_share, not_negative, positive, scalar
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -93,7 +95,7 @@ class HistoryFit(eqx.Module):
 
         **Source:** Student's t by Abramowitz & Stegun (1964), 26.7.5.
         """
-        checked("confidence", confidence, "be in (0, 1)", lambda x: (x > 0) & (x < 1))
+        confidence = float(scalar("confidence", inner_share("confidence", confidence)))
         robust = self.correlated if robust is None else robust
         covariance = self.robust_covariance if robust else self.covariance
         z = float(jax.scipy.special.ndtri((1 + confidence) / 2))
@@ -103,6 +105,7 @@ class HistoryFit(eqx.Module):
         return np.stack([self.values - half, self.values + half], axis=1)
 
 
+@arguments
 def fit_history(
     time: Values,
     rotation: Values,
@@ -110,12 +113,12 @@ def fit_history(
     motion: AbstractMotion | None = None,
     model: AbstractEquation = Housner(),
     *,
-    parameters: Sequence[str] | None = None,
-    initial: tuple[float, float] | None = None,
+    parameters: Annotated[Sequence[str] | None, list_of(str, "names")] = None,
+    initial: Annotated[tuple[float, float] | None, pair] = None,
     scatter: Values | None = None,
     spread: float = 0.2,
-    starts: int = 8,
-    seed: int = 0,
+    starts: Annotated[int, at_least(1)] = 8,
+    seed: Annotated[int, at_least(0)] = 0,
     engine: AbstractEngine | None = None,
 ) -> HistoryFit:
     """Estimate a block, and the motion under it, from a measured history of its rotation.
@@ -144,11 +147,9 @@ def fit_history(
 
     **Source:** Marquardt (1963); Nielsen (1999), the damping; Brockwell & Davis (1991), 8.1, correlated residuals.
     """
-    if starts < 1:
-        raise ValueError(f"Argument `starts` must be at least 1, but is {starts}.")
     if np.size(rotation) == 0:
         raise ValueError("Argument `rotation` must hold measurements, but is empty.")
-    spread = float(positive("spread", spread))
+    spread = float(scalar("spread", positive("spread", spread)))
     scene = FittedScene.of(block, motion, model, parameters, initial, rotation, engine)
     time, rotation, weight = _data(time, rotation, scatter, 2 * len(scene.names))
     places = np.arange(time.size)
@@ -172,7 +173,7 @@ def fit_history(
 
 def _data(time: Values, rotation: Values, scatter: Values | None, least: int):
     """Times, rotations and weights of the measurements as arrays of one length."""
-    time = np.asarray(checked("time", time, "be 0 or more and finite", lambda t: (t >= 0) & (t < np.inf)))
+    time = np.asarray(not_negative("time", time))
     rotation = np.asarray(finite("rotation", rotation))
     if time.ndim != 1 or time.size <= least:
         raise ValueError(f"Argument `time` must be a list of more than {least} values, but has shape {time.shape}.")

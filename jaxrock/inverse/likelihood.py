@@ -29,7 +29,8 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from jaxrock._checks import as_real, checked, positive, put_down
+from jaxrock._arguments import arguments
+from jaxrock._checks import as_real, below_one, positive, put_down, scalar
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import Possible, levels_around
@@ -73,6 +74,7 @@ class Likelihood(eqx.Module):
     model: AbstractEquation
     engine: AbstractEngine | None
 
+    @arguments
     def __init__(
         self,
         observations: Observations,
@@ -86,8 +88,8 @@ class Likelihood(eqx.Module):
             raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
         self.observations, self.model, self.engine = observations, model, engine
         self.motion = motion if isinstance(motion, eqx.Module) else ByIdentity(motion)
-        self.scatter = positive("scatter", scatter)
-        self.lapse = checked("lapse", lapse, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+        self.scatter = scalar("scatter", positive("scatter", scatter))
+        self.lapse = scalar("lapse", below_one("lapse", lapse))
 
     def current(self, names: Sequence[str]) -> "Likelihood":
         """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`."""

@@ -21,8 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxrock._text import file_error, text_lines
-from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock._arguments import path_of
+from jaxrock._checks import Range, size
+from jaxrock._text import check_end, file_error, text_lines
+from jaxrock.blocks.asymmetric import AsymmetricBlock, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.inverse.observations import SEEN, Observations
 
@@ -63,7 +65,7 @@ def read_observations(path: str | Path) -> Observations:
 
     **Raises:** ValueError, with the number of the line, for a file that is wrong, or a rock that cannot be.
     """
-    path = Path(path)
+    path = path_of("path", path)
     lines = text_lines(path)
     rows = [
         (number, [field.strip() for field in next(csv.reader([line]))])
@@ -86,6 +88,8 @@ def read_observations(path: str | Path) -> Observations:
         except ValueError as error:
             raise file_error(path.name, f"line {number}: {error}") from None
         rocks.append(rock)
+    if header[-1] not in ("name", "observed"):
+        check_end(path.name, lines, [fields[-1] for _, fields in rows[1:]])
     return _observations(rocks, [rock["name"] or f"line {number}" for rock, (number, _) in zip(rocks, rows[1:])])
 
 
@@ -191,6 +195,7 @@ def _two_sides(fields: dict[str, str], get) -> dict:
     """Angles and sizes of a rock whose sides differ; deviations are those of side 1."""
     (alpha1, deviation), (alpha2, _) = (_given(name, get(name, None)) for name in ("alpha1", "alpha2"))
     facing, inertia = (get(name, empty)[0] for name, empty in (("facing", 0.0), ("inertia_ratio", 0.75)))
+    _within(ratio_of_inertia, "inertia_ratio", inertia)
     rock = {"alpha": alpha1, "alpha_sd": deviation, "alpha2": alpha2, "inertia_ratio": inertia, "facing": facing}
     if "p1_rad_per_s" in fields:
         (p1, p_sd), (p2, _) = (_given(name, get(name, None)) for name in ("p1_rad_per_s", "p2_rad_per_s"))
@@ -215,9 +220,13 @@ def _rectangle(width: tuple[float, float], height: tuple[float, float]) -> dict:
 
 
 def _positive(name: str, pair: tuple[float, float]) -> tuple[float, float]:
-    if not 0 < pair[0] < np.inf:
-        raise ValueError(f"`{name}` must be positive and finite, but is {pair[0]:g}.")
-    return pair
+    return _within(size, name, pair[0]), pair[1]
+
+
+def _within(allowed: Range, name: str, value: float) -> float:
+    if not allowed.holds(value):
+        raise ValueError(f"`{name}` must {allowed.allowed}, but is {value:g}.")
+    return value
 
 
 def _given(name: str, pair: tuple) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import Values, as_real, checked, put_down
+from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import Values, as_real, checked, put_down, shown
 from jaxrock._label import Label
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Corners, Housner, PerSide
@@ -70,11 +72,12 @@ class Observations(eqx.Module):
     other: OtherSide | None
     label: Label = eqx.field(static=True)
 
+    @arguments
     def __init__(
         self,
         alpha: Values,
         p: Values,
-        seen: Sequence[str],
+        seen: Annotated[Sequence[str], list_of(str, "words")],
         restitution: Values | None = None,
         *,
         alpha_sd: Values = 0.0,
@@ -82,7 +85,7 @@ class Observations(eqx.Module):
         restitution_sd: Values = 0.0,
         rotation: Values | None = None,
         rotation_sd: Values | None = None,
-        names: Sequence[str] | None = None,
+        names: Annotated[Sequence[str] | None, list_of(object, "names")] = None,
         other: OtherSide | None = None,
     ):
         alpha = as_real("alpha", alpha)
@@ -97,7 +100,8 @@ class Observations(eqx.Module):
         self.alpha, self.p = block.alpha, block.p
         if other is None:
             own = np.asarray(alpha)[np.asarray(self.follows)]
-            Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
+            if own.size:
+                Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
         self.restitution = jnp.where(self.follows, self.by_momentum(self.alpha), given)
         deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
         self.alpha_sd, self.p_sd, self.restitution_sd = (
@@ -113,10 +117,11 @@ class Observations(eqx.Module):
             raise ValueError(f"Argument `names` must have {count} names, but has {len(self.names)}.")
 
     @classmethod
+    @arguments
     def asymmetric(
         cls,
         blocks: AsymmetricBlock,
-        seen: Sequence[str],
+        seen: Annotated[Sequence[str], list_of(str, "words")],
         restitution: Values | None = None,
         *,
         facing: Values = 0.0,
@@ -204,7 +209,7 @@ class Observations(eqx.Module):
 
     def of(self, which: ArrayLike) -> "Observations":
         """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
-        index = np.arange(self.alpha.size)[np.asarray(which)]
+        index = _chosen(which, self.alpha.size)
         known = {
             name: getattr(self, name)[index]
             for name in ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
@@ -214,6 +219,20 @@ class Observations(eqx.Module):
         names = [self.names[i] for i in index]
         other = jax.tree.map(lambda x: x[..., index], self.other)
         return Observations(self.alpha[index], self.p[index], words, restitution, **known, names=names, other=other)
+
+
+def _chosen(which: ArrayLike, count: int) -> np.ndarray:
+    """Numbers of the rocks that are meant."""
+    given = np.asarray(which) if isinstance(which, (list, tuple, np.ndarray, jax.Array, int, np.integer)) else None
+    good = given is not None and given.ndim == 1 and given.size
+    if good and given.dtype == bool:
+        good = given.size == count and given.any()
+    elif good:
+        good = given.dtype.kind in "iu" and (given >= -count).all() and (given < count).all()
+    if not good:
+        said = f"be numbers of some of {count} rocks, or a truth value for each"
+        raise ValueError(f"Argument `which` must {said}, but is {shown(which)}.")
+    return np.arange(count)[given]
 
 
 def _in_share(x):

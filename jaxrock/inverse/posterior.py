@@ -7,12 +7,15 @@ of walkers, by NumPyro's AIES, take many times as many points: benchmarks/invers
 """
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
+from jaxrock._arguments import arguments, at_least
+from jaxrock._checks import inner_share, scalar
 from jaxrock._progress import Progress
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
@@ -78,6 +81,7 @@ class Posterior(eqx.Module):
 
     def interval(self, share: float = 0.95) -> Real:
         """(parameters, 2) intervals that leave equal shares of the samples on both sides."""
+        share = float(scalar("share", inner_share("share", share)))
         flat = self.samples.reshape(-1, len(self.names))
         return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
 
@@ -92,6 +96,7 @@ class Posterior(eqx.Module):
         return "\n".join([*lines, PosteriorStatus[self.status]])
 
 
+@arguments
 def sample_motion(
     observations: Observations,
     motion: Callable,
@@ -100,9 +105,9 @@ def sample_motion(
     *,
     lapse: ArrayLike = 0.02,
     estimate: Estimate | None = None,
-    effective_size: int = 1000,
-    steps: int = 4000,
-    seed: int = 0,
+    effective_size: Annotated[int, at_least(1)] = 1000,
+    steps: Annotated[int, at_least(1)] = 4000,
+    seed: Annotated[int, at_least(0)] = 0,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -133,9 +138,6 @@ def sample_motion(
         import numpyro.diagnostics  # noqa: F401
     except ImportError as error:
         raise ImportError('Sampling needs NumPyro: pip install "jaxrock[posterior]".') from error
-    for name, value in (("effective_size", effective_size), ("steps", steps)):
-        if value < 1:
-            raise ValueError(f"Argument `{name}` must be at least 1, but is {value}.")
     if estimate is None:
         estimate = estimate_motion(
             observations, motion, unknowns, scatter, lapse=lapse, model=model, engine=engine, progress=progress

@@ -1,6 +1,7 @@
 """What is looked for: unknown parameters of a motion, their ranges and priors, and the likelihood over them."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import finite, positive, scalar
+from jaxrock._arguments import arguments, pair
+from jaxrock._checks import finite, positive, scalar, shown
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
@@ -35,17 +37,27 @@ class Unknown(eqx.Module):
     prior: tuple[Real, Real] | None
     log: bool = eqx.field(static=True)
 
+    @arguments
     def __init__(
-        self, low: ArrayLike, high: ArrayLike, log: bool = True, prior: tuple[ArrayLike, ArrayLike] | None = None
+        self,
+        low: ArrayLike,
+        high: ArrayLike,
+        log: bool = True,
+        prior: Annotated[tuple[ArrayLike, ArrayLike] | None, pair] = None,
     ):
         check = positive if log else finite
         self.low, self.high = (scalar(name, check(name, x)) for name, x in (("low", low), ("high", high)))
         if not self.low < self.high:
             raise ValueError(f"Argument `high` must be above `low`, but is {high} with {low}.")
         self.log = log
-        if prior is not None and np.shape(prior) != (2,):
-            raise ValueError(f"Argument `prior` must be a median and a standard deviation, but is {prior!r}.")
-        self.prior = None if prior is None else (check("prior[0]", prior[0]), positive("prior[1]", prior[1]))
+        self.prior = (
+            None
+            if prior is None
+            else (
+                scalar("prior[0]", check("prior[0]", prior[0])),
+                scalar("prior[1]", positive("prior[1]", prior[1])),
+            )
+        )
         if prior is not None and not _FARTHEST >= self._away:
             given = f"{prior} with a range of {low} to {high}"
             raise ValueError(f"Argument `prior` must be within five standard deviations of the range, but is {given}.")
@@ -82,8 +94,9 @@ class Problem(eqx.Module):
 
     def __check_init__(self):
         for name, unknown in self.unknowns.items():
-            if isinstance(unknown, (int, float, tuple, list)):
-                raise ValueError(f"Argument `unknowns` must hold an `Unknown` for `{name}`, but holds {unknown!r}.")
+            if not isinstance(unknown, Unknown):
+                said = f"hold an `Unknown` for {shown(name)}, but holds {shown(unknown)}"
+                raise ValueError(f"Argument `unknowns` must {said}.")
 
     @property
     def names(self) -> tuple[str, ...]:

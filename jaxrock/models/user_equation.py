@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxrock._arguments import arguments
 from jaxrock._guard import guarded
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
@@ -40,6 +41,7 @@ class Equation(AbstractEquation):
     _acceleration: Callable
     _falls_flat: bool = eqx.field(static=True)
 
+    @arguments
     def __init__(
         self,
         restoring: Callable | None = None,

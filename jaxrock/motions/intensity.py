@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock._arguments import arguments
+from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.gauss_legendre import gauss_legendre
@@ -13,6 +15,7 @@ _PARTS = 256  # of every smooth piece, where there are few
 _FEW = 32
 
 
+@arguments
 def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
     """Peak ground acceleration (PGA) [g].
 
@@ -22,9 +25,11 @@ def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
 
     **Returns:** the largest |acceleration|: exact for records and straight lines, to about 1e-9 for smooth pulses.
     """
+    check_single(motion=motion)
     return _peaks(motion)[0]
 
 
+@arguments
 def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     """Peak ground velocity (PGV) [m/s], of a ground that is at rest at first, under 9.81 m/s^2.
 
@@ -34,6 +39,7 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
 
     **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses.
     """
+    check_single(motion=motion)
     return _peaks(motion)[1]
 
 
@@ -45,6 +51,7 @@ def _peaks(motion: AbstractMotion):
     passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
     """
     knots = motion.knots
+    nodes, weights = (jnp.asarray(values, knots.dtype) for values in (_NODES, _WEIGHTS))
     parts = _PARTS if knots.size - 1 <= _FEW else 1
 
     def in_piece(piece, length):
@@ -58,8 +65,8 @@ def _peaks(motion: AbstractMotion):
 
         def gain(begin, width):
             """Velocity that is gained."""
-            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(_NODES)
-            return values @ _WEIGHTS * width / 2
+            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(nodes)
+            return values @ weights * width / 2
 
         begins = step * jnp.arange(parts)
         ends = jax.vmap(lambda local: jet(local)[0])(step * jnp.arange(parts + 1))
@@ -82,7 +89,7 @@ def _peaks(motion: AbstractMotion):
         peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(jet(top)[0]))
         return peak, jax.vmap(gain, (0, None))(begins, step), turning
 
-    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), jnp.diff(knots))
+    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), motion.lengths)
     velocity = jnp.cumsum(gains.ravel())
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings.ravel())))

@@ -13,77 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._checks import Values, finite, instance, not_negative
+from jaxrock._arguments import arguments
+from jaxrock._checks import Values, delay, factor, if_known, not_nan
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.lookup import count_up_to
-from jaxrock.numerics.polynomial import horner, rescaled, shifted
 
 Scalar = Inexact[ArrayLike, ""]
-
-
-class Shaking(NamedTuple):
-    """Taylor coefficients of the ground's acceleration [g]; `vertical` (upward) is None where there is none."""
-
-    horizontal: list[Scalar]
-    vertical: list[Scalar] | None = None
-
-    def each(self, function) -> "Shaking":
-        """The same with the coefficients that a function makes of those of each component."""
-        return Shaking(function(self.horizontal), None if self.vertical is None else function(self.vertical))
-
-    def at(self, x: Scalar) -> tuple[Scalar, Scalar | None]:
-        """Horizontal acceleration [g], and the weight of a mass over that at rest (None: 1), at x units of time."""
-        return horner(self.horizontal, x), None if self.vertical is None else 1 + horner(self.vertical, x)
-
-    @property
-    def now(self) -> tuple[Scalar, Scalar | None]:
-        """As `at` no time at all."""
-        return self.horizontal[0], None if self.vertical is None else 1 + self.vertical[0]
-
-    def rescaled(self, length: Scalar) -> "Shaking":
-        """Coefficients in time/length."""
-        return self.each(lambda terms: rescaled(terms, length))
-
-    def shifted(self, by: Scalar) -> "Shaking":
-        """Coefficients about a time `by` later."""
-        return self.each(lambda terms: shifted(terms, by))
-
-    def steepest(self, within: Scalar | float = 1.0) -> tuple[Scalar, Scalar | None]:
-        """Bounds of how fast the components change in so many units of time, per unit."""
-
-        def bound(terms):
-            slopes = [k * jnp.abs(c) for k, c in enumerate(terms)][1:]
-            return horner(slopes or [jnp.zeros_like(terms[0])], within)
-
-        return bound(self.horizontal), None if self.vertical is None else bound(self.vertical)
-
-
-class Bounds(NamedTuple):
-    """Upper bounds of a component's absolute acceleration within each piece [g], times `gain` where there is one: what
-    only scales a motion leaves the array to all scales alike."""
-
-    values: Inexact[Array, " pieces"]
-    gain: Scalar | None = None
-
-    def scaled(self, factor: Scalar) -> "Bounds":
-        """Those of a motion that is so many times as strong."""
-        factor = jnp.abs(factor)
-        return Bounds(self.values, factor if self.gain is None else factor * self.gain)
-
-    def times_gain(self, values: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        """Some of the values, or what was made of them, as bounds."""
-        return values if self.gain is None else self.gain * values
-
-
-class Envelope(NamedTuple):
-    """Bounds of the horizontal acceleration, and of the vertical one if there is any."""
-
-    horizontal: Bounds
-    vertical: Bounds | None
-
-    def each(self, function) -> "Envelope":
-        """The same with the bounds that a function makes of those of each component."""
-        return Envelope(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
 
 class AbstractMotion(eqx.Module):
@@ -93,6 +29,18 @@ class AbstractMotion(eqx.Module):
     @abc.abstractmethod
     def knots(self) -> Inexact[Array, " knots"]:
         """Times that bound the smooth pieces, from 0 to the end of the motion [s], never decreasing."""
+
+    @property
+    def lengths(self) -> Inexact[Array, " pieces"]:
+        """How long each piece lasts [s]. Blocks are followed by the time since the last knot: a motion that begins late
+        tells lengths that differences of rounded knots would not."""
+        return jnp.diff(self.knots)
+
+    @property
+    def lateness(self) -> Scalar | None:
+        """By how much parts of the motion may come too early or too late, one beside another, because their times are
+        rounded [s]; None: by nothing that the length of a piece does not tell."""
+        return None
 
     @property
     @abc.abstractmethod
@@ -142,7 +90,7 @@ class AbstractMotion(eqx.Module):
         **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
         value after it.
         """
-        time = jnp.asarray(time, self.knots.dtype)
+        time = if_known(not_nan, "time", time).astype(self.knots.dtype)
         knots = self.knots
 
         def at(t):
@@ -154,7 +102,6 @@ class AbstractMotion(eqx.Module):
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
-        instance("vertical", vertical, AbstractMotion, "a motion")
         return WithVertical(self, vertical)
 
     def shifted(self, delay: ArrayLike) -> "Shifted":
@@ -202,8 +149,9 @@ class Scaled(_Changed):
     """A motion times a factor (`factor * motion`)."""
 
     motion: AbstractMotion
-    factor: Inexact[Array, "..."] = parameter("-", finite, is_free=False)  # the motion's amplitude says the same
+    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude says the same
 
+    @arguments
     def __init__(self, motion: AbstractMotion, factor: ArrayLike):
         self.motion = motion
         set_parameters(self, factor=factor)
@@ -211,6 +159,14 @@ class Scaled(_Changed):
     @property
     def knots(self):
         return self.motion.knots
+
+    @property
+    def lengths(self):
+        return self.motion.lengths
+
+    @property
+    def lateness(self):
+        return self.motion.lateness
 
     @property
     def scales(self):
@@ -232,8 +188,9 @@ class Shifted(_Changed):
     """A motion after `delay` seconds of quiet (`motion.shifted(delay)`)."""
 
     motion: AbstractMotion
-    delay: Inexact[Array, "..."] = parameter("s", not_negative)
+    delay: Inexact[Array, "..."] = parameter("s", delay)
 
+    @arguments
     def __init__(self, motion: AbstractMotion, delay: ArrayLike):
         self.motion = motion
         set_parameters(self, delay=delay)
@@ -242,6 +199,15 @@ class Shifted(_Changed):
     def knots(self):
         knots = self.motion.knots + self.delay
         return jnp.concatenate([jnp.zeros_like(knots[:1]), knots])
+
+    @property
+    def lengths(self):
+        inner = self.motion.lengths
+        return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
+
+    @property
+    def lateness(self):
+        return self.motion.lateness
 
     @property
     def scales(self):
@@ -295,12 +261,15 @@ class _Pieces(NamedTuple):
         return None if terms is None else [jnp.where(moving, u, 0.0) for u in terms]
 
 
-def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None:
-    """Coefficients of a sum; None is zero."""
-    if first is None or second is None:
-        return first if second is None else second
-    longer, shorter = (first, second) if len(first) > len(second) else (second, first)
-    return [a + b for a, b in zip(longer, shorter)] + longer[len(shorter) :]
+def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
+    """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
+
+    def is_shifted(node):
+        return isinstance(node, Shifted)
+
+    if not any(map(is_shifted, jax.tree.leaves(parts, is_leaf=is_shifted))):
+        return None
+    return sum((part.lateness for part in parts if part.lateness is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
 
 class Summed(AbstractMotion):
@@ -309,9 +278,17 @@ class Summed(AbstractMotion):
     first: AbstractMotion
     second: AbstractMotion
 
+    @arguments
+    def __init__(self, first: AbstractMotion, second: AbstractMotion):
+        self.first, self.second = first, second
+
     @property
     def knots(self):
         return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
+
+    @property
+    def lateness(self):
+        return _lateness(self.knots, self.first, self.second)
 
     @property
     def _parts(self) -> tuple[_Pieces, _Pieces]:
@@ -355,9 +332,17 @@ class WithVertical(_Changed):
     horizontal: AbstractMotion
     vertical: AbstractMotion
 
+    @arguments
+    def __init__(self, horizontal: AbstractMotion, vertical: AbstractMotion):
+        self.horizontal, self.vertical = horizontal, vertical
+
     @property
     def knots(self):
         return jnp.sort(jnp.concatenate([self.horizontal.knots, self.vertical.knots]))
+
+    @property
+    def lateness(self):
+        return _lateness(self.knots, self.horizontal, self.vertical)
 
     @property
     def _parts(self) -> tuple[_Pieces, _Pieces]:

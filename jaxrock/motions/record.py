@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Values, finite, not_negative, positive
+from jaxrock._arguments import arguments
+from jaxrock._checks import Values, not_negative, size, strength
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion
@@ -57,16 +58,17 @@ class Record(_Straight):
     Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
     """
 
-    samples: Inexact[Array, "*batch n"] = parameter("g", finite, axes=1)
-    dt: Inexact[Array, "..."] = parameter("s", positive)
+    samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
+    dt: Inexact[Array, "..."] = parameter("s", size)
     label: Label = eqx.field(static=True)
 
+    @arguments
     def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
-        samples = finite("acceleration", acceleration)
+        samples = strength("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
         self.samples = samples
-        self.dt = positive("dt", dt)
+        self.dt = size("dt", dt)
         self.label = Label(name)
 
     @property
@@ -85,8 +87,8 @@ class Record(_Straight):
 class _Padded(_Straight):
     """A record with room for more samples, which are zero and at its end."""
 
-    samples: Inexact[Array, "*batch n"] = parameter("g", finite, axes=1)
-    dt: Inexact[Array, "..."] = parameter("s", positive)
+    samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
+    dt: Inexact[Array, "..."] = parameter("s", size)
     finish: Inexact[Array, "..."] = parameter("s", not_negative, is_free=False)
 
     @property

@@ -1,6 +1,7 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxrock._checks import instance
+from jaxrock._arguments import arguments, list_of
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record
+
+_LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
 
 class Suite(eqx.Module):
@@ -34,12 +37,14 @@ class Suite(eqx.Module):
     peak_acceleration: Float[Array, " motions"]
     peak_velocity: Float[Array, " motions"]
 
-    def __init__(self, motions: Sequence[AbstractMotion], names: Sequence[str] | None = None):
-        motions = tuple(motions)
+    @arguments
+    def __init__(
+        self,
+        motions: Annotated[Sequence[AbstractMotion], list_of(AbstractMotion, "motions")],
+        names: Annotated[Sequence[str] | None, list_of(str, "words")] = None,
+    ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
-        for motion in motions:
-            instance("motions", motion, AbstractMotion, "a list of motions")
         lengths = [m.samples.shape[-1] for m in motions if isinstance(m, Record)]
         self.groups = tuple(_ensemble(_padded(m, max(lengths, default=0))) for m in motions)
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
@@ -49,7 +54,7 @@ class Suite(eqx.Module):
         self.peak_acceleration = jnp.concatenate([_each(peak_acceleration, group) for group in self.groups])
         self.peak_velocity = jnp.concatenate([_each(peak_velocity, group) for group in self.groups])
         for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
-            if not peak > 0:
+            if not peak > _LEAST:
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
 
     def __len__(self) -> int:

@@ -1,9 +1,10 @@
 """What `outcome` and `simulate` take alike: the block's kind, the initial state, the engine."""
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike, Inexact
 
-from jaxrock._checks import as_real, checked, scalar
+from jaxrock._checks import as_real, checked, scalar, shown, strength
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -35,22 +36,25 @@ def start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
     rotation = checked(
         "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)
     )
-    return scalar("initial[0]", rotation), scalar("initial[1]", as_real("initial[1]", velocity))
+    velocity = as_real("initial[1]", velocity)
+    if not isinstance(velocity, jax.core.Tracer):  # of what is traced and not finite a status tells
+        velocity = strength("initial[1]", velocity)
+    return scalar("initial[0]", rotation), scalar("initial[1]", velocity)
 
 
 def steps_of_flexible(model: AbstractEquation, initial: tuple, engine: AbstractEngine | None) -> dict[str, int]:
     """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
     if model is not USUAL:
         raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")
-    if tuple(initial) != (0.0, 0.0):
+    if any(isinstance(x, jax.core.Tracer) or x != 0 for x in start_of(initial)):
         raise ValueError(
-            f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {initial}."
+            f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {shown(initial)}."
         )
     if engine is None:
         return {}
     if not isinstance(engine, Series) or engine.order is not None or engine.tolerance is not None:
         raise ValueError(
             "Argument `engine` must be None or Series(max_steps=...) for a FlexibleBlock, whose phases are solved in "
-            f"closed form, but is {engine}."
+            f"closed form, but is {shown(engine)}."
         )
     return {} if engine.max_steps is None else {"max_steps": engine.max_steps}

@@ -5,12 +5,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked
-from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock._arguments import arguments
+from jaxrock._checks import scalar
+from jaxrock._parameters import check_single
+from jaxrock.blocks.asymmetric import AsymmetricBlock, ratio_of_inertia
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle
-from jaxrock.motions.motion import Shaking
+from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response
 
 Scalar = Inexact[ArrayLike, ""]
@@ -50,6 +52,7 @@ class Contact(eqx.Module):
         return self.keeps_contact & (jnp.asarray(friction) >= needed)
 
 
+@arguments
 def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_ratio: ArrayLike = 0.75) -> Contact:
     """Compute the forces between block and ground along a response.
 
@@ -67,7 +70,9 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     **Source:** momentum of the centre of mass, on a circle about the corner (Shenton 1996 for the beginning of
     rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
-    ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
+    ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
+    check_single(block=block)
+    response.trajectory.check_single()
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (1.0, 1.0)
         rates = block.p, block.p

@@ -1,12 +1,14 @@
 """The history of a block under a motion."""
 
+from typing import Annotated
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import Values, checked, scalar
+from jaxrock._arguments import arguments, at_least, pair
+from jaxrock._checks import Values, scalar, span
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
@@ -164,15 +166,16 @@ def _peaks_of(path: Trajectory) -> tuple:
     return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
 
 
+@arguments
 def simulate(
     block: AnyBlock,
     motion: AbstractMotion,
     model: AbstractEquation = USUAL,
     *,
-    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    initial: Annotated[tuple[ArrayLike, ArrayLike], pair] = (0.0, 0.0),
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
-    samples: int = 2001,
+    samples: Annotated[int, at_least(2)] = 2001,
 ) -> Response | FlexibleResponse:
     """Compute the history of a block under a motion.
 
@@ -190,11 +193,8 @@ def simulate(
     if isinstance(block, FlexibleBlock):
         budget = steps_of_flexible(model, initial, engine)
         return simulate_flexible(block, motion, duration=duration, samples=samples, **budget)
-    if samples < 2:
-        raise ValueError(f"Argument `samples` must be at least 2, but is {samples}.")
     if duration is not None:
-        duration = checked("duration", duration, "be positive and finite", lambda t: (t > 0) & (t < np.inf))
-        duration = scalar("duration", duration)
+        duration = scalar("duration", span("duration", duration))
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model)

@@ -1,10 +1,13 @@
 """What becomes of a block under a motion: peak, verdict, margin."""
 
+from typing import Annotated
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._arguments import arguments, pair
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -72,12 +75,13 @@ class Outcome(eqx.Module):
     status: Status
 
 
+@arguments
 def outcome(
     block: AnyBlock,
     motion: AbstractMotion,
     model: AbstractEquation = USUAL,
     *,
-    initial: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
+    initial: Annotated[tuple[ArrayLike, ArrayLike], pair] = (0.0, 0.0),
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
 ) -> Outcome | FlexibleOutcome:
@@ -191,6 +195,9 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
         return jnp.where(overturned, jnp.inf, value)
 
     tie = final.peak - final.second <= 1e-9 * final.peak
+    # A block that stands still in balance goes nowhere, however many steps it takes.
+    eps = jnp.finfo(state.closeness.dtype).eps
+    unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
     graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
     return Outcome(
         differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
@@ -202,5 +209,5 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
         overturned=overturned,
         margin=jnp.where(overturned, -final.closeness_beyond, final.closeness),
         error=unless_overturned(final.error),
-        status=Status.where(state.done, final.status, Status.step_budget_exhausted),
+        status=Status.where(state.done, final.status, unfinished),
     )

@@ -7,6 +7,7 @@ at sampled points tell where something may hide between two of them, and only th
 """
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxrock._checks import positive
+from jaxrock._arguments import arguments, pair
+from jaxrock._checks import ratio, scalar
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -31,6 +33,7 @@ from jaxrock.sweeps.sweep import surface
 
 _FIRST = 256  # intervals of the first sampling
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
+_LEAST = 1e-12  # [g]; amplitudes are factors on a motion
 _TIGHT = 4e-15  # width of a bracket, relative
 
 
@@ -65,12 +68,13 @@ class Critical(eqx.Module):
         return jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
 
 
+@arguments
 def critical_amplitudes(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: AbstractEquation = Housner(),
     *,
-    intensity: tuple[float, float] = (1.0, 10.0),
+    intensity: Annotated[tuple[float, float], pair] = (1.0, 10.0),
     derivatives: bool = True,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -101,12 +105,13 @@ def critical_amplitudes(
     return _critical(scenes, np.log(factors), _Amplitude(model, engine), derivatives, progress)
 
 
+@arguments
 def critical_durations(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
     model: AbstractEquation = Housner(),
     *,
-    factor: tuple[float, float] = (0.05, 20.0),
+    factor: Annotated[tuple[float, float], pair] = (0.05, 20.0),
     derivatives: bool = True,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -133,7 +138,7 @@ def critical_durations(
 
 
 def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
-    low, high = (float(positive(name, end)) for end in ends)
+    low, high = (float(scalar(name, ratio(name, end))) for end in ends)
     if low >= high:
         raise ValueError(f"Argument `{name}` must be rising, but is {ends}.")
     return low, high
@@ -174,7 +179,10 @@ class _Scenes(eqx.Module):
                 jnp.abs(named(block_, motion_)["amplitude"]),
             )
 
-        return cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
+        found = cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
+        if not (found.peak > _LEAST).all():
+            raise ValueError(f"Argument `motion` must move the ground, but its peak is {found.peak.min():g} g.")
+        return found
 
 
 # What is varied: z is the logarithm of a factor.

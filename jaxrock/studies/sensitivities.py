@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
+from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -67,6 +68,7 @@ class Sensitivity(eqx.Module):
 _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 
 
+@arguments
 def sensitivity(
     block: Block | AsymmetricBlock,
     motion: AbstractMotion,
@@ -144,6 +146,7 @@ class SensitivityMap(eqx.Module):
     sensitivity: Sensitivity
 
 
+@arguments
 def sensitivity_map(
     uplift_strength: Values,
     pulse_duration: Values,

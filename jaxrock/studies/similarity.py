@@ -13,8 +13,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import one_of, positive
+from jaxrock._arguments import arguments
+from jaxrock._checks import as_real, one_of, positive
 from jaxrock.blocks.rigid import Block
+from jaxrock.responses.history import Response
 
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
@@ -46,6 +48,7 @@ class Scales(eqx.Module):
     velocity: Real
 
 
+@arguments
 def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str = "rigid") -> Groups:
     """The groups of a block under a motion.
 
@@ -68,6 +71,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3
 
 
+@arguments
 def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """The slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
 
@@ -79,6 +83,7 @@ def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     return Block(alpha, positive("frequency", frequency) / groups.frequency_ratio, groups.restitution)
 
 
+@arguments
 def motion(groups: Groups, block: Block, form: Callable):
     """The motion under which a block has these groups.
 
@@ -94,6 +99,7 @@ def motion(groups: Groups, block: Block, form: Callable):
     return form(threshold / groups.strength, 2 * jnp.pi / (groups.frequency_ratio * block.p))
 
 
+@arguments
 def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid") -> Scales:
     """The units in which responses of similar blocks are one curve.
 
@@ -113,7 +119,8 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
     return Scales(1 / block.p, rotation, block.p * rotation)
 
 
-def master_curve(response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
+@arguments
+def master_curve(response: Response, scales: Scales, dimensionless_time: ArrayLike) -> tuple[Real, Real]:
     """Rotation and velocity of a response in dimensionless terms.
 
     **Arguments:**
@@ -126,5 +133,5 @@ def master_curve(response, scales: Scales, dimensionless_time: ArrayLike) -> tup
 
     **Source:** Dimitrakopoulos & DeJong (2012), figures 6 and 11.
     """
-    rotation, velocity = response(jnp.asarray(dimensionless_time) * scales.time)
+    rotation, velocity = response(as_real("dimensionless_time", dimensionless_time) * scales.time)
     return rotation / scales.rotation, velocity / scales.velocity

@@ -5,9 +5,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxrock._checks import Values, positive
+from jaxrock._arguments import arguments
+from jaxrock._checks import Range, Values, ratio
 from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -60,6 +62,7 @@ class OverturningMap(eqx.Module):
     status: Status
 
 
+@arguments
 def rocking_spectrum(
     alpha: ArrayLike,
     motion: AbstractMotion,
@@ -87,13 +90,14 @@ def rocking_spectrum(
 
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
-    period = axis("period", period)
+    period = axis("period", period, _period)
     block = Block(alpha, 1.0, restitution)  # raises here, where values are known
 
     scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
     return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress))
 
 
+@arguments
 def self_similar_spectrum(
     frequency_ratio: Values,
     intensity: Values,
@@ -129,6 +133,7 @@ def self_similar_spectrum(
     return Spectrum(abscissa=ratio, intensity=intensity, **results)
 
 
+@arguments
 def overturning_map(
     frequency_ratio: Values,
     intensity: Values,
@@ -177,8 +182,12 @@ def scaled_law(block: Block) -> AbstractRestitution:
     return block.law
 
 
-def axis(name: str, values: Values) -> Float[Array, " n"]:
-    array = jnp.atleast_1d(positive(name, values))
+_period = Range("be positive and finite, from 1e-5 to 1e6", 0.0, np.inf, lambda x: (x >= 1e-5) & (x <= 1e6))  # 2 pi/p
+
+
+def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"]:
+    """A list of numbers in a range, as an array."""
+    array = jnp.atleast_1d(allowed(name, values))
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")
     return array

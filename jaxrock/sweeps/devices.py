@@ -6,11 +6,14 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator
+from typing import Annotated
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import UInt8
+
+from jaxrock._arguments import arguments, at_least
 
 # Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
 _CPU_OPTIONS = {
@@ -25,7 +28,8 @@ _CPU_OPTIONS = {
 _PATIENCE = 7 * 24 * 3600  # seconds a process waits for the others: shares of a sweep may take long
 
 
-def use_cpu_devices(count: int | None = None) -> int:
+@arguments
+def use_cpu_devices(count: Annotated[int | None, at_least(1, 2**16)] = None) -> int:
     """Make every CPU core a device of JAX, so that surfaces are computed on all of them.
 
     Call it before the first computation. It changes nothing on GPUs.
@@ -40,8 +44,6 @@ def use_cpu_devices(count: int | None = None) -> int:
     """
     if count is None:
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if count < 1:
-        raise ValueError(f"Argument `count` must be at least 1, but is {count}.")
     try:
         jax.config.update("jax_num_cpu_devices", count)
     except RuntimeError as error:  # JAX has chosen its devices

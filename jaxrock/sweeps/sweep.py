@@ -10,14 +10,14 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import whole
+from jaxrock._arguments import arguments, at_least
 from jaxrock._progress import Progress
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import exchange, meet, process, shared_out
@@ -29,6 +29,7 @@ from jaxrock.sweeps.store import Store, listed, local, made_or_mended, of_sweep
 from jaxrock.transforms.fingerprint import Traced
 
 
+@arguments
 def sweep(
     function: Callable,
     /,
@@ -36,7 +37,7 @@ def sweep(
     outer: bool = True,
     store: str | Path | None = None,
     load: bool = True,
-    block: int | None = None,
+    block: Annotated[int | None, at_least(1)] = None,
     progress: bool | None = None,
     version: str | None = None,
     **axes: ArrayLike | Sequence,
@@ -75,7 +76,6 @@ def sweep(
     if not outer and len({values.size for values in lists.values()}) > 1:
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
-    whole("block", block, 1)
 
     traced = Traced(function, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
     names = own_names(list(axes), outer, traced.shapes, 0)

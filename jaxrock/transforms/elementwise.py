@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from jaxrock._checks import together
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -24,7 +25,9 @@ def elementwise(**checks: Callable) -> Callable:
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
             given = signature.bind(*args, **kwargs).arguments
-            return compiled(*(checks[name](name, value) for name, value in given.items()))
+            given = {name: checks[name](name, value) for name, value in given.items()}
+            together(**given)
+            return compiled(*given.values())
 
         return checked_and_compiled
 

@@ -9,6 +9,7 @@ needs a turning point. Knots end arcs, so that the right-hand side of every solv
 """
 
 from dataclasses import replace
+from typing import Annotated
 
 import diffrax
 import equinox as eqx
@@ -17,6 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._arguments import arguments, at_least, known
+from jaxrock._checks import inner_share
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.diffrax.guards import (
     POLICY,
@@ -79,14 +82,15 @@ class Diffrax(AbstractEngine):
     atol: float | None = eqx.field(static=True)
     max_solves: int | None = eqx.field(static=True)
 
+    @arguments
     def __init__(
         self,
         solver: diffrax.AbstractSolver = diffrax.Tsit5(),
-        rtol: float = 1e-8,
-        atol: float | None = None,
+        rtol: Annotated[float, known(inner_share)] = 1e-8,
+        atol: Annotated[float | None, known(inner_share)] = None,
         controller: diffrax.AbstractStepSizeController | None = None,
         adjoint: diffrax.AbstractAdjoint = diffrax.ForwardMode(),
-        max_solves: int | None = None,
+        max_solves: Annotated[int | None, at_least(1, 10**9)] = None,
     ):
         self._solver, self._controller, self._adjoint = Held.of(solver), Held.of(controller), Held.of(adjoint)
         self.rtol, self.atol, self.max_solves = rtol, atol, max_solves
@@ -111,12 +115,6 @@ class Diffrax(AbstractEngine):
         return self._adjoint.value
 
     def __check_init__(self):
-        if not 0 < self.rtol < 1:
-            raise ValueError(f"Argument `rtol` must be in (0, 1), but is {self.rtol}.")
-        if self.atol is not None and not 0 < self.atol < 1:
-            raise ValueError(f"Argument `atol` must be in (0, 1), but is {self.atol}.")
-        if self.max_solves is not None and self.max_solves < 1:
-            raise ValueError(f"Argument `max_solves` must be at least 1, but is {self.max_solves}.")
         if type(self.adjoint) not in _ADJOINTS:
             names = ", ".join(kind.__name__ for kind in _ADJOINTS)
             raise ValueError(f"Argument `adjoint` must be one of {names}, but is {type(self.adjoint).__name__}.")

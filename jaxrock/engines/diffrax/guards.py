@@ -13,7 +13,8 @@ from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.models.equation import AbstractMoments, Angle
-from jaxrock.motions.motion import AbstractMotion, Shaking
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.shaking import Shaking
 
 Scalar = Inexact[ArrayLike, ""]
 Flag = Bool[ArrayLike, ""]

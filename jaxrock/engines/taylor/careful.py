@@ -9,14 +9,15 @@ lane needs is not taken.
 
 import functools
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, Inexact, Int
 
-from jaxrock._checks import whole
+from jaxrock._arguments import at_least, check_fields, known
+from jaxrock._checks import inner_share
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.events import WATCHED, Events, landed, level_of
 from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
@@ -30,7 +31,7 @@ from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
-from jaxrock.motions.motion import Shaking
+from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import (
     Watch,
     derivative,
@@ -64,15 +65,12 @@ class Series(AbstractEngine):
     **Raises:** ValueError for a value outside its range.
     """
 
-    order: int | None = eqx.field(static=True, default=None)
-    tolerance: float | None = eqx.field(static=True, default=None)
-    max_steps: int | None = eqx.field(static=True, default=None)
+    order: Annotated[int | None, at_least(4, 64)] = eqx.field(static=True, default=None)
+    tolerance: Annotated[float | None, known(inner_share)] = eqx.field(static=True, default=None)
+    max_steps: Annotated[int | None, at_least(1, 10**9)] = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        whole("order", self.order, 4)
-        if self.tolerance is not None and not 0 < self.tolerance < 1:
-            raise ValueError(f"Argument `tolerance` must be in (0, 1), but is {self.tolerance}.")
-        whole("max_steps", self.max_steps, 1)
+        check_fields(self)
 
     def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
         """This engine at work on a scene; short pieces of a record need few terms."""

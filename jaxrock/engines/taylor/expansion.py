@@ -15,7 +15,7 @@ from jaxtyping import ArrayLike, Bool, Inexact
 
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
-from jaxrock.motions.motion import Shaking
+from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
 Scalar = Inexact[ArrayLike, ""]

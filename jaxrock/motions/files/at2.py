@@ -2,7 +2,7 @@
 
 import re
 
-from jaxrock._text import file_error
+from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
 
@@ -38,8 +38,7 @@ class AT2(AbstractFormat):
         at = next((number for number in range(last + 1) if _UNIT.search(lines[number])), None)
         unit = agreed_unit(name, (at or 0) + 1, unit, "" if at is None else _UNIT.search(lines[at])[1])
         samples = announced_samples(name, lines, last + 1, count, _numbers)
-        if _is_cut(lines[last + 1 :]):
-            raise file_error(name, "the last number is shorter than all others: the file seems to be cut off.")
+        check_end(name, lines, _printed(lines[last + 1 :]), by_program=True)
         # Event, station and component stand above the unit; the first line only names the database.
         title = " ".join(lines[at - 1].split()) if at is not None and at >= 2 else ""
         return Accelerogram(samples, dt, unit, title)
@@ -54,18 +53,11 @@ def _counts(line: str) -> tuple[int, float] | None:
     return (int(before[1]), to_float(before[2])) if before else None
 
 
-def _is_cut(lines: list[str]) -> bool:
-    """Whether all numbers have as many digits and an exponent alike, as formats of Fortran print them, but the last."""
+def _printed(lines: list[str]) -> list[str]:
+    """Numbers as they are printed: many of the first, and the last."""
     samples = [line for line in lines if line.strip() and _NUMBERS.fullmatch(line)]
     samples = samples[:_MANY] + samples[max(_MANY, len(samples) - 2) :]
-    *before, last = [_shape(text) for line in samples for text in re.findall(NUMBER, line)]
-    return len(before) > 1 and len(set(before)) == 1 and last != before[0]
-
-
-def _shape(text: str) -> tuple[int, int]:
-    """Digits after the point, and characters of the exponent."""
-    mantissa, exponent, power = text.upper().replace("D", "E").partition("E")
-    return len(mantissa.partition(".")[2]), len(exponent + power)
+    return [text for line in samples for text in re.findall(NUMBER, line)]
 
 
 def _numbers(line: str) -> list[float] | None:

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from jaxrock._text import file_error
+from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, to_float
 
@@ -60,7 +60,7 @@ def _fields(line: str) -> list[str]:
 
 def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str]]:
     """The numbers in columns of text, the line number of each row, and its first field as written."""
-    rows, numbers, first = [], [], []
+    rows, numbers, first, last = [], [], [], []
     for number, line in enumerate(lines, 1):
         line = line.split("#")[0].strip()
         fields = _fields(line) if line else []
@@ -82,6 +82,9 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str
         rows.append(row)
         numbers.append(number)
         first.append(fields[0])
+        last.append(fields[-1])
+    if rows:
+        check_end(name, lines, last)
     return np.array(rows), numbers, first
 
 

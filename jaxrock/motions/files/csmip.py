@@ -2,9 +2,11 @@
 
 import re
 
-from jaxrock._text import file_error
+import numpy as np
+
+from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
+from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, check_peak, to_float
 
 # "5690 POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: CM/SEC/SEC)"; later files write
 # ", in cm/sec2. (8f10.6)" and those of USC "IN UNITS CM/SEC/SEC".
@@ -38,16 +40,41 @@ class CSMIP(AbstractFormat):
         dt = agreed_step(name, dt, to_float(step))
         width = int(width or 10)
         samples = announced_samples(name, lines, at + 1, int(count), lambda line: _numbers(line, width))
+        if channel == len(channels) - 1:
+            _check_end(name, lines, at + 1, width)
+        if unit == "cm/s2":
+            _check_peak(name, lines, channels[channel - 1] + 1 if channel else 0, at, samples)
         return Accelerogram(samples, dt, unit, _title(lines[:at]))
 
 
 def _numbers(line: str, width: int) -> list[float] | None:
     """The numbers in a line of columns `width` wide, which may touch, or None if it holds anything else."""
     line = line.rstrip()
+    if len(line) % width:
+        return None
     fields = [line[start : start + width].strip() for start in range(0, len(line), width)]
     if not all(re.fullmatch(NUMBER, field) for field in fields):
         return None
     return [to_float(field) for field in fields]
+
+
+def _check_end(name: str, lines: list[str], start: int, width: int) -> None:
+    """The last line of a channel, at which a file may end, is whole."""
+    rows = [row for row, line in enumerate(lines[start:], start) if line.strip() and _numbers(line, width) is not None]
+    if lines[-1].strip() and rows and rows[-1] == len(lines) - 1:
+        last = lines[-1].rstrip()
+        check_end(name, lines, [last[k : k + width] for k in range(0, len(last), width)])
+
+
+_PEAK = re.compile(rf"\s*PEAK\s+ACCELERATION\s*=\s*({NUMBER})\s*CM/SEC/SEC", re.IGNORECASE)
+
+
+def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.ndarray) -> None:
+    """The largest sample is the peak that the header of a channel states, if it does."""
+    for row in range(start, at):
+        found = _PEAK.match(lines[row])
+        if found:
+            check_peak(name, row + 1, to_float(found[1]), samples)
 
 
 def _title(lines: list[str]) -> str:

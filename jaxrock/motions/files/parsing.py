@@ -76,3 +76,10 @@ def announced_samples(
     if len(values) != count or count == 0:
         raise file_error(name, f"header announces {count} samples, but {len(values)} follow.")
     return np.array(values)
+
+
+def check_peak(name: str, line: int, stated: float, samples: np.ndarray) -> None:
+    """The largest sample is the peak that a header states in a line [cm/s2]."""
+    stated, largest = abs(stated), float(np.abs(samples).max())
+    if abs(largest - stated) > 1e-3 * stated + 1e-6:
+        raise file_error(name, f"line {line} states a peak of {stated:g} cm/s2, but the largest sample is {largest:g}.")

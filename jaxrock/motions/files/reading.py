@@ -5,12 +5,12 @@ and where a header announces a count, a unit or a time step, contradictions rais
 """
 
 import os
-from pathlib import Path
+from typing import Annotated
 
-import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import one_of, positive
+from jaxrock._arguments import arguments, at_least, path_of, word_of
+from jaxrock._checks import one_of, scalar, size
 from jaxrock._text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
@@ -32,13 +32,18 @@ _COLUMNS = Columns(_WITH_HEADERS)
 FORMATS = {each.name: each for each in (*_WITH_HEADERS, _COLUMNS)}
 
 
+def _known_format(name: str, value: str) -> str:
+    return one_of(name, value, tuple(FORMATS))  # as the table is then
+
+
+@arguments
 def read_record(
     path: str | os.PathLike,
     *,
-    format: str | None = None,
+    format: Annotated[str | None, _known_format] = None,
     dt: ArrayLike | None = None,
-    unit: str | None = None,
-    column: int | np.integer | None = None,
+    unit: Annotated[str | None, word_of(*PER_G)] = None,
+    column: Annotated[int | None, at_least(0)] = None,
 ) -> Record:
     """Read an accelerogram from a file.
 
@@ -63,18 +68,8 @@ def read_record(
     empty, binary or damaged; ValueError for an argument that is missing, not allowed, of no use for
     the format, or contradicted by the file.
     """
-    if format is not None:
-        one_of("format", format, tuple(FORMATS))
-    if unit is not None:
-        one_of("unit", unit, tuple(PER_G))
-    if dt is not None:
-        if np.ndim(dt) != 0:
-            raise ValueError(f"Argument `dt` must be one number, but has shape {np.shape(dt)}.")
-        positive("dt", dt)
-        dt = float(dt)
-    if column is not None and (isinstance(column, bool) or not isinstance(column, (int, np.integer)) or column < 0):
-        raise ValueError(f"Argument `column` must be an integer, 0 or more, but is {column!r}.")
-    path = Path(path)
+    dt = None if dt is None else float(scalar("dt", size("dt", dt)))
+    path = path_of("path", path)
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[format]
     accelerogram = chosen.read(path.name, lines, dt, unit, column)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jaxrock._checks import finite, not_nan, positive
+from jaxrock._checks import not_nan, size, strength
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.lookup import pick
@@ -12,8 +12,8 @@ from jaxrock.numerics.lookup import pick
 class RectangularPulse(AbstractPulse):
     """Constant `amplitude` [g] for `duration` [s] (positive): the limit shape -> -inf of `ExponentialPulse`."""
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    duration: Real = parameter("s", positive, symbol="t_d")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    duration: Real = parameter("s", size, symbol="t_d")
 
     @classmethod
     def word(cls) -> str:
@@ -42,8 +42,8 @@ class RectangularPulse(AbstractPulse):
 class TriangularPulse(AbstractPulse):
     """Straight up to `amplitude` [g] at mid `duration` [s] and straight down: shape 0 of `ExponentialPulse`."""
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    duration: Real = parameter("s", positive, symbol="t_d")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    duration: Real = parameter("s", size, symbol="t_d")
 
     @classmethod
     def word(cls) -> str:
@@ -97,8 +97,8 @@ class ExponentialPulse(AbstractPulse):
     **Source:** Voyagaki, Psycharis & Mylonakis (2012), equation 2.1, with the opposite sign of the motion.
     """
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    duration: Real = parameter("s", positive, symbol="t_d")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    duration: Real = parameter("s", size, symbol="t_d")
     shape: Real = parameter("-", not_nan, symbol="beta")
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike):

@@ -6,12 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import Range, finite, positive
+from jaxrock._checks import Range, size, strength
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.motions.pulses.sinusoidal import sinusoid
 
-_above_one = Range("be above 1 and finite", 1.0, np.inf, lambda x: (x > 1) & (x < np.inf))
+_above_one = Range("be above 1 and finite, and at most 1e6", 1.0, np.inf, lambda x: (x > 1) & (x <= 1e6))
+_phase = Range("be finite, and at most 1000 in size", -np.inf, np.inf, lambda x: (x >= -1e3) & (x <= 1e3))
 
 
 class MavroeidisPapageorgiouPulse(AbstractPulse):
@@ -32,10 +33,10 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
     **Source:** Mavroeidis & Papageorgiou (2003), equation 3 (velocity); its derivative is used.
     """
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    period: Real = parameter("s", positive, symbol="T")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    period: Real = parameter("s", size, symbol="T")
     oscillations: Real = parameter("-", _above_one, symbol="gamma")
-    phase: Real = parameter("rad", finite, symbol="nu")
+    phase: Real = parameter("rad", _phase, symbol="nu")
 
     def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
         set_parameters(self, amplitude=amplitude, period=period)

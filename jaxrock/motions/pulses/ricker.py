@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import finite, one_of, positive
+from jaxrock._checks import one_of, size, strength
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.xla_cpu import keep
@@ -36,9 +36,9 @@ class RickerPulse(AbstractPulse):
     Vassiliou & Makris (2011) (antisymmetric).
     """
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    period: Real = parameter("s", positive, symbol="T")
-    center: Real = parameter("s", positive)
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    period: Real = parameter("s", size, symbol="T")
+    center: Real = parameter("s", size)
     kind: str = eqx.field(static=True)
 
     def __init__(
@@ -47,7 +47,7 @@ class RickerPulse(AbstractPulse):
         set_parameters(self, amplitude=amplitude, period=period)
         self.kind = one_of("kind", kind, ("symmetric", "antisymmetric"))
         default = 5.7 / math.pi if kind == "symmetric" else 8.2 * math.sqrt(3) / (2 * math.pi)
-        self.center = default * self.period if center is None else positive("center", center)
+        self.center = default * self.period if center is None else size("center", center)
 
     @property
     def knots(self):

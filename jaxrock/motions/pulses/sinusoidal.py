@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import finite, positive
+from jaxrock._checks import size, strength
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.elementary import sine_cosine_of_any
@@ -29,8 +29,8 @@ def harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
 class HalfSinePulse(AbstractPulse):
     """amplitude sin(pi t/duration) [g] for `duration` [s] (positive)."""
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    duration: Real = parameter("s", positive, symbol="t_d")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    duration: Real = parameter("s", size, symbol="t_d")
 
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
         set_parameters(self, amplitude=amplitude, duration=duration)
@@ -55,8 +55,8 @@ class HalfSinePulse(AbstractPulse):
 class _OneCycle(AbstractPulse):
     """One full cycle of a sinusoid."""
 
-    amplitude: Real = parameter("g", finite, symbol="a_g")
-    period: Real = parameter("s", positive, symbol="T")
+    amplitude: Real = parameter("g", strength, symbol="a_g")
+    period: Real = parameter("s", size, symbol="T")
 
     def __init__(self, amplitude: ArrayLike, period: ArrayLike):
         set_parameters(self, amplitude=amplitude, period=period)

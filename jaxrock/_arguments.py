@@ -1,0 +1,198 @@
+"""What a public function takes: its annotations say so, and what is given is held against them at the door.
+
+    @arguments
+    def outcome(block: Block, motion: AbstractMotion, *, samples: Annotated[int, at_least(2)] = 100):
+
+A class asks for an instance, `int`, `bool` and `str` for just that, `Callable` for something to be called. What stands
+beside a type in `Annotated` is a check of its own, such as a `Range`, and what it returns is what the function gets.
+Numbers and arrays without one (`ArrayLike`, shapes) are left to the function, which knows more of them.
+"""
+
+import collections.abc
+import functools
+import inspect
+import os
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import numpy as np
+
+from jaxrock._checks import Range, one_of, shown, whole
+
+Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
+
+
+def arguments(function: Callable) -> Callable:
+    """Decorate a function whose arguments are checked by their annotations, before it sees them.
+
+    **Raises:** ValueError, when it is called, for an argument that is not what is asked for: "Argument `x` must ...".
+    """
+    parameters = inspect.signature(function).parameters.values()
+    checks = {each.name: check_of(each.annotation) for each in parameters}
+    checks = {name: check for name, check in checks.items() if check is not None}
+    several = {each.name for each in parameters if each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+    checks = {name: check for name, check in checks.items() if name not in several}
+    places = [(each.name, checks.get(each.name)) for each in parameters if each.kind <= each.POSITIONAL_OR_KEYWORD]
+
+    @functools.wraps(function)
+    def checked(*args, **kwargs):
+        args = [value if check is None else check(name, value) for (name, check), value in zip(places, args)] + list(
+            args[len(places) :]
+        )  # too many: Python says so
+        kwargs = {name: checks[name](name, value) if name in checks else value for name, value in kwargs.items()}
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def check_fields(owner: Any) -> None:
+    """The same for the fields of a module without an `__init__` of its own: for its `__check_init__`."""
+    for name, check in _of_fields(type(owner)).items():
+        check(name, getattr(owner, name))
+
+
+@functools.cache
+def _of_fields(kind: type) -> dict[str, Check]:
+    hints = {name: hint for each in reversed(kind.__mro__) for name, hint in inspect.get_annotations(each).items()}
+    checks = {name: check_of(hint) for name, hint in hints.items()}
+    return {name: check for name, check in checks.items() if check is not None}
+
+
+def check_of(hint: Any) -> Check | None:
+    """The check that an annotation stands for; None where it asks for nothing that is checked here."""
+    if get_origin(hint) is Annotated:
+        return _of_annotated(*get_args(hint))
+    if get_origin(hint) in (Union, types.UnionType):
+        return _of_union(get_args(hint))
+    if hint is int:
+        return lambda name, value: whole(name, value)
+    if hint is bool:
+        return lambda name, value: _kind(name, value, (bool, np.bool_), "be True or False")
+    if hint is str:
+        return lambda name, value: _kind(name, value, (str,), "be a word")
+    if hint is collections.abc.Callable or get_origin(hint) is collections.abc.Callable:
+        return _callable
+    if hint is dict or get_origin(hint) is dict:
+        return lambda name, value: _kind(name, value, (collections.abc.Mapping,), "be a dictionary")
+    if _is_own(hint):
+        return lambda name, value: _kind(name, value, (hint,), f"be {_called(hint)}")
+    return None
+
+
+def _of_annotated(hint: Any, *more: Any) -> Check:
+    checks = [each for each in more if callable(each)]
+    missing = type(None) in get_args(hint)
+
+    def check(name: str, value: Any) -> Any:
+        if value is None and missing:
+            return None
+        return functools.reduce(lambda value, each: each(name, value), checks, value)
+
+    return check
+
+
+def _of_union(members: tuple) -> Check | None:
+    """Of several classes an instance of one; of one type and None that type; other unions are not checked."""
+    rest = tuple(each for each in members if each is not type(None))
+    missing = len(rest) < len(members)
+    if all(map(_is_own, rest)):
+        words = [_called(each) for each in rest]
+        words = " or ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+
+        def inner(name, value):
+            return _kind(name, value, rest, f"be {words}")
+    elif len(rest) == 1:
+        inner = check_of(rest[0])
+    else:
+        inner = None
+    if inner is None or not missing:
+        return inner
+    return lambda name, value: None if value is None else inner(name, value)
+
+
+def _is_own(hint: Any) -> bool:
+    """Whether it is a class of the package, or of a library, and not one of Python, NumPy or shapes of arrays."""
+    return isinstance(hint, type) and hint.__module__.split(".")[0] in ("jaxrock", "diffrax")
+
+
+_IN_WORDS = {"AbstractEquation": "an equation of motion, such as Housner()"}
+
+
+def _called(kind: type) -> str:
+    """A class in words: "a Block", and of an abstract one "a motion"."""
+    name = kind.__name__
+    if name in _IN_WORDS:
+        return _IN_WORDS[name]
+    word = name.removeprefix("Abstract")
+    word = word if word == name else word.lower()
+    return f"{'an' if word[0] in 'AEIOUaeiou' else 'a'} {word}"
+
+
+def _kind(name: str, value: Any, kinds: tuple[type, ...], allowed: str) -> Any:
+    if isinstance(value, kinds):
+        return value
+    raise ValueError(f"Argument `{name}` must {allowed}, but is {shown(value)}.")
+
+
+def _callable(name: str, value: Any) -> Callable:
+    if callable(value):
+        return value
+    raise ValueError(f"Argument `{name}` must be a function, but is {shown(value)}.")
+
+
+# Checks for `Annotated`.
+
+
+def at_least(least: int, most: int | None = None) -> Check:
+    """Whole numbers from `least` on, up to `most`."""
+    return lambda name, value: whole(name, value, least, most)
+
+
+def known(allowed: Range) -> Check:
+    """One number in a range, which is a setting: no array, and not traced."""
+
+    def check(name: str, value: Any) -> float:
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
+            raise ValueError(f"Argument `{name}` must be a number, but is {shown(value)}.")
+        return float(allowed(name, value))
+
+    return check
+
+
+def word_of(*words: str) -> Check:
+    """One of some words."""
+    return lambda name, value: one_of(name, value, words)
+
+
+def path_of(name: str, value: Any) -> Path:
+    """The path of a file."""
+    if not isinstance(value, (str, os.PathLike)) or "\0" in os.fsdecode(value):
+        raise ValueError(f"Argument `{name}` must be the path of a file, but is {shown(value)}.")
+    return Path(os.fsdecode(value))
+
+
+def pair(name: str, value: Any) -> tuple:
+    """Two values."""
+    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+        raise ValueError(f"Argument `{name}` must be a pair, but is {shown(value)}.")
+    return tuple(value)
+
+
+def list_of(kind: type | Callable, words: str) -> Check:
+    """A list, not empty, of what is of a kind."""
+
+    def check(name: str, value: Any) -> list:
+        if isinstance(value, (str, bytes, dict)) or not isinstance(value, collections.abc.Iterable):
+            raise ValueError(f"Argument `{name}` must be a list of {words}, but is {shown(value)}.")
+        try:
+            values = list(value)
+        except TypeError:  # an array without axes
+            raise ValueError(f"Argument `{name}` must be a list of {words}, but is {shown(value)}.") from None
+        for each in values:
+            if not (isinstance(each, kind) if isinstance(kind, type) else kind(each)):
+                raise ValueError(f"Argument `{name}` must be a list of {words}, but holds {shown(each)}.")
+        return values
+
+    return check

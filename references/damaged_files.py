@@ -1,0 +1,259 @@
+"""Damaged files for every reader: what is read is what was written, or the file is refused by its name.
+
+    python -m references.damaged_files 2000 7        # so many damaged files of each kind of reader, from this seed
+
+A file that is cut short anywhere gives the rows that are there, every digit of them, or is refused; one in another
+encoding, with other line ends or decimal commas gives the same numbers or is refused; one with flipped bytes or noise
+may be another file, but never ends in an internal error or in what is not a number.
+"""
+
+import collections
+import json
+import re
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import jaxrock as rk
+
+jax.config.update("jax_enable_x64", True)
+
+SAMPLES = np.round(np.random.default_rng(5).normal(0, 0.2, 23), 7)
+
+
+def _lines(values: np.ndarray, form: str, per_line: int) -> str:
+    printed = [form % value for value in values]
+    return "".join("".join(printed[i : i + per_line]) + "\n" for i in range(0, len(printed), per_line))
+
+
+def _at2(body: str) -> str:
+    head = "PEER STRONG MOTION DATABASE RECORD\nLOMA PRIETA 10/18/89, WAHO, 090\nACCELERATION IN UNITS OF G\n"
+    return f"{head}NPTS=    {SAMPLES.size}, DT= .00500 SEC\n{body}"
+
+
+def _v2() -> str:
+    values = SAMPLES * 980.665
+    peak = f"PEAK ACCELERATION = {np.abs(values).max():9.3f}    CM/SEC/SEC  AT     .020   SEC.\n"
+    text = "CORRECTED ACCELEROGRAM   01336     CHAN  2: 360 DEG\n" + peak
+    announced = f"{values.size:5d} POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: CM/SEC/SEC)\n"
+    return text + announced + _lines(values, "%10.3f", 8)
+
+
+def _esm() -> str:
+    values = SAMPLES * 980.665
+    peak = values[np.abs(values).argmax()]
+    head = {
+        "EVENT_NAME": "GREECE", "SAMPLING_INTERVAL_S": "0.005000", "NDATA": f"{values.size}", "UNITS": "cm/s^2",
+        "PGA_CM/S^2": f"{peak:.6f}", "DATA_TYPE": "ACCELERATION",
+    }  # fmt: skip
+    return "".join(f"{key}: {value}\n" for key, value in head.items()) + "".join(f"{x:.6f}\n" for x in values)
+
+
+def _pairs(form: str, separator: str) -> str:
+    return "time,acceleration\n".replace(",", separator) + "".join(
+        f"{0.02 * k:.2f}{separator}{form % x}\n" for k, x in enumerate(SAMPLES.tolist())
+    )
+
+
+def _rocks() -> str:
+    head = "name,alpha_deg,alpha_deg_sd,half_diagonal_m,restitution,observed,rotation_deg,rotation_deg_sd\n"
+    rows = [
+        "a,10.5,0.5,1.25,0.9,survived,,",
+        "b,12.25,,0.75,,toppled,,",
+        '"c, the third",9.5,0.25,1.5,0.85,rotation,2.5,0.125',
+    ]
+    return "# rocks\n" + head + "".join(row + "\n" for row in rows)
+
+
+def _sides() -> str:
+    head = "observed,facing,alpha1_deg,alpha2_deg,radius1_m,radius2_m,inertia_ratio,alpha1_deg_sd\n"
+    return head + "survived,1,10.5,12.5,1.25,1.375,0.7,0.5\ntoppled,,9.5,8.25,0.75,0.875,,0.25\n"
+
+
+def _hazard(form: str) -> str:
+    levels = ["0.005", "0.0125", "0.1", "0.5"]
+    head = "# ,,,,,\"generated_by='OpenQuake engine 3.20', kind='mean', investigation_time=50.0, imt='PGA'\"\n"
+    sites = [(10.5, 45.25, (0.99, 0.5, 0.0125, 0.001)), (11.5, 46.75, (0.875, 0.25, 0.01, 0.0))]
+    rows = [",".join([f"{x:.5f}", f"{y:.5f}", "0.00000", *(form % p for p in ps)]) for x, y, ps in sites]
+    return head + f"lon,lat,depth,{','.join(f'poe-{level}' for level in levels)}\n" + "".join(f"{r}\n" for r in rows)
+
+
+def _of_record(record: rk.Record) -> dict[str, np.ndarray]:
+    return {"rows": np.asarray(record.samples)[:, None], "dt": np.asarray(record.dt)}
+
+
+def _of_rocks(seen: rk.Observations) -> dict[str, np.ndarray]:
+    names = ["alpha", "p", "restitution", "alpha_sd", "p_sd", "rotation", "rotation_sd", "seen"]
+    columns = [np.asarray(getattr(seen, name), float) for name in names]
+    if seen.other is not None:
+        columns += [np.asarray(x) for x in jax.tree.leaves(seen.other)]
+    return {"rows": np.stack([np.asarray(c).reshape(-1, seen.alpha.size)[0] for c in columns], axis=1)}
+
+
+def _of_hazard(found: rk.HazardCurves) -> dict[str, np.ndarray]:
+    places = np.stack([np.asarray(x) for x in (found.longitude, found.latitude, found.depth)], axis=1)
+    return {
+        "rows": np.concatenate([places, np.asarray(found.curves.rates[0])], axis=1),
+        "levels": found.curves.levels[0, 0],
+    }
+
+
+class File(NamedTuple):
+    """A file, what reads it, and what is looked at of what was read: rows, and what holds for all of them."""
+
+    text: str
+    read: Callable[[Path], object]
+    told: Callable[[object], dict[str, np.ndarray]]
+    suffix: str
+
+
+def _record(text: str, suffix: str, **given) -> File:
+    return File(text, lambda path: rk.read_record(path, **given), _of_record, suffix)
+
+
+FILES = {
+    "AT2": _record(_at2(_lines(SAMPLES, "%15.7E", 5)), ".AT2"),
+    "AT2 of free form": _record(_at2("\n".join(map(repr, SAMPLES.tolist())) + "\n"), ".AT2"),
+    "V2": _record(_v2(), ".V2"),
+    "ESM": _record(_esm(), ".ASC"),
+    "CSV": _record(_pairs("%.5f", ","), ".csv", unit="g"),
+    "columns of free form": _record(_pairs("%r", "\t"), ".txt", unit="g"),
+    "one column": _record("".join(f"{x!r}\n" for x in SAMPLES.tolist()), ".txt", unit="g", dt=0.01),
+    "rocks": File(_rocks(), rk.read_observations, _of_rocks, ".csv"),
+    "rocks of two sides": File(_sides(), rk.read_observations, _of_rocks, ".csv"),
+    "hazard": File(_hazard("%.6E"), rk.read_hazard_curves, _of_hazard, ".csv"),
+    "hazard of free form": File(_hazard("%g"), rk.read_hazard_curves, _of_hazard, ".csv"),
+}
+
+
+class Damage(NamedTuple):
+    """Content of a damaged file, and what may be read of it: "rows" that are there, the "same", or "anything" else."""
+
+    name: str
+    content: bytes
+    allowed: str
+
+
+def cut(text: str) -> Iterator[Damage]:
+    """Cut short after every byte."""
+    content = text.encode()
+    for at in range(len(content)):
+        yield Damage(f"cut after {at} bytes", content[:at], "rows")
+
+
+def written_differently(text: str) -> Iterator[Damage]:
+    """The same in other encodings, with other line ends, other marks."""
+    for encoding in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-7", "cp037", "latin-1", "cp1252"):
+        yield Damage(encoding, text.encode(encoding), "same")
+    for name, end in (("CRLF", "\r\n"), ("CR", "\r"), ("form feeds", "\f"), ("NEL", "\x85"), ("LFLF", "\n\n")):
+        yield Damage(name, text.replace("\n", end).encode(), "same")
+    yield Damage("decimal commas", re.sub(r"(\d)\.(\d)", r"\1,\2", text).encode(), "same")
+    semicolons = re.sub(r"(\d)\.(\d)", r"\1,\2", text.replace(",", ";"))
+    yield Damage("semicolons and decimal commas", semicolons.encode(), "same")
+    yield Damage("thousands", re.sub(r"(\d)(\d\d)\b", r"\1_\2", text).encode(), "same")
+    yield Damage("Arabic digits", text.translate({ord("0") + k: 0x660 + k for k in range(10)}).encode(), "same")
+    yield Damage("wide blanks", text.replace(" ", "\u00a0").encode(), "same")
+    yield Damage("minus signs", text.replace("-", "\u2212").encode(), "same")
+    yield Damage("twice", (text + text).encode(), "anything")
+    yield Damage("DOS end", text.encode() + b"\x1a", "same")
+    yield Damage("blanks at ends", text.replace("\n", "   \n").encode(), "same")
+    yield Damage("no end", text.rstrip().encode(), "same")
+
+
+def struck(text: str, random: np.random.Generator) -> Damage:
+    """Bytes flipped, put in, taken out or exchanged at random."""
+    content = bytearray(text.encode())
+    kind = random.choice(["flip", "noise", "cut out", "exchange", "put in", "repeat", "random", "lines"])
+    at = int(random.integers(len(content)))
+    if kind == "flip":
+        for place in random.integers(len(content), size=random.integers(1, 4)):
+            content[place] ^= 1 << int(random.integers(8))
+    elif kind == "noise":
+        for place in random.integers(len(content), size=random.integers(1, 40)):
+            content[place] = random.integers(256)
+    elif kind == "cut out":
+        del content[at : at + int(random.integers(1, 60))]
+    elif kind == "exchange":
+        other = int(random.integers(len(content)))
+        content[at], content[other] = content[other], content[at]
+    elif kind == "put in":
+        odd = ["nan", "inf", "1e999", "-", "1_0", ",", "\t", '"', "1e5", "\0", "é", "E", "--1", "0x1", " ", "\n", "#"]
+        content[at:at] = str(random.choice(odd)).encode()
+    elif kind == "repeat":
+        content[at:at] = content[at : at + int(random.integers(1, 60))]
+    elif kind == "lines":
+        lines = bytes(content).splitlines(keepends=True)
+        content = bytearray(b"".join(random.permutation(np.array(lines, object))))
+    else:
+        content = bytearray(random.bytes(int(random.integers(1, 300))))
+    return Damage(str(kind), bytes(content), "anything")
+
+
+def verdict(file: File, damage: Damage, folder: Path, truth: dict[str, np.ndarray]) -> str | None:
+    """What is wrong with how a damaged file is read; None: nothing."""
+    path = folder / f"damaged{file.suffix}"
+    path.write_bytes(damage.content)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = file.told(file.read(path))
+    except ValueError as error:
+        text = str(error)
+        named = text.startswith(f"File `{path.name}`") or re.match(r"Arguments? `\w+` must", text)
+        return None if type(error) is ValueError and named else f"{type(error).__name__}: {text[:200]}"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:200]}"
+    return _of_numbers(damage.allowed, found, truth)
+
+
+def _of_numbers(allowed: str, found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> str | None:
+    if any(np.isnan(np.asarray(x)).any() for x in found.values()):
+        return "silent: what was read is not a number"
+    if allowed == "anything":
+        return None
+    rows, count = truth["rows"], len(found["rows"])
+    if count > len(rows) or allowed == "same" and count != len(rows):
+        return f"silent: {count} rows of {len(rows)}"
+    if found["rows"].shape[1:] != rows.shape[1:] or not np.array_equal(found["rows"], rows[:count]):
+        return "silent: other numbers"
+    for name in set(truth) - {"rows"}:
+        if not np.allclose(found[name], truth[name], rtol=1e-9, atol=0):
+            return f"silent: another {name}"
+    return None
+
+
+def attack(count: int, seed: int, every: int = 1) -> tuple[int, dict[str, list[str]]]:
+    """Damage every file: some struck at random, each cut after every byte (or after some), each written differently."""
+    found, tried, random = collections.defaultdict(list), 0, np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for kind, file in FILES.items():
+            path = folder / f"whole{file.suffix}"
+            path.write_bytes(file.text.encode())
+            truth = file.told(file.read(path))
+            ends = list(cut(file.text))
+            damages = ends[::every] + ends[-12:] + list(written_differently(file.text))
+            damages += [struck(file.text, random) for _ in range(count // len(FILES))]
+            for damage in damages:
+                tried += 1
+                said = verdict(file, damage, folder, truth)
+                if said is not None:
+                    found[f"{kind}: {said}"].append(damage.name)
+    return tried, dict(found)
+
+
+def main(words: list[str]) -> int:
+    """Attack, and say what was found."""
+    tried, found = attack(int(words[0]), int(words[1]), *map(int, words[2:]))
+    print(json.dumps({"tried": tried, "found": found}, indent=1))
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
