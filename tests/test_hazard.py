@@ -696,7 +696,7 @@ def test_what_is_not_there(file):
     found = rk.read_hazard_curves(file(engine_file()))
     with pytest.raises(ValueError, match="`site` must be a whole number from 0 to 1, but is 2"):
         found.at(2)
-    with pytest.raises(ValueError, match="`branch` must be from 0 to 0, but is -1"):
+    with pytest.raises(ValueError, match="`branch` must be a whole number from 0 to 0, but is -1"):
         found.at(0, -1)
     with pytest.raises(ValueError, match="`paths` must be a file or a list of files, but is empty"):
         rk.read_hazard_curves([])
