@@ -4,16 +4,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, Values, acute, checked, finite, not_negative, positive
+from jaxrock._checks import Values, acute, checked, finite, not_negative, positive
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
-from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of
+from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, Side
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
-
-_ratio_of_inertia = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
 
 
 class AsymmetricBlock(eqx.Module):
@@ -44,7 +42,7 @@ class AsymmetricBlock(eqx.Module):
     alpha1: Real = parameter("rad", acute)
     alpha2: Real = parameter("rad", acute)
     p1: Real = parameter("rad/s", positive)
-    inertia_ratio: Real = parameter("-", _ratio_of_inertia)
+    inertia_ratio: Real = parameter("-", ratio_of_inertia)
     given_radius_ratio: Real | None = parameter("-", positive, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
 
