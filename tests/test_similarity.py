@@ -4,11 +4,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
 
 import jaxrock as rk
 from jaxrock.studies import similarity
+from jaxrock.studies.similarity import orientations
 
 TAU = np.linspace(0, 12, 400)
 
@@ -67,3 +69,84 @@ def test_conversions_invert():
         similarity.block(similarity.groups(block, 0.3, 7.0), 0.3, 7.0)
     with pytest.raises(ValueError, match="must be one of 'slender', 'rigid'"):
         similarity.scales(block, kind="stocky")
+
+
+# ---- Orientations ----
+
+TABLE_1 = {"0": "0xyz", "x": "x0zy", "y": "yz0x", "z": "zyx0"}  # D&D, columns in the order 0, x, y, z
+
+
+def test_the_table_of_orientations():
+    for first, row in TABLE_1.items():
+        for second, both in zip("0xyz", row):
+            assert orientations.combined(first, second) == both
+        assert [orientations.power(first, n) for n in (-3, -1, 0, 1, 2, 7)] == [first, first, "0", first, "0", first]
+
+
+@pytest.mark.parametrize("function, orientation", [(mp.cos, "0"), (mp.sin, "z"), (mp.tan, "z"), (mp.exp, None)])
+def test_orientations_of_functions(function, orientation):
+    """D&D 4.6: by the terms of their series. An exponential of an angle has none."""
+    exponents = [k for k, term in enumerate(mp.taylor(function, 0, 7)) if abs(term) > 1e-12]
+    if orientation is None:
+        with pytest.raises(ValueError, match="Argument `exponents` must be all even or all odd"):
+            orientations.of_series("z", exponents)
+    else:
+        assert orientations.of_series("z", exponents) == orientation
+        assert orientations.of_series("0", exponents) == "0"
+
+
+@pytest.mark.parametrize("exponents, dimension", [
+    ({"acceleration": 1, "gravity": -1}, (0, 0, "z")), ({"frequency": 1, "p": -1}, (0, 0, "0")),
+    ({"velocity": 1, "p": -1, "alpha": -1}, (0, 0, "0")), ({"gravity": 1, "radius": -1, "p": -2}, (0, 0, "y")),
+    ({"rotation": 1, "gravity": 1, "acceleration": -1}, (0, 0, "0")), ({"gravity": 1, "time": 2}, (1, 0, "y")),
+], ids=lambda x: str(x) if isinstance(x, dict) else "")  # fmt: skip
+def test_products(exponents, dimension):
+    """D&D 4.7. That 3 g/(4 R) has an orientation says that R stands for R times a unit vector in it."""
+    assert tuple(orientations.product(**exponents)) == dimension
+    assert orientations.product(**exponents).is_pure == (dimension == (0, 0, "0"))
+
+
+@functools.cache
+def similar_scenes():
+    """Slenderness, amplitude, and peak rotation of slender blocks with equal groups, safe and with impacts."""
+    alpha = np.array([0.02, 0.05, 0.1, 0.2])
+    amplitude = alpha / 0.45
+
+    def peak(alpha, amplitude):
+        block = rk.Block(alpha, 1.0, 0.85)
+        found = rk.outcome(block, rk.SinePulse(amplitude, 2 * np.pi / 5.0), rk.Linear())
+        return found.max_rotation, found.impact_count
+
+    rotation, impacts = jax.jit(jax.vmap(peak))(alpha, amplitude)
+    assert np.all(impacts >= 1) and np.all(np.isfinite(rotation))
+    return alpha, amplitude, np.asarray(rotation)
+
+
+@pytest.mark.parametrize("of_motion", range(-3, 4))
+def test_exponents_that_orientations_allow_and_that_scale(of_motion):
+    """D&D 4.8, 4.9: odd sums are allowed. Of these the engine's peaks are a number times (a_g/g)^m alpha^n for m + n = 1
+    alone, the degree of the linear equation; 4.10 is m, n = 0, 1 and 4.11 is 1, 0."""
+    alpha, amplitude, rotation = similar_scenes()
+    for of_alpha in range(-3, 4):
+        group = orientations.product(rotation=1, acceleration=-of_motion, gravity=of_motion, alpha=-of_alpha)
+        number = rotation / (amplitude**of_motion * alpha**of_alpha)
+        is_one = np.ptp(number) < 1e-12 * np.max(number)
+        assert group.is_pure == ((of_motion + of_alpha) % 2 == 1)
+        assert is_one == (of_motion + of_alpha == 1) and (group.is_pure or not is_one)
+
+
+@pytest.mark.parametrize("model", [rk.Linear(), rk.Housner()], ids=["slender", "rigid"])
+def test_what_orientations_say_is_a_mirror(model):
+    """What points along z changes its sign with the accelerations along x, in every model; not every model scales."""
+    block = rk.Block(0.3, 2.0, 0.85)
+    follow = jax.jit(lambda a: rk.simulate(block, rk.SinePulse(a, 0.8), model, duration=4.0)(jnp.linspace(0, 4, 90)))
+    for one, other in zip(follow(0.6), follow(-0.6)):
+        np.testing.assert_array_equal(one, -other)
+        assert np.max(np.abs(one)) > 0.05
+
+
+def test_names_of_orientations():
+    with pytest.raises(ValueError, match="Argument `orientation` must be one of '0', 'x', 'y', 'z', but is 'w'"):
+        orientations.combined("x", "w")
+    with pytest.raises(ValueError, match="Argument `name` must be one of 'rotation', 'alpha'"):
+        orientations.product(mass=1)

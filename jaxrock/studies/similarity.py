@@ -2,7 +2,8 @@
 
 The rocking of a slender block under a motion of given form, with peak a_g and frequency omega_g, depends on three
 numbers: omega_g/p, g alpha/a_g and the restitution. That of any rigid block depends on cos(alpha) besides, and on
-g tan(alpha)/a_g; as long as rotations are small, dividing them by cos(alpha) makes up for it.
+g tan(alpha)/a_g; as long as rotations are small, dividing them by cos(alpha) makes up for it. Why such groups have
+neither dimension nor orientation is what `orientations` computes.
 
 **Source:** Dimitrakopoulos & DeJong (2012), sections 4 to 6.
 """
@@ -15,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import one_of, positive
 from jaxrock.blocks.rigid import Block
+from jaxrock.studies import orientations as orientations
 
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
