@@ -124,8 +124,8 @@ def similar_scenes():
 
 @pytest.mark.parametrize("of_motion", range(-3, 4))
 def test_exponents_that_orientations_allow_and_that_scale(of_motion):
-    """D&D 4.8, 4.9: odd sums are allowed. Of these the engine's peaks are a number times (a_g/g)^m alpha^n for m + n = 1
-    alone, the degree of the linear equation; 4.10 is m, n = 0, 1 and 4.11 is 1, 0."""
+    """D&D 4.8, 4.9: odd sums are allowed. Of these the engine's peaks are a number times (a_g/g)^m alpha^n where
+    m + n = 1 alone, the degree of the linear equation; 4.10 is m, n = 0, 1 and 4.11 is 1, 0."""
     alpha, amplitude, rotation = similar_scenes()
     for of_alpha in range(-3, 4):
         group = orientations.product(rotation=1, acceleration=-of_motion, gravity=of_motion, alpha=-of_alpha)
