@@ -59,6 +59,87 @@ def test_small_rotations_nearly_collapse(ratio, strength, most):
     assert rigid < most < 0.04 < slender
 
 
+PULSES = {
+    "sine": rk.SinePulse(0.3, 0.9),
+    "exponential": rk.ExponentialPulse(0.3, 0.9, -1.7),
+    "Ricker, with a time of its own": rk.RickerPulse(0.3, 0.9, center=1.4),
+    "near fault": rk.MavroeidisPapageorgiouPulse(0.3, 0.9, 2.5, 0.4),
+}
+
+
+@pytest.mark.parametrize("kind", similarity.KINDS)
+@pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+def test_groups_of_pulses(pulse, kind):
+    """To groups and back to the pulse; another block's pulse with these groups has them, and goes the same way."""
+    block, other = rk.Block(0.12, 3.0, 0.9), rk.Block(0.12, 5.0, 0.9)
+    groups = similarity.groups_of(block, pulse, kind)
+    again = similarity.motion(groups, block, type(pulse))
+    for one, two in zip(jax.tree.leaves(pulse), jax.tree.leaves(again), strict=True):
+        assert float(one) == pytest.approx(float(two), rel=1e-14)
+    alike = similarity.motion(groups, other, type(pulse))
+    for one, two in zip(
+        jax.tree.leaves(groups), jax.tree.leaves(similarity.groups_of(other, alike, kind)), strict=True
+    ):
+        assert float(one) == pytest.approx(float(two), rel=1e-14)
+    tau = np.linspace(0, 3.0, 20)
+    np.testing.assert_allclose(pulse.acceleration(tau / 3.0), alike.acceleration(tau / 5.0), atol=1e-14)
+
+
+def test_groups_of_a_single_lobe():
+    """Uplift strength, p t_d and shape of Voyagaki et al., both ways."""
+    groups = similarity.Groups.of_duration(0.4, 1.5, 0.9, shape=0.5)
+    pulse = similarity.motion(groups, rk.Block(0.1, 2.0, 0.9), rk.ExponentialPulse)
+    np.testing.assert_allclose([pulse.amplitude, pulse.duration, pulse.shape], [0.25, 0.75, 0.5], rtol=1e-15)
+    back = similarity.groups_of(rk.Block(0.1, 2.0, 0.9), pulse, "slender")
+    np.testing.assert_allclose([back.strength, back.pulse_duration, back.others["shape"]], [0.4, 1.5, 0.5], rtol=1e-15)
+    block = similarity.block(back, 0.5, 2 * np.pi / 0.3)
+    np.testing.assert_allclose([block.alpha, block.p, block.restitution], [0.2, 5.0, 0.9], rtol=1e-15)
+    down = similarity.groups_of(rk.Block(0.1, 2.0, 0.9), rk.ExponentialPulse(-0.25, 0.75, 0.5), "slender")
+    assert down.strength == back.strength
+    with pytest.raises(ValueError, match="Argument `pulse_duration` must be positive"):
+        similarity.Groups.of_duration(0.4, 0.0, 0.9)
+
+
+LOBES = np.array([  # uplift strength, pulse duration, shape: peak after the pulse, and before its end
+    (0.5, 2.0, 3.0), (0.8, 1.0, -2.0), (0.7, 0.5, 0.0), (0.6, 3.0, 1.0), (0.97, 3.0, -0.3), (0.95, 2.0, 4.0),
+])  # fmt: skip
+
+
+def lobe_peak(engine):
+    """Peak over alpha by uplift strength, duration and shape."""
+
+    def peak(x):
+        block, groups = rk.Block(0.1, 1.0, 0.9), similarity.Groups.of_duration(x[0], x[1], 0.9, shape=x[2])
+        pulse = similarity.motion(groups, block, rk.ExponentialPulse)
+        return rk.outcome(block, pulse, rk.Linear(), engine=engine).max_rotation / 0.1
+
+    return peak
+
+
+@functools.cache
+def with_slopes(name):
+    """Peaks of the lobes, and their derivatives."""
+    function = {
+        "closed form": lambda x: rk.closed_form.single_lobe.peak_rotation(*x),
+        "series": lobe_peak(None),
+        "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10)),
+    }[name]
+    return jax.jit(jax.vmap(jax.value_and_grad(function)))(LOBES)
+
+
+@pytest.mark.parametrize("name, value_within, slope_within", [
+    ("series", 1e-13, 1e-10), pytest.param("diffrax", 1e-7, 1e-5, marks=pytest.mark.slow)
+])  # fmt: skip
+def test_peaks_and_their_derivatives_side_by_side(name, value_within, slope_within):
+    """By uplift strength, duration and shape of a lobe: the engines beside the closed form of Voyagaki et al."""
+    value, slope = with_slopes("closed form")
+    found, found_slope = with_slopes(name)
+    np.testing.assert_allclose(found, value, rtol=value_within)
+    np.testing.assert_allclose(found_slope, slope, rtol=slope_within, atol=slope_within)
+    # Strength helps, duration hurts, and the slimmer pulse does less.
+    assert np.all(np.sign(slope) == [-1, 1, -1])
+
+
 def test_conversions_invert():
     block = rk.Block(0.12, 3.0, 0.9)
     groups = similarity.groups(block, 0.3, 7.0, kind="slender")
