@@ -127,6 +127,20 @@ def test_single_lobe_in_220_digits(part, duration, shape):
             assert np.isnan(found) if exact < 0 else found == pytest.approx(exact, rel=1e-12, abs=1e-300)
 
 
+@pytest.mark.parametrize("_, duration, shape", list(lobes()))
+def test_walls_of_the_pulse_in_220_digits(_, duration, shape):
+    """V 2.4: at uplift the pulse is at the threshold; 3.8: at a wall the block is at alpha at the peak, or the end."""
+    for strength in (0.03, 0.5, 0.97):
+        uplift = single_lobe.uplift_time(strength, shape)
+        exact = mp.log(1 - strength * (1 - mp.exp(shape))) / (2 * shape) if shape else strength / 2
+        assert float(uplift) == pytest.approx(float(exact), rel=1e-12)
+    with mp.workdps(220):
+        for wall, time in ((single_lobe.rising_wall, 0.5), (single_lobe.falling_wall, 1.0)):
+            found = float(wall(duration, shape))
+            below, above = (printed("rotation", found * (1 + s), duration, shape, time) for s in (-1e-11, 1e-11))
+            assert above < 1 < below
+
+
 @pytest.mark.parametrize("part, duration, shape", list(lobes()))
 def test_single_lobe_gradients(part, duration, shape):
     strength = above_wall(part, duration, shape)

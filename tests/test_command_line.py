@@ -199,6 +199,21 @@ def test_map_of_a_pulse_with_more_parameters(command, tmp_path):
     np.testing.assert_allclose(rows[:, 5], np.ravel(expected.margin), rtol=1e-11)
 
 
+def test_map_of_a_lobe(command, tmp_path):
+    """Over pulse duration and uplift strength: overturned below the wall of the closed form, safe above."""
+    words = ["--uplift-strength", "0.1", "0.9", "--pulse-duration", "0.5", "6", "--model", "linear"]
+    status, _, errors = command("map", "--points", "7", "--pulse", "exponential", "--shape", "0.5", *words)
+    assert status == 0 and errors == ""
+    header, rows = table_of(tmp_path / "out" / "map.csv")
+    assert header[:3] == ["pulse_duration", "uplift_strength", "state"] and is_figure(tmp_path / "out" / "map.png")
+    duration, strength, state = rows[:, :3].T
+    np.testing.assert_allclose(np.unique(duration), np.linspace(0.5, 6, 7), rtol=1e-11)
+    np.testing.assert_allclose(np.unique(strength), np.linspace(0.1, 0.9, 7), rtol=1e-11)
+    wall = np.asarray(rk.closed_form.single_lobe.safety_wall(duration, 0.5))
+    np.testing.assert_array_equal(state > 0, strength < wall)
+    assert 10 < (state > 0).sum() < 40
+
+
 @pytest.mark.parametrize("pulse", PULSES)
 def test_every_pulse_has_its_words(pulse):
     """Of every pulse the command makes one with what the words do not say: defaults, or a shape of 0."""
@@ -239,7 +254,20 @@ def test_as_a_program(tmp_path):
         ([], ["run", "spectrum", "map", "examples:"]),
         (["run"], ["--width", "--height", "--duration", "--dt", "--unit", "--column", "--scale", "--restitution"]),
         (["spectrum"], ["--slenderness", "--shortest", "--longest", "--points", "--model", "--out"]),
-        (["map"], ["--pulse", *PULSES, "--shape", "--alpha", "--frequency-ratio", "--intensity", "--points"]),
+        (
+            ["map"],
+            [
+                "--pulse",
+                *PULSES,
+                "--shape",
+                "--alpha",
+                "--frequency-ratio",
+                "--intensity",
+                "--points",
+                "--pulse-duration",
+                "--uplift-strength",
+            ],
+        ),
         (["invert"], ["--pulse", *PULSES, "--shape", "--amplitude", "--scatter", "--prior", "--starts", "--points"]),
     ],
     ids=["jaxrock", "run", "spectrum", "map", "invert"],
@@ -303,6 +331,11 @@ BAD = {
         ["map", "--intensity", "-1", "8"],
         "`--intensity` must be positive, finite and in order, but is -1 to 8",
     ),
+    "map, two names of axes": (
+        ["map", "--frequency-ratio", "1", "8", "--uplift-strength", "0.1", "0.9"],
+        "Options --frequency-ratio, --uplift-strength must not go together",
+    ),
+    "map, strength from 0": (["map", "--uplift-strength", "0", "1"], "Argument `--uplift-strength` must be positive"),
     "map, ratio to inf": (["map", "--frequency-ratio", "1", "inf"], "must be .*finite.*inf"),
     "map, intensity to inf": (["map", "--intensity", "1", "inf"], "must be .*finite.*inf"),
 }

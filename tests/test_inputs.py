@@ -74,6 +74,21 @@ BAD = {
     "height negative": (lambda: rk.Block.from_dimensions(0.6, -3.0), "height", POSITIVE, "-3.0"),
     "gravity 0": (lambda: rk.Block.from_dimensions(0.6, 3.0, gravity=0.0), "gravity", POSITIVE, "0.0"),
     "sizes, restitution 2": (lambda: rk.Block.from_dimensions(0.6, 3.0, 2.0), "restitution", SHARE, "2.0"),
+    "radius 0": (lambda: rk.Block.from_radius(0.2, 0.0), "R", POSITIVE, "0.0"),
+    "radius, alpha 0": (lambda: rk.Block.from_radius(0.0, 2.0), "alpha", SLENDERNESS, "0.0"),
+    "radius, gravity 0": (lambda: rk.Block.from_radius(0.2, 2.0, gravity=0.0), "gravity", POSITIVE, "0.0"),
+    "inertia ratio above 1": (
+        lambda: rk.Block.from_radius(0.2, 2.0, inertia_ratio=4 / 3),
+        "inertia_ratio",
+        "be in (0, 1]",
+        "1.3333333333333333",
+    ),
+    "stocky and concentrated": (
+        lambda: rk.Block.from_radius(0.8, 2.0, inertia_ratio=1.0),
+        "alpha",
+        "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative",
+        "0.8",
+    ),
     # Pulses
     "sine, period 0": (lambda: rk.SinePulse(0.5, 0.0), "period", POSITIVE, "0.0"),
     "sine, period negative": (lambda: rk.SinePulse(0.5, -1.0), "period", POSITIVE, "-1.0"),
@@ -208,6 +223,32 @@ BAD = {
     "self-similar, intensity 0": (lambda: rk.self_similar_spectrum([1.0], [0.0]), "intensity", POSITIVE, "0.0"),
     "map, no ratio": (lambda: rk.overturning_map([], [2.0]), "frequency_ratio", LIST, "shape (0,)"),
     "map, no intensity": (lambda: rk.overturning_map([1.0], []), "intensity", LIST, "shape (0,)"),
+    "map, no axis": (lambda: rk.overturning_map([1.0]), "intensity", "be given, or `uplift_strength` in", "neither is"),
+    "map, two axes of one": (
+        lambda: rk.overturning_map([1.0], [2.0], pulse_duration=[1.0]),
+        "frequency_ratio",
+        "be given, or `pulse_duration` in its place",
+        "both are",
+    ),
+    "map, strength 0": (lambda: rk.overturning_map([1.0], uplift_strength=[0.0]), "uplift_strength", POSITIVE, "0.0"),
+    "map, no duration": (
+        lambda: rk.self_similar_spectrum(pulse_duration=[], intensity=[1.0]),
+        "pulse_duration",
+        LIST,
+        "shape (0,)",
+    ),
+    "map, shape NaN": (
+        lambda: rk.overturning_map([1.0], [2.0], pulse=rk.ExponentialPulse, shape=NAN),
+        "shape",
+        "be a number",
+        "nan",
+    ),
+    "map, many shapes in two axes": (
+        lambda: rk.overturning_map([1.0], [2.0], pulse=rk.ExponentialPulse, shape=[[1.0]]),
+        "shape",
+        "be a number or a list",
+        "shape (1, 1)",
+    ),
     "map, ratio negative": (lambda: rk.overturning_map([-1.0], [2.0]), "frequency_ratio", POSITIVE, "-1.0"),
     "map, intensity negative": (lambda: rk.overturning_map([1.0], [2.0, -3.0]), "intensity", POSITIVE, "-3.0"),
     "map, intensity inf": (lambda: rk.overturning_map([1.0], [INF]), "intensity", POSITIVE, "inf"),
@@ -423,6 +464,34 @@ def test_block_from_dimensions():
     moon = rk.Block.from_dimensions(0.6, 3.0, gravity=1.62)
     np.testing.assert_allclose(moon.p / block.p, np.sqrt(1.62 / 9.81), rtol=1e-15)
     assert moon.alpha == block.alpha
+
+
+@pytest.mark.parametrize(
+    ("inertia", "frequency", "restitution"),
+    [(None, np.sqrt(0.75 * 9.81 / 2), 1 - 1.5 * np.sin(0.3) ** 2),
+     (0.75, np.sqrt(0.75 * 9.81 / 2), 1 - 1.5 * np.sin(0.3) ** 2),
+     (1.0, np.sqrt(9.81 / 2), 1 - 2 * np.sin(0.3) ** 2), (0.5, np.sqrt(9.81 / 4), np.cos(0.3) ** 2)],
+    ids=["rectangle", "as a number", "all mass at one point", "a ring through both corners"],
+)  # fmt: skip
+def test_block_from_radius(inertia, frequency, restitution):
+    """p = sqrt(m g R/I); the momentum about the new corner decides what an impact leaves, and follows alpha."""
+    block = rk.Block.from_radius(0.3, 2.0, inertia_ratio=inertia)
+    np.testing.assert_allclose(block.p, frequency, rtol=1e-15)
+    np.testing.assert_allclose(block.restitution, restitution, rtol=1e-15)
+    np.testing.assert_allclose(
+        block.restitution,
+        rk.closed_form.restitution.housner(0.3, 1 / (0.75 if inertia is None else inertia)),
+        rtol=1e-15,
+    )
+    slope = jax.grad(lambda alpha: rk.Block.from_radius(alpha, 2.0, inertia_ratio=inertia).restitution)(0.3)
+    np.testing.assert_allclose(slope, (restitution - 1) * 2 / np.tan(0.3), rtol=1e-14)
+    assert rk.Block.from_radius(0.3, 2.0, 0.9, inertia_ratio=inertia).restitution == 0.9
+
+
+def test_block_from_radius_is_that_of_its_dimensions():
+    block, radius = rk.Block.from_dimensions(0.6, 3.0), np.hypot(0.3, 1.5)
+    assert rk.Block.from_radius(block.alpha, radius).p == block.p
+    np.testing.assert_allclose(rk.Block.from_radius(0.2, 1.7).half_diagonal, 1.7, rtol=1e-15)
 
 
 # ---------------------------------------------------------------------------------- single precision

@@ -4,11 +4,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
 
 import jaxrock as rk
 from jaxrock.studies import similarity
+from jaxrock.studies.similarity import orientations
 
 TAU = np.linspace(0, 12, 400)
 
@@ -57,6 +59,87 @@ def test_small_rotations_nearly_collapse(ratio, strength, most):
     assert rigid < most < 0.04 < slender
 
 
+PULSES = {
+    "sine": rk.SinePulse(0.3, 0.9),
+    "exponential": rk.ExponentialPulse(0.3, 0.9, -1.7),
+    "Ricker, with a time of its own": rk.RickerPulse(0.3, 0.9, center=1.4),
+    "near fault": rk.MavroeidisPapageorgiouPulse(0.3, 0.9, 2.5, 0.4),
+}
+
+
+@pytest.mark.parametrize("kind", similarity.KINDS)
+@pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
+def test_groups_of_pulses(pulse, kind):
+    """To groups and back to the pulse; another block's pulse with these groups has them, and goes the same way."""
+    block, other = rk.Block(0.12, 3.0, 0.9), rk.Block(0.12, 5.0, 0.9)
+    groups = similarity.groups_of(block, pulse, kind)
+    again = similarity.motion(groups, block, type(pulse))
+    for one, two in zip(jax.tree.leaves(pulse), jax.tree.leaves(again), strict=True):
+        assert float(one) == pytest.approx(float(two), rel=1e-14)
+    alike = similarity.motion(groups, other, type(pulse))
+    for one, two in zip(
+        jax.tree.leaves(groups), jax.tree.leaves(similarity.groups_of(other, alike, kind)), strict=True
+    ):
+        assert float(one) == pytest.approx(float(two), rel=1e-14)
+    tau = np.linspace(0, 3.0, 20)
+    np.testing.assert_allclose(pulse.acceleration(tau / 3.0), alike.acceleration(tau / 5.0), atol=1e-14)
+
+
+def test_groups_of_a_single_lobe():
+    """Uplift strength, p t_d and shape of Voyagaki et al., both ways."""
+    groups = similarity.Groups.of_duration(0.4, 1.5, 0.9, shape=0.5)
+    pulse = similarity.motion(groups, rk.Block(0.1, 2.0, 0.9), rk.ExponentialPulse)
+    np.testing.assert_allclose([pulse.amplitude, pulse.duration, pulse.shape], [0.25, 0.75, 0.5], rtol=1e-15)
+    back = similarity.groups_of(rk.Block(0.1, 2.0, 0.9), pulse, "slender")
+    np.testing.assert_allclose([back.strength, back.pulse_duration, back.others["shape"]], [0.4, 1.5, 0.5], rtol=1e-15)
+    block = similarity.block(back, 0.5, 2 * np.pi / 0.3)
+    np.testing.assert_allclose([block.alpha, block.p, block.restitution], [0.2, 5.0, 0.9], rtol=1e-15)
+    down = similarity.groups_of(rk.Block(0.1, 2.0, 0.9), rk.ExponentialPulse(-0.25, 0.75, 0.5), "slender")
+    assert down.strength == back.strength
+    with pytest.raises(ValueError, match="Argument `pulse_duration` must be positive"):
+        similarity.Groups.of_duration(0.4, 0.0, 0.9)
+
+
+LOBES = np.array([  # uplift strength, pulse duration, shape: peak after the pulse, and before its end
+    (0.5, 2.0, 3.0), (0.8, 1.0, -2.0), (0.7, 0.5, 0.0), (0.6, 3.0, 1.0), (0.97, 3.0, -0.3), (0.95, 2.0, 4.0),
+])  # fmt: skip
+
+
+def lobe_peak(engine):
+    """Peak over alpha by uplift strength, duration and shape."""
+
+    def peak(x):
+        block, groups = rk.Block(0.1, 1.0, 0.9), similarity.Groups.of_duration(x[0], x[1], 0.9, shape=x[2])
+        pulse = similarity.motion(groups, block, rk.ExponentialPulse)
+        return rk.outcome(block, pulse, rk.Linear(), engine=engine).max_rotation / 0.1
+
+    return peak
+
+
+@functools.cache
+def with_slopes(name):
+    """Peaks of the lobes, and their derivatives."""
+    function = {
+        "closed form": lambda x: rk.closed_form.single_lobe.peak_rotation(*x),
+        "series": lobe_peak(None),
+        "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10)),
+    }[name]
+    return jax.jit(jax.vmap(jax.value_and_grad(function)))(LOBES)
+
+
+@pytest.mark.parametrize("name, value_within, slope_within", [
+    ("series", 1e-13, 1e-10), pytest.param("diffrax", 1e-7, 1e-5, marks=pytest.mark.slow)
+])  # fmt: skip
+def test_peaks_and_their_derivatives_side_by_side(name, value_within, slope_within):
+    """By uplift strength, duration and shape of a lobe: the engines beside the closed form of Voyagaki et al."""
+    value, slope = with_slopes("closed form")
+    found, found_slope = with_slopes(name)
+    np.testing.assert_allclose(found, value, rtol=value_within)
+    np.testing.assert_allclose(found_slope, slope, rtol=slope_within, atol=slope_within)
+    # Strength helps, duration hurts, and the slimmer pulse does less.
+    assert np.all(np.sign(slope) == [-1, 1, -1])
+
+
 def test_conversions_invert():
     block = rk.Block(0.12, 3.0, 0.9)
     groups = similarity.groups(block, 0.3, 7.0, kind="slender")
@@ -67,3 +150,84 @@ def test_conversions_invert():
         similarity.block(similarity.groups(block, 0.3, 7.0), 0.3, 7.0)
     with pytest.raises(ValueError, match="must be one of 'slender', 'rigid'"):
         similarity.scales(block, kind="stocky")
+
+
+# ---- Orientations ----
+
+TABLE_1 = {"0": "0xyz", "x": "x0zy", "y": "yz0x", "z": "zyx0"}  # D&D, columns in the order 0, x, y, z
+
+
+def test_the_table_of_orientations():
+    for first, row in TABLE_1.items():
+        for second, both in zip("0xyz", row):
+            assert orientations.combined(first, second) == both
+        assert [orientations.power(first, n) for n in (-3, -1, 0, 1, 2, 7)] == [first, first, "0", first, "0", first]
+
+
+@pytest.mark.parametrize("function, orientation", [(mp.cos, "0"), (mp.sin, "z"), (mp.tan, "z"), (mp.exp, None)])
+def test_orientations_of_functions(function, orientation):
+    """D&D 4.6: by the terms of their series. An exponential of an angle has none."""
+    exponents = [k for k, term in enumerate(mp.taylor(function, 0, 7)) if abs(term) > 1e-12]
+    if orientation is None:
+        with pytest.raises(ValueError, match="Argument `exponents` must be all even or all odd"):
+            orientations.of_series("z", exponents)
+    else:
+        assert orientations.of_series("z", exponents) == orientation
+        assert orientations.of_series("0", exponents) == "0"
+
+
+@pytest.mark.parametrize("exponents, dimension", [
+    ({"acceleration": 1, "gravity": -1}, (0, 0, "z")), ({"frequency": 1, "p": -1}, (0, 0, "0")),
+    ({"velocity": 1, "p": -1, "alpha": -1}, (0, 0, "0")), ({"gravity": 1, "radius": -1, "p": -2}, (0, 0, "y")),
+    ({"rotation": 1, "gravity": 1, "acceleration": -1}, (0, 0, "0")), ({"gravity": 1, "time": 2}, (1, 0, "y")),
+], ids=lambda x: str(x) if isinstance(x, dict) else "")  # fmt: skip
+def test_products(exponents, dimension):
+    """D&D 4.7. That 3 g/(4 R) has an orientation says that R stands for R times a unit vector in it."""
+    assert tuple(orientations.product(**exponents)) == dimension
+    assert orientations.product(**exponents).is_pure == (dimension == (0, 0, "0"))
+
+
+@functools.cache
+def similar_scenes():
+    """Slenderness, amplitude, and peak rotation of slender blocks with equal groups, safe and with impacts."""
+    alpha = np.array([0.02, 0.05, 0.1, 0.2])
+    amplitude = alpha / 0.45
+
+    def peak(alpha, amplitude):
+        block = rk.Block(alpha, 1.0, 0.85)
+        found = rk.outcome(block, rk.SinePulse(amplitude, 2 * np.pi / 5.0), rk.Linear())
+        return found.max_rotation, found.impact_count
+
+    rotation, impacts = jax.jit(jax.vmap(peak))(alpha, amplitude)
+    assert np.all(impacts >= 1) and np.all(np.isfinite(rotation))
+    return alpha, amplitude, np.asarray(rotation)
+
+
+@pytest.mark.parametrize("of_motion", range(-3, 4))
+def test_exponents_that_orientations_allow_and_that_scale(of_motion):
+    """D&D 4.8, 4.9: odd sums are allowed. Of these the engine's peaks are a number times (a_g/g)^m alpha^n where
+    m + n = 1 alone, the degree of the linear equation; 4.10 is m, n = 0, 1 and 4.11 is 1, 0."""
+    alpha, amplitude, rotation = similar_scenes()
+    for of_alpha in range(-3, 4):
+        group = orientations.product(rotation=1, acceleration=-of_motion, gravity=of_motion, alpha=-of_alpha)
+        number = rotation / (amplitude**of_motion * alpha**of_alpha)
+        is_one = np.ptp(number) < 1e-12 * np.max(number)
+        assert group.is_pure == ((of_motion + of_alpha) % 2 == 1)
+        assert is_one == (of_motion + of_alpha == 1) and (group.is_pure or not is_one)
+
+
+@pytest.mark.parametrize("model", [rk.Linear(), rk.Housner()], ids=["slender", "rigid"])
+def test_what_orientations_say_is_a_mirror(model):
+    """What points along z changes its sign with the accelerations along x, in every model; not every model scales."""
+    block = rk.Block(0.3, 2.0, 0.85)
+    follow = jax.jit(lambda a: rk.simulate(block, rk.SinePulse(a, 0.8), model, duration=4.0)(jnp.linspace(0, 4, 90)))
+    for one, other in zip(follow(0.6), follow(-0.6)):
+        np.testing.assert_array_equal(one, -other)
+        assert np.max(np.abs(one)) > 0.05
+
+
+def test_names_of_orientations():
+    with pytest.raises(ValueError, match="Argument `orientation` must be one of '0', 'x', 'y', 'z', but is 'w'"):
+        orientations.combined("x", "w")
+    with pytest.raises(ValueError, match="Argument `name` must be one of 'rotation', 'alpha'"):
+        orientations.product(mass=1)

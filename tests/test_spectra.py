@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.closed_form import single_lobe
 
 RATIOS, INTENSITIES = np.linspace(0.4, 8.0, 23), np.linspace(1.02, 9.0, 17)
 
@@ -86,6 +87,62 @@ def test_rocking_spectrum_of_a_record():
         )
 
 
+STRENGTHS, DURATIONS, SHAPES = np.linspace(0.05, 0.98, 12), np.linspace(0.3, 7.0, 14), np.array([-3.0, 0.0, np.pi])
+
+
+@pytest.fixture(scope="module")
+def lobes():
+    axes = {"uplift_strength": STRENGTHS, "pulse_duration": DURATIONS, "shape": SHAPES}
+    given = {"pulse": rk.ExponentialPulse, "alpha": 0.1, "restitution": 0.9, "model": rk.Linear(), "progress": False}
+    return rk.overturning_map(**axes, **given), rk.self_similar_spectrum(**axes, **given)
+
+
+def test_single_lobes_over_strength_duration_and_shape(lobes):
+    """Voyagaki et al., figures 3.1 to 3.3, 3.5 and 3.6: walls and peaks of the closed form."""
+    shape, strength, duration = np.meshgrid(SHAPES, STRENGTHS, DURATIONS, indexing="ij")
+    wall = np.asarray(single_lobe.safety_wall(duration, shape))
+    peak = np.asarray(single_lobe.peak_rotation(strength, duration, shape))
+    assert 0.2 < np.mean(strength < wall) < 0.8
+    for found in lobes:
+        np.testing.assert_array_equal(found.margin < 0, strength < wall)
+        np.testing.assert_allclose(found.max_rotation, peak, rtol=1e-11)
+        np.testing.assert_allclose(found.uplift_strength, STRENGTHS, rtol=1e-15)
+        np.testing.assert_allclose(found.pulse_duration, DURATIONS, rtol=1e-15)
+        np.testing.assert_array_equal(found.parameters["shape"], SHAPES)
+    np.testing.assert_array_equal(lobes[0].state, np.where(strength < wall, 1, 0))
+
+
+def test_a_parameter_that_is_a_number_is_no_axis(lobes):
+    given = {"uplift_strength": STRENGTHS, "pulse_duration": DURATIONS, "alpha": 0.1, "restitution": 0.9}
+    found = rk.overturning_map(pulse=rk.ExponentialPulse, shape=0.0, model=rk.Linear(), progress=False, **given)
+    assert found.state.shape == (12, 14) and not found.parameters
+    np.testing.assert_allclose(found.margin, lobes[0].margin[1], rtol=1e-12)
+
+
+def test_figures_of_single_lobes(lobes, tmp_path):
+    surface, spectrum = lobes
+    for found, draw in ((surface, rk.plot.overturning), (spectrum, rk.plot.spectrum)):
+        with pytest.raises(ValueError, match="Argument `result` must have no further axes, but has `shape`"):
+            draw(found, by_duration=True)
+    given = {"pulse": rk.ExponentialPulse, "restitution": 0.9, "model": rk.Linear(), "progress": False, "shape": 0.0}
+    few = {"uplift_strength": [0.5, 0.8], "pulse_duration": [0.5, 1.0, 2.0]}
+    axis = rk.plot.overturning(rk.overturning_map(**few, **given), by_duration=True)
+    assert "uplift strength" in axis.get_ylabel() and "duration" in axis.get_xlabel()
+    assert axis.get_xlim()[1] == pytest.approx(2.5) and axis.get_ylim()[1] < 1
+    axes = rk.plot.spectrum(rk.self_similar_spectrum(**few, **given), by_duration=True)
+    np.testing.assert_allclose(axes[0].lines[0].get_xdata(), [0.5, 1.0, 2.0])
+    assert [text.get_text() for text in axes[0].get_legend().get_texts()][:2] == ["0.5", "0.8"]
+    axis.figure.savefig(tmp_path / "map.png")
+    with pytest.raises(ValueError, match="Argument `by_duration` must be False"):
+        rk.plot.spectrum(rk.rocking_spectrum(0.2, rk.SinePulse(0.5, 0.8), [1.0, 2.0]), by_duration=True)
+    plt.close("all")
+
+
+def test_parameters_that_a_pulse_does_not_have():
+    with pytest.raises(TypeError, match="sharpness"):
+        rk.overturning_map([1.0], [2.0], pulse=rk.ExponentialPulse, shape=0.0, sharpness=1.0)
+
+
 def test_progress_bar(capsys):
     rk.overturning_map([2.0, 3.0], [1.5, 2.0], restitution=0.9, progress=True)
     assert "4/4" in capsys.readouterr().err
@@ -118,6 +175,15 @@ TRACED = {
             rk.overturning_map(
                 FEW_RATIOS, FEW_INTENSITIES, pulse=lambda a, t: rk.ExponentialPulse(a, t, shape), progress=False
             )
+        ).margin
+    ),
+    "map, single lobes": lambda x: (
+        rk.overturning_map(
+            pulse_duration=[0.5, 2.0],
+            uplift_strength=x * np.array([1, 2]),
+            pulse=rk.ExponentialPulse,
+            shape=x,
+            progress=False,
         ).margin
     ),
     "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, progress=False).max_rotation,

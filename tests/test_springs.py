@@ -15,6 +15,7 @@ import jaxrock as rk
 from jaxrock.blocks.restitution import Reset
 from jaxrock.engines.free_stage import Visit, free_stage
 from jaxrock.models.equation import Angle
+from references import lumped_column
 from references.in_jaxrock import PULSES
 
 SCENES = json.loads((Path(__file__).parents[1] / "references" / "springs.json").read_text())["scenes"]
@@ -35,11 +36,11 @@ def slow(*row):
 # ---- The equations ----
 
 
-@pytest.mark.parametrize("kind", ["SM1", "SM2", "SM3"])
+@pytest.mark.parametrize("kind", ["SM1", "SM2", "SM3", "mmSM"])
 @pytest.mark.parametrize("law", ["sine", "linear", "plastic"])
 def test_equation(kind, law):
     """Moment and arm are the printed ones; the block uplifts at tan(alpha), and at the saddle nothing pulls."""
-    moment = MOMENTS["SM3" if law == "plastic" and kind != "SM1" else "SM1", law]
+    moment = MOMENTS["SM3" if law == "plastic" and kind in ("SM2", "SM3") else "SM1", law]
     for alpha in (0.05, 0.3, 0.7):
         table, angle = rk.Spring(kind, law).moments(rk.Block(alpha, 2.0)), np.linspace(0, 1.5, 7)
         parts = [(table.restoring(Angle.of(x)), table.arm(Angle.of(x))) for x in angle]
@@ -76,12 +77,36 @@ def test_pushover():
     np.testing.assert_allclose(none, 0, atol=1e-15)
 
 
-@pytest.mark.parametrize("words", [("SM4", "sine"), ("SM1", "bilinear"), ("mmSM",)])
+@pytest.mark.parametrize("law", ["sine", "linear", "plastic"])
+@pytest.mark.parametrize("count, slower", [(2, 3 / 2), (3, 9 / 8), (6, 51 / 50), (10_001, 1 + 0.5e-8)])
+def test_lumped_masses(law, count, slower):
+    """Their moment of inertia over the block's, mass by mass; two put one half at the top, very many are the rod."""
+    height, mass = lumped_column.masses_along(count, 2.0)
+    assert np.sum(mass) == pytest.approx(lumped_column.MASS) and np.average(height, weights=mass) == pytest.approx(1)
+    assert np.average(height**2, weights=mass) * 3 / 4 == pytest.approx(slower, rel=1e-12)
+    block, angle = rk.Block(0.3, 2.0), Angle.of(0.17)
+    column, rod = (rk.Spring("mmSM", law, n).moments(block) for n in (count, None))
+    for name in ("restoring", "arm"):
+        slowly, quickly = (float(getattr(table, name)(angle)) for table in (column, rod))
+        assert slowly * slower == pytest.approx(quickly, rel=1e-15)
+    assert float(column.threshold) == pytest.approx(np.tan(0.3), rel=1e-15)
+    assert float(column.saddle) == pytest.approx(float(rod.saddle), rel=1e-15)
+
+
+@pytest.mark.parametrize("words", [("SM4", "sine"), ("SM1", "bilinear"), ("MMSM",)])
 def test_unknown_words(words):
     with pytest.raises(ValueError, match="Argument `(kind|law)` must be one of"):
         rk.Spring(*words)
     with pytest.raises(ValueError, match="Argument `(kind|law)` must be one of"):
         rk.closed_form.pushover.spring_force(0.1, 0.2, *words)
+
+
+@pytest.mark.parametrize("count", [1, 0, -6])
+def test_too_few_masses(count):
+    with pytest.raises(ValueError, match="Argument `masses` must be a whole number, at least 2, but is"):
+        rk.Spring("mmSM", masses=count)
+    with pytest.raises(ValueError, match="Argument `masses` must be None for 'SM1', which has one mass, but is"):
+        rk.Spring("SM1", masses=count)
 
 
 def test_a_stout_block_has_no_balance():
@@ -280,15 +305,31 @@ def test_diffrax(spring):
     assert lost.status == rk.Status.successful and lost.overturned and lost.margin < 0
 
 
+@pytest.mark.parametrize("law, count", [("linear", 2), slow("linear", 6), slow("sine", 3), slow("plastic", 4)])
+def test_histories_of_lumped_masses(law, count):
+    """SciPy, mass by mass: rotation, velocity and impacts under a sine, from before the uplift to the free rocking."""
+    alpha, radius, e, period = 0.2, 2.0, 0.9, 0.8
+    u = lambda t: 0.33 * np.sin(2 * np.pi * t / period) if t < period else 0.0
+    time = np.linspace(0, 4.0, 200)
+    rotation, velocity, impacts = lumped_column.history(alpha, radius, e, law, count, u, [period], time)
+    block = rk.Block.from_radius(alpha, radius, e)
+    response = rk.simulate(block, rk.SinePulse(0.33, period), rk.Spring("mmSM", law, count), duration=4.0)
+    found, speed = response(time)
+    np.testing.assert_allclose(found, rotation, atol=1e-9)
+    np.testing.assert_allclose(speed, velocity, atol=1e-8)
+    assert len(impacts) >= 2 and response.impact_count == len(impacts)
+    np.testing.assert_allclose(response.impact_times[: len(impacts)], impacts, atol=1e-8)
+
+
 SHARED = Path(__file__).parents[2] / "shared" / "reference"
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "springs.json").exists(), reason="the histories are not part of the package")
 @pytest.mark.parametrize(
-    ("name", "spring"), [("SM_b_cos", SPRINGS[1]), ("SM_a_exact_cos", SPRINGS[0]), ("SM1_c_plastic_cos", SPRINGS[2])]
+    ("name", "law"), [("SM_b_cos", "linear"), ("SM_a_exact_cos", "sine"), ("SM1_c_plastic_cos", "plastic")]
 )
-def test_histories_of_the_paper(name, spring):
+def test_histories_of_the_paper(name, law):
     """Blocks and pulses of figures 5, 7, 9, 11 and 16: rotation and velocity of a DOP853 of its own."""
     cases = [case for case in json.loads((SHARED / "springs.json").read_text())["cases"] if name in case["results"]]
     stored = np.load(SHARED / "springs.npz")
@@ -296,11 +337,12 @@ def test_histories_of_the_paper(name, spring):
     for case in cases:
         one, ground, known = case["params"], case["ground"], case["results"][name]
         ratio, period = one["h_over_b"], 2 * np.pi / ground["omega"]
-        block = rk.Block(np.arctan(1 / ratio), np.sqrt(one["p2"] / one["I_ratio"]), one["eta"])
+        block = rk.Block(np.arctan(1 / ratio), np.sqrt(one["p2"]), one["eta"])
+        model = rk.Spring("mmSM" if one["n_masses"] else "SM1", law, one["n_masses"])
         size = ground["ap"] / one["g"]
         sine = "sine" in ground["type"]
         motion = rk.SinePulse(size, period) if sine else rk.RickerPulse(size, period, center=ground["tc"])
-        response = rk.simulate(block, motion, rk.Spring(*spring), duration=one["T"], samples=400)
+        response = rk.simulate(block, motion, model, duration=one["T"], samples=400)
         assert response.impact_count == known["n_impacts"] or one["eta"] < 0.8  # that one comes to rest
         for found, key in ((response.rotation, "theta"), (response.velocity, "thetadot")):
             exact = stored[known["npz"][key]]

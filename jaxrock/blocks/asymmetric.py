@@ -11,13 +11,12 @@ from jaxrock._arguments import arguments, pair
 from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
-from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of
+from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, Side
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
 
-ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
 _gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e9))
 
 

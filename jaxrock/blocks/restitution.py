@@ -23,11 +23,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import checked, not_negative, share, size, together
+from jaxrock._checks import Range, checked, not_negative, share, size, together
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
+
+# m R^2/I about a corner
+ratio_of_inertia = Range("be in (0, 1], and not below 1e-6", 0.0, 1.0, lambda x: (x >= 1e-6) & (x <= 1))
 
 
 class Corners(NamedTuple):
@@ -102,12 +105,28 @@ class Constant(AbstractRestitution):
 class Housner(AbstractRestitution):
     """The impact of a rectangle that keeps its angular momentum about the new corner: 1 - 1.5 sin^2(alpha), at least 0.
 
+    **Arguments:**
+
+    - `inertia_ratio`: m R^2/I about a corner, in (0, 1], of a symmetric block that is no homogeneous rectangle:
+      1 - 2 inertia_ratio sin^2(alpha). None: 3/4, a rectangle's.
+
+    **Raises:** ValueError for a value outside its range.
+
     **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.4.
     """
 
+    inertia_ratio: Real | None = parameter("-", ratio_of_inertia)
+
+    def __init__(self, inertia_ratio: ArrayLike | None = None):
+        self.inertia_ratio = None if inertia_ratio is None else ratio_of_inertia("inertia_ratio", inertia_ratio)
+
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """It follows alpha, under differentiation too."""
-        return jnp.maximum(1 - 1.5 * jnp.sin(corners.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
+        return jnp.maximum(1 - self._loss * jnp.sin(corners.alpha) ** 2, 0)  # Housner 1963; D&D 2012, 2.4
+
+    @property
+    def _loss(self) -> Real | float:
+        return 1.5 if self.inertia_ratio is None else 2 * self.inertia_ratio
 
     @property
     def depends_on_speed(self) -> bool:
@@ -203,9 +222,12 @@ def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
     """The slenderness angle, where the law is one for such blocks."""
     if not isinstance(law, Housner):
         return alpha
-    widest = np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6)
-    allowed = "be at most 0.955 when `restitution` is None, because Housner's value is negative above"
-    return checked("alpha", alpha, allowed, lambda x: x <= widest)
+    if law.inertia_ratio is None:
+        widest = np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6)
+        allowed = "be at most 0.955 when `restitution` is None, because Housner's value is negative above"
+        return checked("alpha", alpha, allowed, lambda x: x <= widest)
+    allowed = "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative"
+    return checked("alpha", alpha, allowed, lambda x: law._loss * jnp.sin(x) ** 2 <= 1 + 1e-6)
 
 
 class Reset(eqx.Module):

@@ -6,7 +6,15 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import acute, rate, size, together
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fitting_alpha, law_of
+from jaxrock.blocks.restitution import (
+    AbstractRestitution,
+    Corners,
+    Housner,
+    Restitution,
+    fitting_alpha,
+    law_of,
+    ratio_of_inertia,
+)
 
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
 
@@ -63,8 +71,40 @@ class Block(eqx.Module):
         width, height, gravity = size("width", width), size("height", height), size("gravity", gravity)
         together(width=width, height=height, gravity=gravity)
         half_diagonal = jnp.hypot(width, height) / 2
-        frequency = jnp.sqrt(3 * gravity / (4 * half_diagonal))
-        return cls(jnp.arctan2(width, height), frequency, restitution)
+        return cls.from_radius(jnp.arctan2(width, height), half_diagonal, restitution, gravity=gravity)
+
+    @classmethod
+    def from_radius(
+        cls,
+        alpha: ArrayLike,
+        R: ArrayLike,
+        restitution: Restitution | None = None,
+        *,
+        inertia_ratio: ArrayLike | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "Block":
+        """Build a block from its slenderness and the distance of its corners to the centre of mass.
+
+        **Arguments:**
+
+        - `alpha`: as in `Block`.
+        - `R`: distance from either corner to the centre of mass [m], positive: half the diagonal of a rectangle.
+        - `restitution`: as in `Block`; None follows the inertia ratio, too: 1 - 2 inertia_ratio sin^2(alpha).
+        - `inertia_ratio`: m R^2/I, I the moment of inertia about a corner [-], in (0, 1]. None: 3/4, that of a
+          homogeneous rectangle.
+        - `gravity`: acceleration of gravity [m/s^2], positive.
+
+        **Returns:** a `Block` with p = sqrt(inertia_ratio g / R), sqrt(3 g / 4 R) for a rectangle.
+
+        **Raises:** ValueError for a value outside its range.
+
+        **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.2.
+        """
+        radius, gravity = size("R", R), size("gravity", gravity)
+        if inertia_ratio is None:
+            return cls(alpha, jnp.sqrt(3 * gravity / (4 * radius)), restitution)
+        ratio = ratio_of_inertia("inertia_ratio", inertia_ratio)
+        return cls(alpha, jnp.sqrt(ratio * gravity / radius), law_of(restitution, Housner(ratio)))
 
     @property
     def restitution(self) -> Inexact[Array, "..."]:

@@ -91,7 +91,13 @@ def _advance(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lan
 
 
 def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
-    """To the next impact, or to the next change of sign of the driving."""
+    """To the next impact, or to the next change of sign of the driving; where the block rests, to the next uplift."""
+    new, hit = piece(lane, intensity, ratio, restitution)
+    return _rested(new, hit, intensity, ratio, restitution, uplift_phase(intensity))
+
+
+def piece(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> tuple[Lane, Bool[Array, "..."]]:
+    """To the next impact, or to the next change of sign of the driving; and whether it is an impact."""
     psi = uplift_phase(intensity)
     on, off = (jnp.where(lane.side < 0, angle, jnp.pi + angle) for angle in (psi, jnp.pi - psi))
     end = 2 * jnp.pi + 0 * psi
@@ -136,8 +142,7 @@ def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
         done=lane.done,
     )
     passed = Lane(edge, lane.side, jnp.maximum(opening, 0.0), speed, lane.impacts, edge >= end)
-    new = jax.tree.map(lambda a, b: jnp.where(hit, a, b), landed, passed)
-    return _rested(new, hit, intensity, ratio, restitution, psi)
+    return jax.tree.map(lambda a, b: jnp.where(hit, a, b), landed, passed), hit
 
 
 def _rested(lane: Lane, hit, intensity: Real, ratio: Real, restitution: Real, psi: Real) -> Lane:

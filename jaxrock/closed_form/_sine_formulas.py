@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import checked, positive, share
+from jaxrock._checks import checked, finite, positive, share
 from jaxrock.closed_form import _sine_arcs as arcs
 from jaxrock.numerics.roots import bracketed_root
 from jaxrock.transforms.elementwise import elementwise
@@ -21,7 +21,7 @@ def _above_one(name, value):
 
 
 # Of the public functions: arguments are checked by these names, and broadcast.
-elementwise_in_sine = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=share)
+elementwise_in_sine = elementwise(intensity=_above_one, frequency_ratio=positive, restitution=share, time=finite)
 
 
 def end_of_pulse(a: Array, w: Array) -> Array:
@@ -83,6 +83,25 @@ def impact_during_pulse(a: Array, w: Array) -> Array:
     """First root of D&D 3.21: the block can only fall after the driving stretch, and then falls once."""
     lower = (jnp.pi - 2 * arcs.uplift_phase(a)) / w
     return bracketed_root(lambda t, a, w: first_excursion(t, a, w)[0], lower, end_of_pulse(a, w), a, w)
+
+
+def first_impact(a: Array, w: Array) -> Array:
+    """When the first excursion ends; inf where it does not."""
+    limit, lost = impact_at_end(w), no_impact(w)
+    middle = (limit + lost) / 2
+    after = jnp.where((a > limit) & (a < lost), a, middle)
+    decaying, growing = free_coordinates(*series_constants(after, w))
+    since_end = jnp.log((1 + jnp.sqrt(1 - decaying * growing)) / growing)  # D&D 3.13
+    during_pulse = impact_during_pulse(jnp.where(a > limit, (1 + limit) / 2, a), w)
+    after_pulse = end_of_pulse(after, w) + since_end
+    return jnp.where(a < limit, during_pulse, jnp.where(a < lost, after_pulse, jnp.inf))
+
+
+def impact_speed(time: Array, a: Array, w: Array) -> Array:
+    """Velocity over p alpha with which the first excursion ends at its `first_impact`; D&D 3.22, 3.15."""
+    late = time > end_of_pulse(a, w)
+    lost = jnp.where(late, 1 - coordinate_product(a, w), 1.0)
+    return jnp.where(late, jnp.sqrt(lost), -first_excursion(time, a, w)[1])
 
 
 def growth_after_impact(a: Array, w: Array, e: Array, time: Array, jump: bool = False) -> Array:

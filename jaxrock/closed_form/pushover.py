@@ -43,7 +43,7 @@ def _force_sine(rotation, alpha):
 
 @_elementwise
 def _force_linear(rotation, alpha):
-    return jnp.tan(alpha) * (1 - rotation / alpha) / jnp.cos(rotation)  # as 17, with the moment of 5, 8, 11
+    return jnp.tan(alpha) * (1 - rotation / alpha) / jnp.cos(rotation)  # as 17, with the moment of 5, 8, 11, 14
 
 
 @_elementwise
@@ -70,11 +70,11 @@ def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "lin
     **Raises:** ValueError for arguments outside their ranges.
 
     **Source:** Diamantopoulos & Fragiadakis (2017), equations 17 (law "sine"), 18 ("plastic", SM1 and mmSM) and 19
-    ("plastic", SM3); for the law "linear" the moment of equations 5, 8 and 11 over the same arm.
+    ("plastic", SM3); for the law "linear" the moment of equations 5, 8, 11 and 14 over the same arm.
     """
-    one_of("kind", kind, ("SM1", "SM2", "SM3"))
+    one_of("kind", kind, ("SM1", "SM2", "SM3", "mmSM"))
     one_of("law", law, ("sine", "linear", "plastic"))
-    plastic = _force_plastic_diagonal if kind == "SM1" else _force_plastic_height
+    plastic = _force_plastic_diagonal if kind in ("SM1", "mmSM") else _force_plastic_height
     return {"sine": _force_sine, "linear": _force_linear, "plastic": plastic}[law](rotation, alpha)
 
 

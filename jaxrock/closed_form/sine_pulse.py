@@ -15,6 +15,11 @@ import jax.numpy as jnp
 
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
 from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
+from jaxrock.closed_form.sine_histories import (
+    impact_velocity as impact_velocity,
+    rotation as rotation,
+    velocity as velocity,
+)
 from jaxrock.closed_form.sine_intervals import (
     OverturningIntervals as OverturningIntervals,
     overturning_intervals as overturning_intervals,
@@ -66,15 +71,7 @@ def impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 
     **Source:** D&D 3.21 (while the pulse lasts), 3.13 (after it).
     """
-    a, w = intensity, frequency_ratio
-    limit, lost = formulas.impact_at_end(w), formulas.no_impact(w)
-    middle = (limit + lost) / 2
-    after = jnp.where((a > limit) & (a < lost), a, middle)
-    decaying, growing = formulas.free_coordinates(*formulas.series_constants(after, w))
-    since_end = jnp.log((1 + jnp.sqrt(1 - decaying * growing)) / growing)  # D&D 3.13
-    during_pulse = formulas.impact_during_pulse(jnp.where(a > limit, (1 + limit) / 2, a), w)
-    after_pulse = formulas.end_of_pulse(after, w) + since_end
-    return jnp.where(a < limit, during_pulse, jnp.where(a < lost, after_pulse, jnp.inf))
+    return formulas.first_impact(intensity, frequency_ratio)
 
 
 @elementwise_in_sine

@@ -17,25 +17,30 @@ from jaxrock.command_line.options import (
 )
 from jaxrock.command_line.output import save, status_of_surface, table, write_csv
 
+# Across and up, and whether they are those of single lobes; the range that is drawn, and what it is.
+_AXES = {
+    "frequency_ratio": (False, (0.3, 8.0), "2 pi/period of the pulse over p"),
+    "intensity": (False, (1.02, 10.0), "peak acceleration over the uplift threshold"),
+    "pulse_duration": (True, (0.05, 8.0), "in place of the frequency ratio: p times the duration or period"),
+    "uplift_strength": (True, (0.02, 0.98), "in place of the intensity: uplift threshold over peak acceleration"),
+}
+
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_restitution(parser)
     parser.add_argument("--alpha", type=number, default=0.2, help="slenderness angle [rad] (default 0.2)")
-    parser.add_argument("--frequency-ratio", type=number, nargs=2, default=(0.3, 8.0), metavar=("FROM", "TO"))
-    parser.add_argument("--intensity", type=number, nargs=2, default=(1.02, 10.0), metavar=("FROM", "TO"))
+    for name, (_, ends, meaning) in _AXES.items():
+        words = f"{meaning} (default {ends[0]:g} {ends[1]:g})"
+        parser.add_argument("--" + name.replace("_", "-"), type=number, nargs=2, metavar=("FROM", "TO"), help=words)
     parser.add_argument("--points", type=int, default=128, help="points along each axis (default 128)")
     add_pulse(parser)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     check_points(arguments.points, 2)
-    check_range("--frequency-ratio", arguments.frequency_ratio)
-    check_range("--intensity", arguments.intensity)
-    ratio = np.linspace(*arguments.frequency_ratio, arguments.points)
-    intensity = np.linspace(*arguments.intensity, arguments.points)
+    by_duration, axes = _axes(arguments)
     result = rk.overturning_map(
-        ratio,
-        intensity,
+        **axes,
         alpha=arguments.alpha,
         restitution=arguments.restitution,
         pulse=pulse_of(arguments),
@@ -45,13 +50,30 @@ def _run(arguments: argparse.Namespace) -> int:
     names = {0: "safe", 1: "overturned without impact", 2: "overturned after impacts", -1: "not computed"}
     print(table([(name, f"{int((state == key).sum())}", "scenes") for key, name in names.items()]))
     arguments.out.mkdir(parents=True, exist_ok=True)
-    columns, rows = np.meshgrid(ratio, intensity)
-    write_csv(arguments.out / "map.csv", "frequency_ratio,intensity,state,max_rotation_over_alpha,impacts,margin",
+    columns, rows = np.meshgrid(*axes.values())
+    write_csv(arguments.out / "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
               *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
               )  # fmt: skip
     print(f"wrote {arguments.out / 'map.csv'}")
-    save(rk.plot.overturning(result).figure, arguments.out / "map.png")
+    save(rk.plot.overturning(result, by_duration=by_duration).figure, arguments.out / "map.png")
     return status_of_surface(result.status)
+
+
+def _axes(arguments: argparse.Namespace) -> tuple[bool, dict[str, np.ndarray]]:
+    """The two axes by their names, and whether they are pulse duration and uplift strength."""
+    given = {name: getattr(arguments, name) for name in _AXES if getattr(arguments, name) is not None}
+    kinds = {_AXES[name][0] for name in given} or {False}
+    if len(kinds) > 1:
+        options = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise ValueError(f"Options {options} must not go together: give frequency ratio and intensity, or the others.")
+    (by_duration,) = kinds
+    axes = {}
+    for name, (of_lobes, ends, _) in _AXES.items():
+        if of_lobes == by_duration:
+            low, high = given.get(name, ends)
+            check_range("--" + name.replace("_", "-"), (low, high))
+            axes[name] = np.linspace(low, high, arguments.points)
+    return by_duration, axes
 
 
 MAP = Command("map", "overturning map: intensity against frequency of a pulse", _add_options, _run)

@@ -24,7 +24,8 @@ import numpy as np
 from jaxrock._arguments import path_of
 from jaxrock._checks import Range, size
 from jaxrock._text import check_end, file_error, text_lines
-from jaxrock.blocks.asymmetric import AsymmetricBlock, ratio_of_inertia
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.inverse.observations import SEEN, Observations
 

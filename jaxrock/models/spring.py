@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from jaxrock._checks import checked, one_of
+from jaxrock._checks import checked, one_of, whole
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.coefficients import Coefficients, Terms
 from jaxrock.models.equation import AbstractEquation
@@ -16,48 +16,63 @@ class Spring(AbstractEquation):
     **Arguments:**
 
     - `kind`: `"SM1"` (the mass at a distance R above the spring), `"SM2"` (the mass at the pivot, shaken by a moment)
-      or `"SM3"` (the mass at the height R cos(alpha) above the spring); all with the block's moment of inertia.
+      or `"SM3"` (the mass at the height R cos(alpha) above the spring), all with the block's moment of inertia; or
+      `"mmSM"` (a rigid column of length 2R that carries many masses).
     - `law`: moment of the spring over m g R at the opening angle x: `"sine"`: sin(alpha - x), the block's own;
       `"linear"`: sin(alpha) (1 - x/alpha), a constant negative stiffness; `"plastic"`: sin(alpha), and the weight
-      of the leaning column pulls by sin(x) (SM1) or cos(alpha) sin(x) (SM2, SM3).
+      of the leaning column pulls by sin(x) (SM1, mmSM) or cos(alpha) sin(x) (SM2, SM3).
+    - `masses`: of mmSM: how many, 2 or more, at equal distances from the base to the top; each carries the part of the
+      column next to it, those at the ends half as much. Their mean height is R, and their moment of inertia
+      1 + 1/(2 (masses - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
 
     All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
-    differ by the law "plastic" alone. It balances at x = alpha (SM1), or where sin(x) = tan(alpha) (SM2, SM3): there
-    alpha must be below pi/4, for a stouter block on this spring never overturns.
+    differ by the law "plastic" alone, and mmSM is a slower SM1. It balances at x = alpha (SM1, mmSM), or where
+    sin(x) = tan(alpha) (SM2, SM3): there alpha must be below pi/4, for a stouter block on this spring never overturns.
 
     Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
     SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.
 
     Under vertical motion a spring is not a block: its moment does not change with the weight. That raises ValueError.
 
-    The rigid multi-mass model (mmSM) of n lumped masses is "SM1" of a block with p/sqrt(1 + 1/(2 (n - 1)^2)).
-
-    **Raises:** ValueError for other words; at use, for a block of alpha >= pi/4 where that is not allowed.
+    **Raises:** ValueError for other words, and for `masses` that are fewer than 2 or of another kind than mmSM; at use,
+    for a block of alpha >= pi/4 where that is not allowed.
 
     **Source:** Diamantopoulos & Fragiadakis (2017), equations 4-6 (SM1), 7-9 (SM2), 10-12 (SM3), 13-15 (mmSM).
     """
 
     kind: str = eqx.field(static=True)
     law: str = eqx.field(static=True)
+    masses: int | None = eqx.field(static=True)
 
-    def __init__(self, kind: str = "SM1", law: str = "linear"):
-        self.kind = one_of("kind", kind, ("SM1", "SM2", "SM3"))
+    def __init__(self, kind: str = "SM1", law: str = "linear", masses: int | None = None):
+        self.kind = one_of("kind", kind, ("SM1", "SM2", "SM3", "mmSM"))
         self.law = one_of("law", law, ("sine", "linear", "plastic"))
+        if masses is not None and kind != "mmSM":
+            raise ValueError(f"Argument `masses` must be None for {kind!r}, which has one mass, but is {masses!r}.")
+        whole("masses", masses, 2)
+        self.masses = masses
 
     def moments(self, block: Block | Side) -> Coefficients:
         """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""
-        alpha = block.alpha
-        if self.law == "plastic" and self.kind != "SM1":
+        found = self._moments(block)
+        if self.masses is None:
+            return found
+        return found.times(1 / (1 + 1 / (2 * (self.masses - 1) ** 2)))  # moments of inertia, block over column
+
+    def _moments(self, block: Block | Side) -> Coefficients:
+        """The same over the block's moment of inertia."""
+        alpha, leans_by_height = block.alpha, self.kind in ("SM2", "SM3")
+        if self.law == "plastic" and leans_by_height:
             message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
             alpha = checked("block.alpha", alpha, message, lambda angle: angle < jnp.pi / 4)
         sine, cosine = sine_cosine(alpha)
         arm = Terms(cosine=cosine)
         if self.law == "sine":
-            return Coefficients(Terms(sine=-cosine, cosine=sine), arm)  # D&F 2017, 4, 7, 10
+            return Coefficients(Terms(sine=-cosine, cosine=sine), arm)  # D&F 2017, 4, 7, 10, 13
         if self.law == "linear":
-            return Coefficients(Terms(constant=sine, line=-sine / alpha), arm)  # D&F 2017, 5, 8, 11
-        weight = jnp.ones_like(alpha) if self.kind == "SM1" else cosine
-        return Coefficients(Terms(constant=sine, sine=-weight), arm)  # D&F 2017, 6; 9, 12
+            return Coefficients(Terms(constant=sine, line=-sine / alpha), arm)  # D&F 2017, 5, 8, 11, 14
+        weight = cosine if leans_by_height else jnp.ones_like(alpha)
+        return Coefficients(Terms(constant=sine, sine=-weight), arm)  # D&F 2017, 6, 15; 9, 12
 
     @property
     def feels_weight(self) -> bool:

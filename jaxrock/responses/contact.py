@@ -8,7 +8,8 @@ from jaxtyping import Array, ArrayLike, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
 from jaxrock._parameters import check_single
-from jaxrock.blocks.asymmetric import AsymmetricBlock, ratio_of_inertia
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle

@@ -2,11 +2,15 @@
 
 The rocking of a slender block under a motion of given form, with peak a_g and frequency omega_g, depends on three
 numbers: omega_g/p, g alpha/a_g and the restitution. That of any rigid block depends on cos(alpha) besides, and on
-g tan(alpha)/a_g; as long as rotations are small, dividing them by cos(alpha) makes up for it.
+g tan(alpha)/a_g; as long as rotations are small, dividing them by cos(alpha) makes up for it. Why such groups have
+neither dimension nor orientation is what `orientations` computes.
 
-**Source:** Dimitrakopoulos & DeJong (2012), sections 4 to 6.
+Of a pulse these are its uplift strength, its duration times p, and what else it has: `groups_of` and `motion`.
+
+**Source:** Dimitrakopoulos & DeJong (2012), sections 4 to 6; Voyagaki, Psycharis & Mylonakis (2012), 2.2.
 """
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -14,9 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, one_of, positive
+from jaxrock._checks import as_real, not_nan, one_of, positive, share
+from jaxrock._parameters import declared
 from jaxrock.blocks.rigid import Block
+from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.history import Response
+from jaxrock.studies import orientations as orientations
 
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
@@ -29,12 +36,46 @@ class Groups(eqx.Module):
     - `strength`: g alpha/a_g (slender) or g tan(alpha)/a_g (rigid) [-]: one over the intensity.
     - `restitution`: [-].
     - `cos_alpha`: None for slender blocks, for which it plays no part.
+    - `others`: further parameters of a pulse by their names, times of them times p [-].
     """
 
     frequency_ratio: Real
     strength: Real
     restitution: Real
     cos_alpha: Real | None = None
+    others: dict[str, Real] = eqx.field(default_factory=dict)
+
+    @classmethod
+    def of_duration(
+        cls,
+        uplift_strength: ArrayLike,
+        pulse_duration: ArrayLike,
+        restitution: ArrayLike,
+        cos_alpha: ArrayLike | None = None,
+        **others: ArrayLike,
+    ) -> "Groups":
+        """Groups by the numbers of single-lobe pulses: uplift threshold over peak, and p times the duration [-].
+
+        **Arguments:**
+
+        - `uplift_strength`, `pulse_duration`: positive.
+        - `restitution`, `cos_alpha`: as they are kept.
+        - `others`: of the pulse, such as `shape=0.5`.
+
+        **Raises:** ValueError for arguments outside their ranges.
+
+        **Source:** Voyagaki, Psycharis & Mylonakis (2012), section 2.
+        """
+        ratio = 2 * jnp.pi / positive("pulse_duration", pulse_duration)
+        others = {name: not_nan(name, value) for name, value in others.items()}
+        cos_alpha = None if cos_alpha is None else share("cos_alpha", cos_alpha)
+        strength, restitution = positive("uplift_strength", uplift_strength), share("restitution", restitution)
+        return cls(ratio, strength, restitution, cos_alpha, others)
+
+    @property
+    def pulse_duration(self) -> Real:
+        """p times the duration (or period) of the pulse [-]."""
+        return 2 * jnp.pi / self.frequency_ratio
 
 
 class Scales(eqx.Module):
@@ -72,6 +113,32 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
 
 
 @arguments
+def groups_of(block: Block, pulse: AbstractPulse, kind: str = "rigid") -> Groups:
+    """The groups of a block under a pulse: uplift strength, duration, and the pulse's further parameters.
+
+    **Arguments:**
+
+    - `block`, `kind`: as in `groups`.
+    - `pulse`: any pulse; the sign of its amplitude plays no part.
+
+    **Returns:** `Groups`, of which `motion` makes the pulse again, for this block or for another.
+
+    **Source:** Voyagaki, Psycharis & Mylonakis (2012), 2.2; Dimitrakopoulos & DeJong (2012), 4.11 and 5.3.
+    """
+    (size, extent), others = _parts(type(pulse))
+    found = groups(block, jnp.abs(getattr(pulse, size)), 2 * jnp.pi / getattr(pulse, extent), kind)
+    rates = {name: block.p if is_time else 1.0 for name, is_time in others.items()}
+    return eqx.tree_at(lambda g: g.others, found, {name: getattr(pulse, name) * rate for name, rate in rates.items()})
+
+
+def _parts(form: Callable) -> tuple[list[str], dict[str, bool]]:
+    """Of a pulse: names of its amplitude and its period or duration, and of the others, with whether they are times."""
+    known = declared(form.func if isinstance(form, functools.partial) else form)
+    names = list(known)
+    return names[:2], {name: known[name].unit == "s" for name in names[2:]}
+
+
+@arguments
 def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """The slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
 
@@ -91,12 +158,15 @@ def motion(groups: Groups, block: Block, form: Callable):
 
     - `groups`: `Groups`; if of rigid blocks, with the cosine of `block.alpha`.
     - `block`: a `Block` of any size.
-    - `form`: makes a motion from peak [g] and period [s], such as `SinePulse`.
+    - `form`: makes a motion from peak [g] and period or duration [s], such as `SinePulse`; a pulse, where the groups
+      have others of its parameters.
 
     **Returns:** what `form` makes.
     """
     threshold = block.alpha if groups.cos_alpha is None else jnp.tan(block.alpha)
-    return form(threshold / groups.strength, 2 * jnp.pi / (groups.frequency_ratio * block.p))
+    are_times = _parts(form)[1] if groups.others else {}
+    others = {name: value / block.p if are_times[name] else value for name, value in groups.others.items()}
+    return form(threshold / groups.strength, 2 * jnp.pi / (groups.frequency_ratio * block.p), **others)
 
 
 @arguments

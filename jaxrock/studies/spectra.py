@@ -1,6 +1,8 @@
 """Whole surfaces: rocking spectra and overturning maps."""
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Range, Values, ratio
+from jaxrock._checks import Range, Values, not_nan, ratio
 from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -32,6 +34,7 @@ class Spectrum(eqx.Module):
     - `max_velocity`: peak |angular velocity| over p alpha [-]; infinite where the block overturned.
     - `impact_count`, `overturned`, `margin`, `status`: as in `Outcome`.
     - `intensity`: peak acceleration over the uplift threshold [-], one per row (self-similar spectrum), or None.
+    - `parameters`: further axes of a self-similar spectrum, in front of the rows, by the pulse's names.
     """
 
     abscissa: Float[Array, " n"]
@@ -42,12 +45,24 @@ class Spectrum(eqx.Module):
     margin: Float[Array, "*rows n"]
     status: Status
     intensity: Float[Array, " rows"] | None = None
+    parameters: dict[str, Float[Array, " _"]] = eqx.field(default_factory=dict)
+
+    @property
+    def pulse_duration(self) -> Float[Array, " n"] | None:
+        """p times the duration (or period) of the pulse [-], 2 pi/abscissa; None of a rocking spectrum."""
+        return None if self.intensity is None else 2 * jnp.pi / self.abscissa
+
+    @property
+    def uplift_strength(self) -> Float[Array, " rows"] | None:
+        """Uplift threshold over the peak acceleration [-], 1/intensity; None of a rocking spectrum."""
+        return None if self.intensity is None else 1 / self.intensity
 
 
 class OverturningMap(eqx.Module):
-    """An overturning map; every result has the shape (len(intensity), len(frequency_ratio)).
+    """An overturning map; every result has the shape (len(intensity), len(frequency_ratio)), or (..., of these two).
 
     - `frequency_ratio`: omega/p [-]; `intensity`: peak acceleration over the uplift threshold [-].
+    - `parameters`: further axes, in front of these, by the pulse's names.
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
     - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
@@ -55,11 +70,22 @@ class OverturningMap(eqx.Module):
 
     frequency_ratio: Float[Array, " columns"]
     intensity: Float[Array, " rows"]
-    state: Int[Array, "rows columns"]
-    max_rotation: Float[Array, "rows columns"]
-    impact_count: Int[Array, "rows columns"]
-    margin: Float[Array, "rows columns"]
+    state: Int[Array, "*more rows columns"]
+    max_rotation: Float[Array, "*more rows columns"]
+    impact_count: Int[Array, "*more rows columns"]
+    margin: Float[Array, "*more rows columns"]
     status: Status
+    parameters: dict[str, Float[Array, " _"]] = eqx.field(default_factory=dict)
+
+    @property
+    def pulse_duration(self) -> Float[Array, " columns"]:
+        """p times the duration (or period) of the pulse [-], 2 pi/frequency_ratio."""
+        return 2 * jnp.pi / self.frequency_ratio
+
+    @property
+    def uplift_strength(self) -> Float[Array, " rows"]:
+        """Uplift threshold over the peak acceleration [-], 1/intensity."""
+        return 1 / self.intensity
 
 
 @arguments
@@ -99,15 +125,18 @@ def rocking_spectrum(
 
 @arguments
 def self_similar_spectrum(
-    frequency_ratio: Values,
-    intensity: Values,
+    frequency_ratio: Values | None = None,
+    intensity: Values | None = None,
     *,
+    pulse_duration: Values | None = None,
+    uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
+    **parameters: Values,
 ) -> Spectrum:
     """Peak response under a pulse against its frequency, in dimensionless terms: one curve per intensity.
 
@@ -115,35 +144,42 @@ def self_similar_spectrum(
 
     - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
     - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
+    - `pulse_duration`, `uplift_strength`: (n,) and (rows,) the same axes in other numbers, each in place of one of the
+      two: p times the duration (or period) of the pulse, and uplift threshold over peak acceleration [-], positive.
     - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
     - `pulse`: makes a motion from amplitude [g] and period [s] (for pulses with a duration, that): a pulse of the
       package, or any function that JAX can trace; what it reads may have changed since the last call.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+    - `parameters`: further ones of the pulse by their names, such as `shape=0.5`: a number, or a list, which is one
+      more axis, in front of the others.
 
-    **Returns:** a `Spectrum` with results of shape (rows, n).
+    **Returns:** a `Spectrum` with results of shape (rows, n), or (..., rows, n).
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges; TypeError for parameters that the pulse does not have.
 
-    **Source:** Dimitrakopoulos & DeJong (2012), section 4.
+    **Source:** Dimitrakopoulos & DeJong (2012), section 4; Voyagaki, Psycharis & Mylonakis (2012), 2.2, figure 3.5.
     """
-    results, ratio, intensity = _over_pulses(
-        _peaks_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "spectrum", progress
-    )
-    return Spectrum(abscissa=ratio, intensity=intensity, **results)
+    axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
+    scene = alpha, restitution, pulse, model, engine
+    results = _over_pulses(_peaks_under_pulse, axes, *scene, "spectrum", progress)
+    return Spectrum(abscissa=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
 
 @arguments
 def overturning_map(
-    frequency_ratio: Values,
-    intensity: Values,
+    frequency_ratio: Values | None = None,
+    intensity: Values | None = None,
     *,
+    pulse_duration: Values | None = None,
+    uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
     pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
+    **parameters: Values,
 ) -> OverturningMap:
     """Who overturns under a pulse, over its frequency and intensity.
 
@@ -152,27 +188,67 @@ def overturning_map(
     **Returns:** an `OverturningMap`.
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges; TypeError for parameters that the pulse does not have.
 
-    **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4.
+    **Source:** Zhang & Makris (2001); Dimitrakopoulos & DeJong (2012), figure 4; Voyagaki, Psycharis & Mylonakis
+    (2012), 2.2, figures 3.1 to 3.3 and 3.6.
     """
-    results, ratio, intensity = _over_pulses(
-        _states_under_pulse, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, "map", progress
-    )
-    return OverturningMap(frequency_ratio=ratio, intensity=intensity, **results)
+    axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
+    scene = alpha, restitution, pulse, model, engine
+    results = _over_pulses(_states_under_pulse, axes, *scene, "map", progress)
+    return OverturningMap(frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
 
-def _over_pulses(function, frequency_ratio, intensity, alpha, restitution, pulse, model, engine, label, progress):
-    """Outcomes over the outer product of intensities (rows) and frequency ratios (columns), at p = 1."""
-    ratio, intensity = axis("frequency_ratio", frequency_ratio), axis("intensity", intensity)
-    block = Block(alpha, 1.0, restitution)
+class _PulseAxes(NamedTuple):
+    """Axes over pulses: frequency ratios, intensities, and further parameters of the pulse."""
 
-    number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, ratio, intensity))
-    pulse, model = current_function(pulse, number, number), current_model(model, block, ratio, intensity)
-    scene = block.alpha, scaled_law(block), pulse, model, engine
+    ratio: Float[Array, " columns"]
+    intensity: Float[Array, " rows"]
+    parameters: dict[str, Array]  # numbers and lists
+
+    @classmethod
+    def of(cls, frequency_ratio, intensity, pulse_duration, uplift_strength, parameters) -> "_PulseAxes":
+        """Each of the two from the one of its names that is given."""
+        ratio = _either("frequency_ratio", frequency_ratio, "pulse_duration", pulse_duration, 2 * math.pi)
+        intensity = _either("intensity", intensity, "uplift_strength", uplift_strength, 1.0)
+        parameters = {name: not_nan(name, values) for name, values in parameters.items()}
+        for name, values in parameters.items():
+            if values.ndim > 1 or values.size == 0:
+                raise ValueError(f"Argument `{name}` must be a number or a list, but has shape {values.shape}.")
+        return cls(ratio, intensity, parameters)
+
+    @property
+    def lists(self) -> dict[str, Array]:
+        """The parameters that are axes."""
+        return {name: values for name, values in self.parameters.items() if values.ndim}
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the results."""
+        return (*(values.size for values in self.lists.values()), self.intensity.size, self.ratio.size)
+
+
+def _either(name: str, values: Values | None, other: str, others: Values | None, product: float) -> Float[Array, " n"]:
+    """An axis, given by itself or by what it makes a number with."""
+    if (values is None) == (others is None):
+        which = "neither is" if values is None else "both are"
+        raise ValueError(f"Argument `{name}` must be given, or `{other}` in its place, but {which}.")
+    return axis(name, values) if others is None else product / axis(other, others)
+
+
+def _over_pulses(function, axes: _PulseAxes, alpha, restitution, pulse, model, engine, label, progress) -> dict:
+    """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
+    block, names = Block(alpha, 1.0, restitution), tuple(axes.parameters)
+    more = [jnp.atleast_1d(values) for values in axes.parameters.values()]
+
+    number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *more, axes.intensity, axes.ratio))
+    given = pulse if not names else lambda size, extent, *more: pulse(size, extent, **dict(zip(names, more)))
+    pulse_now = current_function(given, number, number, *(number for _ in names))
+    model = current_model(model, block, axes.ratio, axes.intensity)
+    scene = block.alpha, scaled_law(block), pulse_now, model, engine
     # Neighbours in intensity share a chunk: they move alike.
-    results = surface(function, (intensity, ratio), scene, label, progress, columns=True)
-    return results, ratio, intensity
+    results = surface(function, (*more, axes.intensity, axes.ratio), scene, label, progress, columns=True)
+    return jax.tree.map(lambda x: x.reshape(axes.shape), results)
 
 
 def scaled_law(block: Block) -> AbstractRestitution:
@@ -221,16 +297,16 @@ def _under_motion(period, scene):
     return _peaks(outcome(block, motion, model, engine=engine), block)
 
 
-def _under_pulse(intensity, ratio, scene) -> tuple[Outcome, Block]:
-    alpha, restitution, pulse, model, engine = scene
+def _under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
+    *parameters, intensity, ratio, (alpha, restitution, pulse, model, engine) = point_and_scene
     block = Block(alpha, jnp.ones_like(alpha), restitution)
-    motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio)
+    motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio, *parameters)
     return outcome(block, motion, model, engine=engine), block
 
 
-def _peaks_under_pulse(intensity, ratio, scene) -> dict:
-    return _peaks(*_under_pulse(intensity, ratio, scene))
+def _peaks_under_pulse(*point_and_scene) -> dict:
+    return _peaks(*_under_pulse(*point_and_scene))
 
 
-def _states_under_pulse(intensity, ratio, scene) -> dict:
-    return _states(*_under_pulse(intensity, ratio, scene))
+def _states_under_pulse(*point_and_scene) -> dict:
+    return _states(*_under_pulse(*point_and_scene))

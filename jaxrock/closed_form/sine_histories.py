@@ -1,0 +1,96 @@
+"""Histories under one cycle of a sine, from uplift to the second impact; terms and conventions as in `sine_pulse`."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
+from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
+
+_PIECES = 3  # after an impact during the pulse: until the second driving stretch, in it, and after it
+
+
+def rotation(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+    """Rotation over alpha, from uplift over the first impact to the second.
+
+    **Arguments:**
+
+    - `time`: p t from uplift; before it the block stands.
+    - `intensity`: a_g/(g alpha), above 1.
+    - `frequency_ratio`: omega_g/p, positive.
+    - `restitution`: of the first impact, in [0, 1].
+
+    **Returns:** theta/alpha, negative up to the first impact; not a number after the second: ask an engine.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** D&D 3.4 and 3.5, with the constants of each stage of figure 2.
+    """
+    return _history(time, intensity, frequency_ratio, restitution)[0]
+
+
+def velocity(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
+    """Angular velocity over p alpha, with the arguments of `rotation`; at an impact, that before it.
+
+    **Source:** D&D 3.4 and 3.5; 3.11 at the end of the pulse.
+    """
+    return _history(time, intensity, frequency_ratio, restitution)[1]
+
+
+@elementwise_in_sine
+def impact_velocity(intensity: Real, frequency_ratio: Real) -> Result:
+    """Angular velocity over p alpha just before the first impact; not a number where the block overturns before.
+
+    **Arguments:** as in `rotation`.
+
+    **Source:** D&D 3.22 (while the pulse lasts), 3.14 and 3.15 (after it).
+    """
+    time = formulas.first_impact(intensity, frequency_ratio)
+    known = jnp.isfinite(time)
+    speed = formulas.impact_speed(jnp.where(known, time, 1.0), intensity, frequency_ratio)
+    return jnp.where(known, speed, jnp.nan)
+
+
+@elementwise_in_sine
+def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Real) -> tuple[Result, Result]:
+    """Rotation and velocity, in one program."""
+    a, w, e = intensity, frequency_ratio, restitution
+    end, impact = formulas.end_of_pulse(a, w), formulas.first_impact(a, w)
+    hits = jnp.isfinite(impact)
+    first = _flight(jnp.clip(time, 0.0, impact), end, arcs.start(a), a, w)
+    impact = jnp.where(hits, impact, end)
+    speed = jnp.where(hits, formulas.impact_speed(impact, a, w), 0.0)
+    start = arcs.start(a)
+    angle = start.angle + w * jnp.minimum(impact, end)
+    after = arcs.Lane(angle, -start.side, start.opening, e * speed, start.impacts, impact >= end)
+    left = jnp.maximum(end - impact, 0.0)
+    second = _flight(jnp.maximum(time - impact, 0.0), left, after, a, w)
+    known = time - impact <= _return(*jax.lax.stop_gradient((after, left, a, w, e)))
+    rocks = hits & (time > impact)
+    values = [jnp.where(rocks, jnp.where(known, late, jnp.nan), -early) for early, late in zip(first, second)]
+    return values[0], values[1]
+
+
+def _flight(since: Array, left: Array, lane: arcs.Lane, a: Array, w: Array) -> tuple[Array, Array]:
+    """Opening and speed at a time since `lane`, of which the pulse lasts the first part: D&D 3.4, then 3.5."""
+    opening, speed = arcs.arc(jnp.minimum(since, left), lane, a, w)
+    free = jnp.maximum(since - left, 0.0)
+    sinh, cosh, rise = jnp.sinh(free), jnp.cosh(free), 2 * jnp.sinh(free / 2) ** 2
+    return opening * cosh + speed * sinh - rise, opening * sinh + speed * cosh - sinh
+
+
+def _return(lane: arcs.Lane, left: Array, a: Array, w: Array, e: Array) -> Array:
+    """How long after `lane` the block is back on the ground; inf where it overturns."""
+
+    def further(_, carry):
+        lane, hit = carry
+        after, lands = arcs.piece(lane, a, w, e)
+        going = ~(hit | lane.done)
+        return jax.tree.map(lambda x, y: jnp.where(going, x, y), after, lane), hit | (going & lands)
+
+    new, hit = jax.lax.fori_loop(0, _PIECES, further, (lane, jnp.zeros_like(lane.done)))
+    outward = new.opening - 1 + new.speed  # the growing part of 3.5
+    product = outward * (new.opening - 1 - new.speed)
+    falls = outward < 0
+    free = jnp.log((1 + jnp.sqrt(1 - jnp.where(falls, product, 0.0))) / jnp.where(falls, -outward, 1.0))  # as 3.13
+    return jnp.where(hit, (new.angle - lane.angle) / w, jnp.where(falls, left + free, jnp.inf))

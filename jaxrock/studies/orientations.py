@@ -1,0 +1,106 @@
+"""Orientational analysis: which products of quantities have neither a dimension nor an orientation.
+
+A quantity points along x, y or z, or nowhere: a displacement or an acceleration along its axis, an angle in the x-y
+plane along z. Two equal orientations cancel, two unlike ones make the third. So an equation must hold in orientations,
+too: mirrored scenes give mirrored answers. That is a rule for exponents of angles, which have no dimension.
+
+It tells which groups may be used, not which the response depends on: a slender block's response is unchanged if all
+angles and accelerations grow alike, which no orientation knows.
+
+**Source:** Siano (1985); Dimitrakopoulos & DeJong (2012), section 4, equations 4.4 to 4.9 and table 1.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from jaxrock._checks import one_of
+
+ORIENTATIONS = ("0", "x", "y", "z")
+
+
+class Quantity(NamedTuple):
+    """Dimension and orientation of a quantity.
+
+    - `length`, `time`: exponents of its dimension. (No mass: it cancels in the equation of a rocking block.)
+    - `orientation`: "x", "y" or "z"; "0" for none.
+    """
+
+    length: int = 0
+    time: int = 0
+    orientation: str = "0"
+
+    @property
+    def is_pure(self) -> bool:
+        """Whether it is a number without an orientation: one that equal scenes may share."""
+        return self == Quantity()
+
+
+# Of a block that rocks in the x-y plane, y upwards: D&D 4.7.
+QUANTITIES = {
+    "rotation": Quantity(orientation="z"),
+    "alpha": Quantity(orientation="z"),
+    "restitution": Quantity(),
+    "p": Quantity(time=-1),
+    "frequency": Quantity(time=-1),
+    "time": Quantity(time=1),
+    "velocity": Quantity(time=-1, orientation="z"),
+    "acceleration": Quantity(length=1, time=-2, orientation="x"),
+    "gravity": Quantity(length=1, time=-2, orientation="y"),
+    "radius": Quantity(length=1),
+}
+
+
+def combined(first: str, second: str) -> str:
+    """The orientation of a product of two quantities with these orientations.
+
+    **Raises:** ValueError for what is none of "0", "x", "y" and "z".
+
+    **Source:** Dimitrakopoulos & DeJong (2012), equation 4.4 and table 1.
+    """
+    indices = (ORIENTATIONS.index(one_of("orientation", each, ORIENTATIONS)) for each in (first, second))
+    one, other = indices
+    return ORIENTATIONS[one ^ other]  # Klein's group of four: equal ones cancel, two unlike ones make the third
+
+
+def power(orientation: str, exponent: int) -> str:
+    """The orientation of a whole power: its own if that is odd, none if it is even.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), equation 4.5.
+    """
+    return one_of("orientation", orientation, ORIENTATIONS) if exponent % 2 else "0"
+
+
+def of_series(orientation: str, exponents: Iterable[int]) -> str:
+    """The orientation of a power series of a quantity that has terms with these exponents.
+
+    **Returns:** that of its terms: "0" for the cosine of an angle, whose terms are even, the angle's own for its sine.
+
+    **Raises:** ValueError where the terms differ, as those of an exponential: such a sum means nothing.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), equation 4.6.
+    """
+    found = {power(orientation, exponent) for exponent in exponents}
+    if len(found) != 1:
+        raise ValueError(f"Argument `exponents` must be all even or all odd for the orientation {orientation!r}.")
+    return found.pop()
+
+
+def product(**exponents: int) -> Quantity:
+    """Dimension and orientation of a product of powers of the block's and the motion's quantities.
+
+    **Arguments:**
+
+    - `exponents`: whole numbers by the names of `QUANTITIES`: `product(acceleration=1, gravity=-1)` is that of a_g/g.
+
+    **Returns:** a `Quantity`; where `is_pure`, the product is a dimensionless and orientationless group.
+
+    **Raises:** ValueError for other names.
+
+    **Source:** Dimitrakopoulos & DeJong (2012), equations 4.7 to 4.9.
+    """
+    length, time, orientation = 0, 0, "0"
+    for name, exponent in exponents.items():
+        one = QUANTITIES[one_of("name", name, tuple(QUANTITIES))]
+        length, time = length + exponent * one.length, time + exponent * one.time
+        orientation = combined(orientation, power(one.orientation, exponent))
+    return Quantity(length, time, orientation)
