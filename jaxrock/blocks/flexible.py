@@ -183,3 +183,9 @@ class FlexibleBlock(eqx.Module):
         second = frequencies[..., 1]
         part = 2 * ratio / (first + second)
         return part * first * second, part[..., None] * frequencies**2
+
+
+def check_rigid(block) -> None:
+    """Raise ValueError for a `FlexibleBlock`, where only rigid blocks are known."""
+    if isinstance(block, FlexibleBlock):
+        raise ValueError("Argument `block` must be rigid here, but is a FlexibleBlock: ask `outcome` or `simulate`.")

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock.blocks.flexible import check_rigid
 from jaxrock.blocks.rigid import Block
 
 
@@ -23,8 +24,9 @@ def draw_blocks(
 
     **Returns:** a `Block` with parameters of shape (draws,).
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
     """
+    check_rigid(block)
     if draws < 1:
         raise ValueError(f"Argument `draws` must be at least 1, but is {draws}.")
     for name, value in (("alpha", alpha), ("p", p), ("restitution", restitution)):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int8
 
 from jaxrock._checks import Values, one_of
 from jaxrock._parameters import one_of_many
+from jaxrock.blocks.flexible import check_rigid
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising
@@ -186,7 +187,7 @@ def simulated_fragility(
     **Returns:** a `SimulatedFragility`: its `tabulated()` and `fit().fragility` go into `toppling_rate` and
     `survival_probability` with a hazard curve of the same measure.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
 
     **Source:** Vamvatsikos & Cornell (2002), scaled records; Jalayer & Cornell (2009), stripes.
     """
@@ -211,7 +212,8 @@ def _factors(levels, accelerations, velocities, measure: str) -> np.ndarray:
 
 
 def stacked(block: Block) -> Block:
-    """A block with parameters of shape (draws,)."""
+    """A rigid block with parameters of shape (draws,)."""
+    check_rigid(block)
     shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for leaf in jax.tree.leaves(block)))
     if len(shape) > 1:
         raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")

@@ -246,7 +246,7 @@ def simulated_surface(
 
     **Returns:** a `SimulatedSurface`.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
 
     **Source:** Purvance, Anooshehpoor & Brune (2008), the two measures.
     """

@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import checked
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import check_rigid
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle
@@ -62,11 +63,12 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
 
     **Returns:** a `Contact`.
 
-    **Raises:** ValueError for a value outside its range.
+    **Raises:** ValueError for a value outside its range, or a flexible block.
 
     **Source:** momentum of the centre of mass, on a circle about the corner (Shenton 1996 for the beginning of
     rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
+    check_rigid(block)
     ratio = checked("inertia_ratio", inertia_ratio, "be in (0, 1]", lambda x: (x > 0) & (x <= 1))
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (1.0, 1.0)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxrock._checks import positive
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import check_rigid
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound, uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
@@ -88,10 +89,11 @@ def critical_amplitudes(
     **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
     themselves beside them may be missed; a safe gap between different numbers of impacts is not.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
 
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
+    check_rigid(block)
     low, high = _rising("intensity", intensity)
     model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
@@ -120,8 +122,9 @@ def critical_durations(
 
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
     """
+    check_rigid(block)
     low, high = _rising("factor", factor)
     if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")

@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._checks import Values, as_real, not_nan
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import check_rigid
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
@@ -84,8 +85,9 @@ def sensitivity(
     Housner's, but at a fixed amplitude [g]; `amplitude` of a record scales all of it; `uplift_strength`, the uplift
     threshold over the amplitude, is changed by the amplitude.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, or a flexible block.
     """
+    check_rigid(block)
     parameters = named(block, motion)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
 
