@@ -49,8 +49,7 @@ class Spring(AbstractEquation):
         self.law = one_of("law", law, ("sine", "linear", "plastic"))
         if masses is not None and kind != "mmSM":
             raise ValueError(f"Argument `masses` must be None for {kind!r}, which has one mass, but is {masses!r}.")
-        whole("masses", masses, 2)
-        self.masses = masses
+        self.masses = None if masses is None else whole("masses", masses, 2)
 
     def moments(self, block: Block | Side) -> Coefficients:
         """Moment of the spring and of the weight, as far as they are kept apart; arm cos(alpha) cos(x)."""

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 
@@ -22,6 +23,14 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
 
 
+def _check_rigid(response) -> None:
+    if isinstance(response, FlexibleResponse):
+        raise ValueError(
+            "Argument `response` must be of a rigid block, but is a FlexibleResponse: draw its `rotation`, "
+            "`displacement` and `bending` over its `time`."
+        )
+
+
 def history(response: Response, axes=None):
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
@@ -31,9 +40,12 @@ def history(response: Response, axes=None):
     - `axes`: three matplotlib axes; None makes a figure.
 
     **Returns:** the three axes.
+
+    **Raises:** ValueError for the response of a flexible block.
     """
     import matplotlib.pyplot as plt
 
+    _check_rigid(response)
     if axes is None:
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
     scene = response.scene
@@ -67,9 +79,12 @@ def phase(response: Response, axis=None):
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns.
+
+    **Raises:** ValueError for the response of a flexible block.
     """
     import matplotlib.pyplot as plt
 
+    _check_rigid(response)
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
     scene = response.scene
