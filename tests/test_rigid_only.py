@@ -52,4 +52,4 @@ def test_flexible_blocks_are_refused(answers, name):
     if "rk.plot" in ASKED[name]:
         assert answers[name].startswith("ValueError Argument `response` must be of a rigid block, but is a Flexible")
     else:
-        assert re.match("ValueError Argument `(block|response)` must be a .*, but is a FlexibleBlock", answers[name])
+        assert re.match("ValueError Argument `(block|response)` must be a .*, but is a Flexible", answers[name])
