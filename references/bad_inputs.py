@@ -64,6 +64,10 @@ def unknowns():
     return {"amplitude": rk.Unknown(0.1, 1.0), "period": rk.Unknown(0.2, 2.0)}
 
 
+def density():
+    return rk.log_density(rocks(), rk.SinePulse, unknowns())
+
+
 def fragility():
     return rk.LogNormalFragility(0.3, 0.4)
 
@@ -128,6 +132,9 @@ CALLS: dict[str, Call] = {
     "Block": Call(rk.Block, {"alpha": 0.2, "p": 2.0, "restitution": 0.9}),
     "Block.from_dimensions": Call(
         rk.Block.from_dimensions, {"width": 0.6, "height": 3.0, "restitution": 0.9, "gravity": 9.81}
+    ),
+    "Block.from_radius": Call(
+        rk.Block.from_radius, {"alpha": 0.2, "R": 2.0, "restitution": 0.9, "inertia_ratio": 0.7, "gravity": 9.81}
     ),
     "AsymmetricBlock": Call(
         rk.AsymmetricBlock,
@@ -249,6 +256,7 @@ CALLS: dict[str, Call] = {
     "similarity.groups": Call(
         rk.similarity.groups, {"block": block(), "amplitude": 0.5, "frequency": 6.0, "kind": "rigid"}
     ),
+    "similarity.groups_of": Call(rk.similarity.groups_of, {"block": block(), "pulse": pulse(), "kind": "rigid"}),
     "similarity.block": Call(
         rk.similarity.block,
         {"groups": rk.similarity.groups(block(), 0.5, 6.0, "slender"), "amplitude": 0.5, "frequency": 6.0},
@@ -359,6 +367,20 @@ CALLS: dict[str, Call] = {
         rk.Likelihood,
         {"observations": rocks(), "motion": rk.SinePulse, "scatter": 0.3, **QUICK, "lapse": 0.02},
     ),
+    "log_density": Call(
+        rk.log_density,
+        {
+            "observations": rocks(),
+            "motion": rk.SinePulse,
+            "unknowns": unknowns(),
+            "scatter": 0.3,
+            "lapse": 0.02,
+            **QUICK,
+        },
+    ),
+    "LogDensity.starts": Call(density().starts, {"count": 2, "seed": 1}),
+    "LogDensity.values": Call(density().values, {"point": [0.0] * len(unknowns())}),
+    "LogDensity.point": Call(density().point, {"values": {name: 0.9 for name in unknowns()}}, False, ".*"),
     "estimate_motion": Call(
         rk.estimate_motion,
         {

@@ -1,6 +1,7 @@
 """What rocks say about a motion, as a function for optimisers and samplers of any library."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 from scipy.stats import qmc
 
-from jaxrock._checks import as_real, whole
+from jaxrock._arguments import arguments, at_least
+from jaxrock._checks import as_real, together
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
@@ -37,30 +39,42 @@ class LogDensity(eqx.Module):
     def __call__(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-density of points, (..., parameters), with respect to the points themselves, but for a constant: what a
         sampler takes. Many points at once take less time than `jax.vmap` of one."""
-        return _at_points(self, jnp.asarray(point), True)
+        return _at_points(self, self._checked(point), True)
 
     def objective(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-likelihood and log-prior: what `estimate_motion` makes as large as it can. It does not depend on the
         coordinates."""
-        return _at_points(self, jnp.asarray(point), False)
+        return _at_points(self, self._checked(point), False)
 
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
         """Parameters by name, in their units, at points."""
-        return self.problem.values(self._place(jnp.asarray(point)))
+        return self.problem.values(self._place(self._checked(point)))
 
+    @arguments
     def point(self, values: dict[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
-        """The point of parameters; infinite at the ends of their ranges, not a number outside."""
+        """The point of parameters by name; infinite at the ends of their ranges, not a number outside."""
+        if set(values) != set(self.names):
+            raise ValueError(f"Argument `values` must hold {', '.join(self.names)}, but holds {', '.join(values)}.")
         low, high = self.problem.ends.T
         given = [as_real(name, values[name]) for name in self.names]
+        together(**dict(zip(self.names, given)))
         logs = [unknown.log for unknown in self.problem.unknowns.values()]
         place = jnp.stack(jnp.broadcast_arrays(*(jnp.log(x) if log else x for x, log in zip(given, logs))), axis=-1)
         return jnp.log(place - low) - jnp.log(high - place)
 
-    def starts(self, count: int, seed: int = 0) -> Float[Array, "count parameters"]:
+    @arguments
+    def starts(
+        self, count: Annotated[int, at_least(1, 10**6)], seed: Annotated[int, at_least(0)] = 0
+    ) -> Float[Array, "count parameters"]:
         """So many points, spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
-        whole("count", count, 1)
         share = jnp.asarray(qmc.Halton(len(self.names), seed=seed).random(count), self.problem.ends.dtype)
         return jnp.log(share) - jnp.log1p(-share)
+
+    def _checked(self, point: ArrayLike) -> Real:
+        point, size = as_real("point", point), len(self.names)
+        if point.shape[-1:] != (size,):
+            raise ValueError(f"Argument `point` must end with an axis of {size}, but has shape {point.shape}.")
+        return point
 
     def _place(self, point: Real) -> Real:
         low, high = self.problem.ends.T
@@ -79,6 +93,7 @@ def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
     return value + jnp.sum(volume, axis=-1) if by_point else value
 
 
+@arguments
 def log_density(
     observations: Observations,
     motion: Callable,
