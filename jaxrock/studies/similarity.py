@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, one_of, positive
+from jaxrock._checks import as_real, one_of, size
 from jaxrock.blocks.rigid import Block
 from jaxrock.responses.history import Response
 
@@ -63,7 +63,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
 
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.11 (slender) and 5.3 (rigid).
     """
-    amplitude, frequency = positive("amplitude", amplitude), positive("frequency", frequency)
+    amplitude, frequency = size("amplitude", amplitude), size("frequency", frequency)
     if block.law.depends_on_speed:
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     if one_of("kind", kind, KINDS) == "slender":
@@ -79,8 +79,8 @@ def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """
     if groups.cos_alpha is not None:
         raise ValueError("Argument `groups` must be of slender blocks: a rigid one's alpha is given. Use `motion`.")
-    alpha = groups.strength * positive("amplitude", amplitude)
-    return Block(alpha, positive("frequency", frequency) / groups.frequency_ratio, groups.restitution)
+    alpha = groups.strength * size("amplitude", amplitude)
+    return Block(alpha, size("frequency", frequency) / groups.frequency_ratio, groups.restitution)
 
 
 @arguments
@@ -115,7 +115,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.10, 4.11 and 6.1.
     """
     factor = jnp.cos(block.alpha) if one_of("kind", kind, KINDS) == "rigid" else jnp.ones_like(block.alpha)
-    rotation = block.alpha if amplitude is None else positive("amplitude", amplitude) * factor
+    rotation = block.alpha if amplitude is None else size("amplitude", amplitude) * factor
     return Scales(1 / block.p, rotation, block.p * rotation)
 
 
