@@ -175,9 +175,16 @@ def path_of(name: str, value: Any) -> Path:
 
 def pair(name: str, value: Any) -> tuple:
     """Two values."""
-    if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
+    if isinstance(value, (str, bytes, dict, set, frozenset)) or _length(value) != 2:
         raise ValueError(f"Argument `{name}` must be a pair, but is {shown(value)}.")
     return tuple(value)
+
+
+def _length(value: Any) -> int | None:
+    try:
+        return len(value)
+    except TypeError:  # a number, an array without axes
+        return None
 
 
 def list_of(kind: type | Callable, words: str) -> Check:

@@ -216,7 +216,7 @@ DATA = free_rocking(TIME)
         (dict(block=rk.Block(np.array([0.1, 0.2]), np.array([2.0, 2.0]))), "`block` must hold one scene"),
         (dict(block=rk.Block(0.2, 2.5, 1.0)), "`restitution` can be fitted only from within its range"),
         (dict(time=np.zeros(0), rotation=np.zeros(0)), "`rotation` must hold measurements"),
-        (dict(starts=0), "`starts` must be a whole number, at least 1"),
+        (dict(starts=0), "`starts` must be a whole number from 1 to"),
         (dict(spread=-0.1), "`spread` must be positive"),
     ],
 )

@@ -216,7 +216,7 @@ def test_samples_need_numpyro(monkeypatch):
 @pytest.mark.parametrize("name", ["effective_size", "steps"])
 def test_samples_need_good_arguments(name):
     pytest.importorskip("numpyro", reason="samples need NumPyro")
-    with pytest.raises(ValueError, match=f"`{name}` must be a whole number, at least 1"):
+    with pytest.raises(ValueError, match=f"`{name}` must be a whole number from 1 to"):
         rk.sample_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, **{name: 0})
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import Values, scalar, span
+from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
@@ -157,6 +158,7 @@ def simulate_flexible(
 
 
 def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None) -> Scalar:
+    check_single(block=block, motion=motion)
     if motion.vertical_bounds is not None:
         raise ValueError(
             "Argument `motion` must not be vertical for a FlexibleBlock, whose base does not weigh anything."

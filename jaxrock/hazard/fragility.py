@@ -106,10 +106,18 @@ class TabulatedFragility(AbstractFragility):
 def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
     """Return `value` as an array of two positive levels or more, each above the one before."""
     array = as_real(name, value)
-    if array.ndim == 0 or array.shape[-1] < 2:
+    if array.ndim == 0 or array.shape[-1] < 2 or array.size == 0:
         raise ValueError(f"Argument `{name}` must hold at least two levels, but has shape {array.shape}.")
     allowed = "be positive and finite, and rise from level to level"
     return checked(name, array, allowed, lambda x: (jnp.diff(x, prepend=0.0) > 0) & (x < jnp.inf))
+
+
+def rising_list(name: str, value: Values) -> Inexact[Array, " n"]:
+    """The same, of one list."""
+    array = rising(name, value)
+    if array.ndim > 1:
+        raise ValueError(f"Argument `{name}` must be a list of levels, but has shape {array.shape}.")
+    return array
 
 
 def outcomes(toppled: Values, levels: Real, trials: Real) -> Real:

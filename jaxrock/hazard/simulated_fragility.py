@@ -19,7 +19,7 @@ from jaxrock._checks import Values, one_of
 from jaxrock._parameters import one_of_many
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising
+from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising_list
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion, Scaled
@@ -193,7 +193,7 @@ def simulated_fragility(
 
     **Source:** Vamvatsikos & Cornell (2002), scaled records; Jalayer & Cornell (2009), stripes.
     """
-    levels = rising("levels", levels)
+    levels = rising_list("levels", levels)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
     factors = _factors(levels, suite.peak_acceleration, suite.peak_velocity, measure)
     blocks = stacked(block)

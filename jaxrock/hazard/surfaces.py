@@ -36,7 +36,7 @@ from jaxrock.hazard.fragility import (
     outcomes,
     probit,
     probit_line,
-    rising,
+    rising_list,
 )
 from jaxrock.hazard.simulated_fragility import STOOD, TOPPLED, UNDECIDED, SimulatedFragility, counts, stacked, verdicts
 from jaxrock.models.equation import AbstractEquation
@@ -271,7 +271,7 @@ def simulated_surface(
 
     **Source:** Purvance, Anooshehpoor & Brune (2008), the two measures.
     """
-    acceleration, ratio = rising("acceleration", acceleration), rising("ratio", ratio)
+    acceleration, ratio = rising_list("acceleration", acceleration), rising_list("ratio", ratio)
     if not pulses:
         raise ValueError("Argument `pulses` must hold at least one pulse, but is empty.")
     blocks, parts = stacked(block), []

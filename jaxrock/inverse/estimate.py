@@ -116,7 +116,7 @@ def estimate_motion(
     scatter: ArrayLike = 0.3,
     *,
     lapse: ArrayLike = 0.02,
-    starts: Annotated[int, at_least(1)] = 64,
+    starts: Annotated[int, at_least(1, 10**6)] = 64,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,

@@ -117,7 +117,7 @@ def fit_history(
     initial: Annotated[tuple[float, float] | None, pair] = None,
     scatter: Values | None = None,
     spread: float = 0.2,
-    starts: Annotated[int, at_least(1)] = 8,
+    starts: Annotated[int, at_least(1, 10**6)] = 8,
     seed: Annotated[int, at_least(0)] = 0,
     engine: AbstractEngine | None = None,
 ) -> HistoryFit:

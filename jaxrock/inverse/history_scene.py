@@ -18,7 +18,7 @@ from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import RectangularPulse
-from jaxrock.responses.arguments import engine_of
+from jaxrock.responses.arguments import engine_of, start_of
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.history import simulate
 from jaxrock.status import Status
@@ -63,7 +63,7 @@ class FittedScene(eqx.Module):
         if engine is None:
             engine = Series(order=8, tolerance=1e-10) if model.is_series else engine_of(None, model)
         model = current_model(model, block, motion)
-        return cls(names, block, motion, model, tuple(jnp.asarray(float(x)) for x in initial), engine)
+        return cls(names, block, motion, model, start_of(initial), engine)
 
     @property
     def logarithmic(self) -> np.ndarray:

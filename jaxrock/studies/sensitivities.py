@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, as_real, not_nan
+from jaxrock._checks import Values, as_real, not_nan, scalar
+from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import uplift_threshold
@@ -174,8 +175,9 @@ def sensitivity_map(
     **Source:** Voyagaki, Psycharis & Mylonakis (2012), 2.1 (the pulse) and 2.2 (its dimensionless parameters).
     """
     strength, duration = axis("uplift_strength", uplift_strength), axis("pulse_duration", pulse_duration)
-    shape, alpha = not_nan("shape", shape), as_real("alpha", alpha)
+    shape, alpha = scalar("shape", not_nan("shape", shape)), as_real("alpha", alpha)
     block = Block(alpha, 1.0, restitution)  # raises here, where values are known
+    check_single(block=block)
     model = current_model(model, block, shape, strength, duration)
     scene = shape, block.alpha, scaled_law(block), model, engine
     sensitivities = surface(_under_lobe, (strength, duration), scene, "sensitivity", progress)

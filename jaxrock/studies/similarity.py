@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, not_nan, one_of, positive, share
+from jaxrock._checks import as_real, not_nan, one_of, positive, share, size
 from jaxrock._parameters import declared
 from jaxrock.blocks.rigid import Block
 from jaxrock.motions.pulses.pulse import AbstractPulse
@@ -104,7 +104,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
 
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.11 (slender) and 5.3 (rigid).
     """
-    amplitude, frequency = positive("amplitude", amplitude), positive("frequency", frequency)
+    amplitude, frequency = size("amplitude", amplitude), size("frequency", frequency)
     if block.law.depends_on_speed:
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     if one_of("kind", kind, KINDS) == "slender":
@@ -125,8 +125,8 @@ def groups_of(block: Block, pulse: AbstractPulse, kind: str = "rigid") -> Groups
 
     **Source:** Voyagaki, Psycharis & Mylonakis (2012), 2.2; Dimitrakopoulos & DeJong (2012), 4.11 and 5.3.
     """
-    (size, extent), others = _parts(type(pulse))
-    found = groups(block, jnp.abs(getattr(pulse, size)), 2 * jnp.pi / getattr(pulse, extent), kind)
+    (peak, extent), others = _parts(type(pulse))
+    found = groups(block, jnp.abs(getattr(pulse, peak)), 2 * jnp.pi / getattr(pulse, extent), kind)
     rates = {name: block.p if is_time else 1.0 for name, is_time in others.items()}
     return eqx.tree_at(lambda g: g.others, found, {name: getattr(pulse, name) * rate for name, rate in rates.items()})
 
@@ -146,8 +146,8 @@ def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """
     if groups.cos_alpha is not None:
         raise ValueError("Argument `groups` must be of slender blocks: a rigid one's alpha is given. Use `motion`.")
-    alpha = groups.strength * positive("amplitude", amplitude)
-    return Block(alpha, positive("frequency", frequency) / groups.frequency_ratio, groups.restitution)
+    alpha = groups.strength * size("amplitude", amplitude)
+    return Block(alpha, size("frequency", frequency) / groups.frequency_ratio, groups.restitution)
 
 
 @arguments
@@ -185,7 +185,7 @@ def scales(block: Block, amplitude: ArrayLike | None = None, kind: str = "rigid"
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.10, 4.11 and 6.1.
     """
     factor = jnp.cos(block.alpha) if one_of("kind", kind, KINDS) == "rigid" else jnp.ones_like(block.alpha)
-    rotation = block.alpha if amplitude is None else positive("amplitude", amplitude) * factor
+    rotation = block.alpha if amplitude is None else size("amplitude", amplitude) * factor
     return Scales(1 / block.p, rotation, block.p * rotation)
 
 
