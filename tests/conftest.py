@@ -39,14 +39,27 @@ jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
 
 
+_MOST_GROWTH = 2.5e9  # bytes of compiled programs
+_held = [0.0]  # by the process when they were last forgotten
+
+
+def _memory() -> float:
+    """Bytes that this process holds; zero where that cannot be told."""
+    told = Path("/proc/self/statm")
+    return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0.0
+
+
 @pytest.fixture(autouse=True)
 def few_compiled_programs():
-    """Forget compiled programs before they are too many: each maps pages, and past 65,530 maps XLA crashes on Linux."""
+    """Forget compiled programs before they are too many: each takes memory, and maps pages, and past 65,530 maps XLA
+    crashes on Linux."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 30_000:
+    many = maps.exists() and maps.read_bytes().count(b"\n") > 30_000
+    if many or _memory() > _held[0] + _MOST_GROWTH:
         jax.clear_caches()
         gc.collect()
+        _held[0] = _memory()
 
 
 @pytest.fixture(scope="session")
