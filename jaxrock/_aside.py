@@ -4,10 +4,13 @@ import concurrent.futures
 import contextlib
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+_ATTEMPTS, _BETWEEN = 40, 0.05  # to remove what is left over; seconds between them
 
 
 @contextlib.contextmanager
@@ -31,11 +34,20 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
         if lasting:
             _reach_the_disk(path.parent)
     finally:
+        _remove(aside)
+
+
+def _remove(aside: Path) -> None:
+    """Remove what is there, also while a thread of a library that was interrupted goes on writing for a moment."""
+    for _ in range(_ATTEMPTS):
         if aside.is_dir():
             shutil.rmtree(aside, ignore_errors=True)
         else:
             with contextlib.suppress(OSError):
                 aside.unlink(missing_ok=True)
+        if not aside.exists():
+            return
+        time.sleep(_BETWEEN)
 
 
 def _reach_the_disk(file: Path) -> None:
