@@ -158,8 +158,8 @@ BAD = {
     "duration negative": (lambda: rk.simulate(BLOCK, SINE, duration=-1.0), "duration", POSITIVE, "-1.0"),
     "duration NaN": (lambda: rk.simulate(BLOCK, SINE, duration=NAN), "duration", POSITIVE, "nan"),
     "duration inf": (lambda: rk.simulate(BLOCK, SINE, duration=INF), "duration", POSITIVE, "inf"),
-    "samples 1": (lambda: rk.simulate(BLOCK, SINE, samples=1), "samples", "be a whole number, at least 2", "1"),
-    "samples 0": (lambda: rk.simulate(BLOCK, SINE, samples=0), "samples", "be a whole number, at least 2", "0"),
+    "samples 1": (lambda: rk.simulate(BLOCK, SINE, samples=1), "samples", "be a whole number from 2 to 10000000", "1"),
+    "samples 0": (lambda: rk.simulate(BLOCK, SINE, samples=0), "samples", "be a whole number from 2 to 10000000", "0"),
     # Engine
     "order 3": (lambda: rk.Series(order=3), "order", "be a whole number from 4 to 64", "3"),
     "order 0": (lambda: rk.Series(order=0), "order", "be a whole number from 4 to 64", "0"),
