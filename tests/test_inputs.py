@@ -530,3 +530,11 @@ for make, words in (
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["Housner", "Linear"])
+def test_a_block_that_is_balanced_exactly_is_too_close_to_call(model):
+    """It would go nowhere until all steps are used up, which says nothing."""
+    engine = rk.Series(order=4, max_steps=100)
+    result = rk.outcome(BLOCK, 0 * SINE, model, initial=(0.2, 0.0), engine=engine)
+    assert result.status == rk.Status.undecided
