@@ -583,6 +583,7 @@ def attacks(draw, names: list[str]) -> tuple[str, dict[str, Any]]:
     return name, given
 
 
+_FUNCTIONS = ("pulse", "pulses", "motion", "form", "function", "restoring", "arm", "dissipation")
 _INTERNAL = re.compile(r"Tracer|Traced<|jaxpr|XlaRuntime|INTERNAL|equinox|ShapedArray|dtype\(|_checks|0x[0-9a-f]{6}")
 _NAMED = re.compile(r"`[^`]+`|^File |(missing|unexpected) .*argument|unsupported operand|Use jax\.vmap")
 
@@ -596,6 +597,9 @@ def verdict(name: str, given: dict[str, Any]) -> str | None:
             result = call.function(**given)
             jax.block_until_ready(jax.tree.leaves(result))
     except (ValueError, TypeError) as error:
+        given = {place: value for place, value in given.items() if value is not call.good.get(place)}
+        if any(callable(given.get(place)) for place in _FUNCTIONS):
+            return None  # what a user's function raises is its own
         return _of_refusal(error)
     except OSError as error:
         return None if name.startswith("read_") else f"{type(error).__name__}: {error}"

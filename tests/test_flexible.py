@@ -340,7 +340,7 @@ def test_wrong_durations():
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.01)
     with pytest.raises(ValueError, match="`duration` must be positive"):
         rk.simulate_flexible(block, PULSE, duration=0.0)
-    with pytest.raises(ValueError, match="`samples` must be a whole number, at least 2"):
+    with pytest.raises(ValueError, match="`samples` must be a whole number from 2"):
         rk.simulate_flexible(block, PULSE, samples=1)
 
 

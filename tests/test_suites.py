@@ -226,7 +226,7 @@ RECORD = rk.Record([0.0, 0.3, 0.0], 0.4)
             "`levels` must be positive and finite, and rise",
         ),
         (lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], measure="SA"), "`measure` must be one of 'PGA'"),
-        (lambda: rk.draw_blocks(rk.Block(0.2, 2.0), 0), "`draws` must be a whole number, at least 1"),
+        (lambda: rk.draw_blocks(rk.Block(0.2, 2.0), 0), "`draws` must be a whole number from 1"),
         (lambda: rk.draw_blocks(rk.Block(0.2, 2.0), 9, p=-1.0), "`p` must be 0 or more"),
         (lambda: rk.simulated_surface(BLOCKS, [], [0.1, 0.2], [0.1, 0.2]), "`pulses` must hold at least one pulse"),
         (lambda: table(np.zeros((1, 2, 1))).counts("middle"), "`bound` must be one of 'lower', 'upper'"),

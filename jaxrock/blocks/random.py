@@ -19,7 +19,7 @@ def _deviation(name: str, value: ArrayLike) -> float:
 @arguments
 def draw_blocks(
     block: Block,
-    draws: Annotated[int, at_least(1, 10**9)],
+    draws: Annotated[int, at_least(1, 10**7)],
     *,
     alpha: Annotated[float, _deviation] = 0.0,
     p: Annotated[float, _deviation] = 0.0,

@@ -136,7 +136,7 @@ def simulate_flexible(
     motion: AbstractMotion,
     *,
     duration: ArrayLike | None = None,
-    samples: Annotated[int, at_least(2)] = 2001,
+    samples: Annotated[int, at_least(2, 10**7)] = 2001,
     max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
 ) -> FlexibleResponse:
     """Compute the history of a flexible block under a motion.

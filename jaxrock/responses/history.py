@@ -175,7 +175,7 @@ def simulate(
     initial: Annotated[tuple[ArrayLike, ArrayLike], pair] = (0.0, 0.0),
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
-    samples: Annotated[int, at_least(2)] = 2001,
+    samples: Annotated[int, at_least(2, 10**7)] = 2001,
 ) -> Response | FlexibleResponse:
     """Compute the history of a block under a motion.
 
