@@ -83,21 +83,22 @@ def _taken(path: Path) -> FileExistsError:
     return FileExistsError(f"{path} was made by somebody else meanwhile.")
 
 
-def uninterrupted(function: Callable, *given: Any, stop: Callable[[BaseException], None] = lambda error: None) -> Any:
+def uninterrupted(function: Callable, *given: Any, stop: Callable[[], None] = lambda: None) -> Any:
     """Call a function to its end, whoever interrupts: then it is waited for, and what came is raised.
 
     It runs in a thread of its own, as interrupts come to the main thread. Libraries in C, and those with threads of
-    their own, go on writing after an exception, or cannot close what they were writing.
+    their own, go on writing after an exception, or cannot close what they were writing; and what cleans up after an
+    exception can be interrupted like anything else.
 
     **Arguments:**
 
-    - `stop`: called with what came, while the function is still running.
+    - `stop`: called when something came while the function is still running.
     """
     with concurrent.futures.ThreadPoolExecutor(1) as alone:
         running = alone.submit(function, *given)
         try:
             return running.result()
-        except BaseException as error:
+        except BaseException:
             if not running.done():
-                stop(error)
+                stop()
             raise

@@ -1,5 +1,6 @@
 """Results over labelled axes, and their way into files and xarray."""
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Num
 
-from jaxrock._aside import written_aside
+from jaxrock._aside import uninterrupted, written_aside
 from jaxrock.sweeps import netcdf
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, needed, own_names, shape_of
@@ -97,16 +98,24 @@ class Grid(eqx.Module):
         for name, leaf in (self.axes | self._leaves()).items():
             if leaf.dtype.kind not in "biuf" or leaf.dtype == np.float16:
                 raise ValueError(f"NetCDF has no {leaf.dtype}, which {name!r} is: take a path that ends with .zarr.")
-        netcdf.write(self.to_xarray(), path)
+        stopped = threading.Event()
+        uninterrupted(netcdf.write, self.to_xarray(), path, stopped, stop=stopped.set)
 
     def _to_zarr(self, path: Path) -> None:
         axes, leaves = {name: np.asarray(values) for name, values in self.axes.items()}, self._leaves()
         plan = Plan.of(tuple(axes.values()), self.outer)
         like = {name: jax.ShapeDtypeStruct(x.shape[len(self.shape) :], x.dtype) for name, x in leaves.items()}
-        with written_aside(path) as aside:
-            store = create(aside, axes, self.outer, like, plan.block, fingerprint(axes, self.outer, "saved results"))
-            for number in range(store.count):
-                store.write(number, [leaf[plan.place(number)] for leaf in leaves.values()])
+        made_by, stopped = fingerprint(axes, self.outer, "saved results"), threading.Event()
+
+        def written():
+            with written_aside(path) as aside:
+                store = create(aside, axes, self.outer, like, plan.block, made_by)
+                for number in range(store.count):
+                    if stopped.is_set():
+                        raise InterruptedError
+                    store.write(number, [leaf[plan.place(number)] for leaf in leaves.values()])
+
+        uninterrupted(written, stop=stopped.set)
 
     @classmethod
     def load(cls, path: str | Path) -> "Grid":

@@ -5,9 +5,10 @@ it cannot write.
 """
 
 import hashlib
+import threading
 from pathlib import Path
 
-from jaxrock._aside import uninterrupted, written_aside
+from jaxrock._aside import written_aside
 from jaxrock.sweeps.labels import needed
 
 _MARK = b"\njaxrock sha256 "
@@ -20,19 +21,17 @@ class _Patient:
     HDF5 cannot close a file that it could not write, and Python ends with a segmentation fault when it tries again.
     """
 
-    def __init__(self, file):
-        self._file, self.error = file, None
-
-    def stop(self, error: BaseException) -> None:
-        """Let nothing be written any more."""
-        self.error = self.error or error
+    def __init__(self, file, stopped: threading.Event):
+        self._file, self._stopped, self.error = file, stopped, None
 
     def _try(self, does, *given):
+        if self._stopped.is_set():
+            self.error = self.error or InterruptedError()
         if self.error is None:
             try:
                 return does(*given)
             except BaseException as error:
-                self.stop(error)
+                self.error = error
         return None
 
     def _write(self, at: int, data) -> None:
@@ -85,20 +84,16 @@ class _Patient:
         """Nothing waits in memory."""
 
 
-def write(dataset, path: Path) -> None:
-    """Write an `xarray.Dataset` to a new file, all of it or nothing."""
+def write(dataset, path: Path, stopped: threading.Event) -> None:
+    """Write an `xarray.Dataset` to a new file, all of it or nothing; nothing where it is stopped."""
     h5netcdf, backends = needed("h5netcdf"), needed("xarray.backends")
-
-    def written(file):
-        with h5netcdf.File(file, "w") as opened:
-            dataset.dump_to_store(backends.H5NetCDFStore(opened))
-
     with written_aside(path) as aside, aside.open("w+b", buffering=0) as file:
-        patient = _Patient(file)
+        patient = _Patient(file, stopped)
         try:
-            uninterrupted(written, patient, stop=patient.stop)
+            with h5netcdf.File(patient, "w") as opened:
+                dataset.dump_to_store(backends.H5NetCDFStore(opened))
         except BaseException as error:
-            patient.stop(error)
+            patient.error = patient.error or error
         if patient.error is not None:
             raise patient.error
         file.seek(0)

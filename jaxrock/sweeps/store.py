@@ -101,9 +101,6 @@ class Store:
 
     def write(self, number: int, leaves: list[np.ndarray]) -> None:
         """Write one block: its results, and when all are there, its record."""
-        uninterrupted(self._write, number, leaves)
-
-    def _write(self, number: int, leaves: list[np.ndarray]) -> None:
         place = self._plan.place(number)
         for array, leaf in zip(self._arrays, leaves):
             array[place] = leaf.view(np.int8) if leaf.dtype == bool else leaf
@@ -221,6 +218,10 @@ def made_or_mended(
     made_by: dict[str, str],
 ) -> list[Path]:
     """See that there is a store of a sweep, whose axes and description are good; which files were damaged."""
+    return uninterrupted(_made_or_mended, path, axes, outer, leaves, block, made_by)
+
+
+def _made_or_mended(path, axes, outer, leaves, block, made_by) -> list[Path]:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -254,10 +255,6 @@ def create(
     made_by: dict[str, str],
 ) -> Store:
     """Make a store of which no block is done. `leaves`: results by name, as of one point."""
-    return uninterrupted(_create, path, axes, outer, leaves, block, made_by)
-
-
-def _create(path, axes, outer, leaves, block, made_by) -> Store:
     zarr = needed("zarr")
     for name, values in (axes | leaves).items():
         if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least
+from jaxrock._aside import uninterrupted
 from jaxrock._progress import Progress
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import exchange, meet, process, shared_out
@@ -225,7 +226,7 @@ def compute(
 
 def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:
     try:
-        store.write(number, leaves)
+        uninterrupted(store.write, number, leaves)
     except OSError as error:
         said = f"{error.strerror or error}. Blocks that are finished are kept: the same sweep goes on from there"
         raise OSError(error.errno, said, str(store.path)) from error
