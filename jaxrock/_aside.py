@@ -1,6 +1,6 @@
 """Files and folders that are there whole or not at all: they are written aside, and renamed."""
 
-import concurrent.futures
+import _thread
 import contextlib
 import os
 import shutil
@@ -94,11 +94,36 @@ def uninterrupted(function: Callable, *given: Any, stop: Callable[[], None] = la
 
     - `stop`: called when something came while the function is still running.
     """
-    with concurrent.futures.ThreadPoolExecutor(1) as alone:
-        running = alone.submit(function, *given)
-        try:
-            return running.result()
-        except BaseException:
-            if not running.done():
-                stop()
-            raise
+    # The threads of the standard library are written in Python, and an interrupt in the middle of them breaks their
+    # locks: these are in C.
+    whose, done = _thread.allocate_lock(), _thread.allocate_lock()
+    found: list[tuple[Any, BaseException | None]] = []
+
+    def run():
+        if whose.acquire(blocking=False):
+            try:
+                found.append((function(*given), None))
+            except BaseException as error:
+                found.append((None, error))
+            finally:
+                done.release()
+
+    done.acquire()
+    try:
+        _thread.start_new_thread(run, ())
+        done.acquire()
+    except BaseException:
+        if not whose.acquire(blocking=False):  # it has begun; otherwise it never will
+            stop()
+            _wait(done, found)
+        raise
+    result, error = found[0]
+    if error is not None:
+        raise error
+    return result
+
+
+def _wait(done: _thread.LockType, found: list) -> None:
+    while not found:  # however often somebody interrupts
+        with contextlib.suppress(KeyboardInterrupt):
+            done.acquire(timeout=_BETWEEN)
