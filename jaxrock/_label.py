@@ -17,3 +17,6 @@ class Label:
 
     def __hash__(self):
         return 0
+
+    def __repr__(self):
+        return repr(self.value)

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
+from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
@@ -51,6 +52,8 @@ class AsymmetricBlock(eqx.Module):
     inertia_ratio: Real = parameter("-", ratio_of_inertia)
     given_radius_ratio: Real | None = parameter("-", ratio, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
+
+    __repr__ = described
 
     def __init__(
         self,

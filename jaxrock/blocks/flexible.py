@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, below_one, checked, one_of, size, whole
+from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
@@ -64,6 +65,8 @@ class FlexibleBlock(eqx.Module):
     damping: str = eqx.field(static=True)
     impacts: str = eqx.field(static=True)
     base: str = eqx.field(static=True)
+
+    __repr__ = described
 
     def __init__(
         self,

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, checked, not_negative, share, size, together
+from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -53,6 +54,8 @@ class Corners(NamedTuple):
 
 class AbstractRestitution(eqx.Module):
     """A law of restitution. Its fields are parameters, such as derivatives are taken by."""
+
+    __repr__ = described
 
     @abc.abstractmethod
     def ratio(self, corners: Corners, speed: Real) -> Real:

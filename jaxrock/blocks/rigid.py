@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import acute, rate, size, together
+from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.restitution import (
     AbstractRestitution,
@@ -41,6 +42,8 @@ class Block(eqx.Module):
     alpha: Inexact[Array, "..."] = parameter("rad", acute)
     p: Inexact[Array, "..."] = parameter("rad/s", rate)
     law: AbstractRestitution
+
+    __repr__ = described
 
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None):
         set_parameters(self, alpha=alpha, p=p)

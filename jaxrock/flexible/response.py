@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import Values, scalar, span
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -35,7 +36,9 @@ class FlexibleResponse(eqx.Module):
     displacement: Inexact[Array, "..."]
     bending: Inexact[Array, "..."]
     outcome: FlexibleOutcome
-    trajectory: Trajectory
+    trajectory: Trajectory = eqx.field(repr=False)
+
+    __repr__ = described
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Base rotation [rad], displacement of the top [m], and its bending part [m].

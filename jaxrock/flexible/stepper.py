@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
+from jaxrock._described import described
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
@@ -60,6 +61,8 @@ class FlexibleOutcome(eqx.Module):
     overturned: Bool[Array, "..."]
     energy: Scalar
     status: Status
+
+    __repr__ = described
 
 
 class FlexibleScene(eqx.Module):

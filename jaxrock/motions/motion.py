@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, delay, factor, if_known, not_nan
+from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.lookup import count_up_to
@@ -24,6 +25,8 @@ Scalar = Inexact[ArrayLike, ""]
 
 class AbstractMotion(eqx.Module):
     """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
+
+    __repr__ = described
 
     @property
     @abc.abstractmethod

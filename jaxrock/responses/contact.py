@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
@@ -41,6 +42,8 @@ class Contact(eqx.Module):
     friction_at_impact: tuple[Scalar, Scalar]
     largest_friction: Scalar
     least_normal: Scalar
+
+    __repr__ = described
 
     @property
     def keeps_contact(self):

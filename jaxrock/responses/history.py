@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, scalar, span
+from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
@@ -39,6 +40,8 @@ class Summary(eqx.Module):
     margin: Scalar
     status: Status
 
+    __repr__ = described
+
 
 class Response(eqx.Module):
     """The history of a scene; call it with times to evaluate it anywhere: `rotation, velocity = response(t)`.
@@ -57,7 +60,9 @@ class Response(eqx.Module):
     rotation: Inexact[Array, "..."]
     velocity: Inexact[Array, "..."]
     summary: Summary
-    trajectory: Trajectory
+    trajectory: Trajectory = eqx.field(repr=False)
+
+    __repr__ = described
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Rotation and angular velocity.

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, pair
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -73,6 +74,8 @@ class Outcome(eqx.Module):
     clearance: Scalar
     error: Scalar
     status: Status
+
+    __repr__ = described
 
 
 @arguments

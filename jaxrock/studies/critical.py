@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import ratio, scalar
+from jaxrock._described import described
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -61,6 +62,8 @@ class Critical(eqx.Module):
     derivative: Float[Array, "..."]
     complete: Bool[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    __repr__ = described
 
     @property
     def lowest(self) -> Float[Array, "..."]:

@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan, scalar
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -64,6 +65,8 @@ class Sensitivity(eqx.Module):
     condition: Scalar
     graze_distance: Scalar
     boundary_distance: Scalar
+
+    __repr__ = described
 
 
 _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")

@@ -1,0 +1,56 @@
+"""What the documentation says runs, and its links lead somewhere."""
+
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+# Recipes are tried by tests/test_log_density.py, and many processes by tests/test_distributed.py.
+ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md", "README.md"}
+
+
+def snippets(page):
+    """The lines of Python of a page, at the places where they stand."""
+    lines, inside = [], False
+    for line in (ROOT / page).read_text().splitlines():
+        fence = line.startswith("```")
+        inside = line.strip() == "```python" if fence else inside
+        lines.append(line if inside and not fence else "")
+    return "\n".join(lines)
+
+
+QUICK = {"docs/index.md", "docs/concepts/flow_guard_reset.md", "docs/concepts/margin_error_status.md"}
+
+
+def pages_with_snippets():
+    for page in PAGES:
+        if page not in ELSEWHERE and snippets(page).strip():
+            yield pytest.param(page, marks=[] if page in QUICK else pytest.mark.slow)
+
+
+@pytest.mark.parametrize("page", list(pages_with_snippets()))
+def test_every_snippet_of_a_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(snippets(page), page, "exec"), {"__name__": "__main__"})
+    plt.close("all")
+
+
+def anchors(text):
+    """Names of the headings of a page, as readers of Markdown make them."""
+    told = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in told}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_of_a_page_leads_somewhere(page):
+    text = (ROOT / page).read_text()
+    for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = ((ROOT / page).parent / path).resolve() if path else ROOT / page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text()), link
