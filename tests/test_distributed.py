@@ -69,6 +69,7 @@ def job(count, folder, out, kind="chaotic", kill=-1):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))} | {"JAX_PLATFORMS": "cpu"}
+    environment["JAXROCK_CACHE"] = str(out.parent / "kept")  # jobs of one test compile once
     processes = []
     for own in range(count):
         dies = kill if own == count - 1 else -1

@@ -107,10 +107,14 @@ def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
     e = np.linspace(-4.5, 4.5, 3001)
     factors = np.exp(0.3 * e)
     exact = np.empty_like(found)
+    grid = np.geomspace(amplitude[0] * factors[0], amplitude[-1] * factors[-1], 12_000)
+    scenes = [  # there are three blocks only
+        rk.sweep(rotation_of, outer=False, progress=False, amplitude=grid, alpha=0 * grid + alpha[i],
+                 p=0 * grid + p[i]).values  # fmt: skip
+        for i in range(3)
+    ]  # fmt: skip
     for i in range(12):
-        grid = np.geomspace(amplitude[0] * factors[0], amplitude[-1] * factors[-1], 12_000)
-        scene = rk.sweep(rotation_of, outer=False, progress=False, amplitude=grid, alpha=0 * grid + alpha[i],
-                         p=0 * grid + p[i]).values  # fmt: skip
+        scene = scenes[i % 3]
         density = np.exp(-(((peak[i] - scene["peak"]) / sd[i]) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd[i])
         density = np.where(scene["lost"], 0.0, density)
         weight = np.exp(-((np.log(grid / amplitude[:, None]) / 0.3) ** 2) / 2) / (np.sqrt(2 * np.pi) * 0.3)

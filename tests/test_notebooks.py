@@ -28,8 +28,9 @@ def rows():
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("path", list(rows()))
-def test_notebook(path, monkeypatch):
+def test_notebook(path, monkeypatch, tmp_path_factory):
     monkeypatch.setenv("JAXROCK_NOTEBOOK_POINTS", "24")
+    monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path_factory.getbasetemp() / "kept for notebooks"))
     notebook = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
 
