@@ -1,4 +1,4 @@
-"""What a sweep costs: `python benchmarks/scale.py` writes `scale.md`, of which `docs/how_to/cluster.md` makes its estimates.
+"""What a sweep costs: `python benchmarks/scale.py` writes `scale.md`; `docs/how_to/cluster.md` estimates by it.
 
 Is the cost proportional to the number of responses? Is the memory bounded? What do compiling, a store and a second
 device do? Sine pulses on blocks of one slenderness, nonlinear, over frequency and intensity (`rk.sweep` of

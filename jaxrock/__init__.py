@@ -5,8 +5,8 @@ rotation; `alpha` is the slenderness angle, `p` the frequency parameter [rad/s],
 velocity after an impact over that before it.
 """
 
-import importlib
-from typing import TYPE_CHECKING
+import importlib as _importlib
+import typing as _typing
 
 from jaxrock import closed_form as closed_form
 from jaxrock._parameters import parameter as parameter
@@ -131,7 +131,7 @@ from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
 from jaxrock.sweeps.grid import Grid as Grid
 from jaxrock.sweeps.sweep import sweep as sweep
 
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from jaxrock import plot as plot
     from jaxrock.engines.diffrax.arcs import Diffrax as Diffrax
 
@@ -141,7 +141,7 @@ __version__ = "0.1.0"
 def __getattr__(name: str):
     # Few programs that compute draw figures, or solve by Diffrax: both are imported when they are first used.
     if name == "plot":
-        return importlib.import_module("jaxrock.plot")
+        return _importlib.import_module("jaxrock.plot")
     if name == "Diffrax":
-        return importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
+        return _importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
     raise AttributeError(f"module 'jaxrock' has no attribute {name!r}")

@@ -375,6 +375,12 @@ def test_bad_words(capsys, words, error):
     assert re.match(r"jaxrock( run| map)?: error: ", last) and error in last
 
 
+def test_version(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--version"])
+    assert capsys.readouterr().out == f"jaxrock {rk.__version__}\n"
+
+
 def test_folder_that_is_a_file(capsys, at2, tmp_path):
     (tmp_path / "out").write_text("in the way")
     assert main(["run", at2, *GIVEN, "--out", str(tmp_path / "out")]) == 2

@@ -1,15 +1,18 @@
 """What the documentation says runs, and its links lead somewhere."""
 
 import re
+import types
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
 
+import jaxrock as rk
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 # Recipes are tried by tests/test_log_density.py, and many processes by tests/test_distributed.py.
-ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md", "README.md"}
+ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md"}
 
 
 def snippets(page):
@@ -22,7 +25,7 @@ def snippets(page):
     return "\n".join(lines)
 
 
-QUICK = {"docs/index.md", "docs/concepts/flow_guard_reset.md", "docs/concepts/margin_error_status.md"}
+QUICK = {"README.md", "docs/index.md", "docs/concepts/flow_guard_reset.md", "docs/concepts/margin_error_status.md"}
 
 
 def pages_with_snippets():
@@ -54,3 +57,10 @@ def test_every_link_of_a_page_leads_somewhere(page):
         target = ((ROOT / page).parent / path).resolve() if path else ROOT / page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target.read_text()), link
+
+
+def test_every_public_name_has_its_place():
+    text = "".join((ROOT / "docs" / page).read_text() for page in ("names.md", "api.md"))
+    public = [name for name in dir(rk) if name[0] != "_" and not isinstance(getattr(rk, name), types.ModuleType)]
+    assert len(public) > 80
+    assert not [name for name in public if not re.search(rf"\b{name}\b", text)]

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -33,6 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     shared = {"epilog": _EPILOG, "formatter_class": argparse.RawDescriptionHelpFormatter}
     description = "Rocking and overturning of free-standing blocks under earthquakes."
     parser = argparse.ArgumentParser(prog="jaxrock", description=description, **shared)
+    parser.add_argument("--version", action="version", version=f"jaxrock {version('jaxrock')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():
         sub = commands.add_parser(command.name, help=command.purpose, description=command.purpose, **shared)
