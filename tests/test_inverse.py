@@ -10,6 +10,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
+from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.scatter import rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import climb
@@ -370,6 +371,16 @@ def test_a_file_of_rocks(tmp_path):
     assert seen.names == ("a", "b")
 
 
+def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["invert", "--example"])
+    path = tmp_path / "rocks.csv"
+    path.write_text(capsys.readouterr().out)
+    seen = rk.read_observations(path)
+    assert [SEEN[k] for k in np.asarray(seen.seen)] == ["toppled", "rotation", "survived", "survived"]
+    np.testing.assert_allclose(seen.rotation[1], np.deg2rad(5.1))
+
+
 @pytest.mark.parametrize(
     "line, message",
     [
@@ -377,7 +388,7 @@ def test_a_file_of_rocks(tmp_path):
         ("a,10,0.5,-1,0,,toppled,,", "line 2: `half_diagonal_m` must be positive"),
         ("a,10,0.5,1,0,1.5,toppled,,", r"line 2: Argument `restitution` must be in \[0, 1\]"),
         ("a,70,0.5,1,0,,toppled,,", "line 2: Argument `alpha` must be at most 0.955"),
-        ("a,10,0.5,1,0,,fell,,", "line 2: `observed` must be survived, toppled, rotation, but is 'fell'"),
+        ("a,10,0.5,1,0,,flew,,", "line 2: `observed` must be survived, toppled, rotation, but is 'flew'"),
         ("a,10,0.5,1,0,,rotation,3,", "line 2: a measured rotation needs a value and a standard deviation"),
         ("a,ten,0.5,1,0,,toppled,,", "line 2: `alpha_deg` must be a number"),
         ("a,10,0.5,1,0,,toppled,", "line 2: has 8 fields, but there are 9 columns"),
@@ -408,6 +419,8 @@ def refused(folder, header, line, message):
         ("alpha_deg,p_rad_per_s,observed,inertia_ratio", "`inertia_ratio`, which is for rocks whose sides differ"),
         ("alpha_deg,alpha_rad,p_rad_per_s,observed", "must have one of the columns alpha_rad, alpha_deg"),
         ("alpha_deg,observed", "must have one of the columns p_rad_per_s"),
+        ("width,height_m,observed", "a column `width`; the nearest that is known: width_m"),
+        ("alpha_deg,p_rad_per_s,observed,xyz", "a column `xyz`; known are alpha1_deg, .*width_m_sd"),
     ],
 )
 def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, message):
@@ -421,7 +434,7 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
         (lambda: rk.Unknown(0.0, 1.0), "`low` must be positive"),
         (lambda: rk.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),
         (lambda: rk.Unknown(-1.0, 1.0, log=False, prior=(-2.0, 0.1)), "`prior` must be within five"),
-        (lambda: rk.Observations([0.1], [2.0], ["fell"]), "`seen` must hold only"),
+        (lambda: rk.Observations([0.1], [2.0], ["flew"]), "`seen` must hold only"),
         (lambda: rk.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
         (lambda: rk.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
         (lambda: rk.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),

@@ -11,6 +11,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import check_points, extent_of, model_of, number, other_parameters
+from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
 
@@ -23,7 +24,19 @@ def _estimated(word: str) -> list[str]:
     return [name for name, default in other_parameters(PULSES[word]).items() if default is Parameter.empty]
 
 
+class _Example(argparse.Action):
+    """Print a file of rocks: an option that needs no other."""
+
+    def __init__(self, **given):
+        super().__init__(nargs=0, **given)
+
+    def __call__(self, parser, *_):
+        print(EXAMPLE, end="")
+        parser.exit()
+
+
 def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--example", action=_Example, help="print an example of such a file, and leave")
     parser.add_argument(
         "rocks",
         help="CSV file of rocks; columns such as alpha_deg,alpha_deg_sd,half_diagonal_m,observed; of two unlike "

@@ -11,12 +11,14 @@ The first line that is not a comment (#) names the columns, with their units; th
   ground acceleration drives the rock from side 1 to side 2, -1 where it stands the other way round; empty is not known.
 - `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the energy that two impacts keep;
   empty is by angular momentum.
-- `observed`: survived, toppled, or rotation; then `rotation_rad` or `rotation_deg` holds the largest |rotation|.
+- `observed`: survived, toppled (stood, fell and the like are understood), or rotation; then `rotation_rad` or
+  `rotation_deg` holds the largest |rotation|.
 - `..._sd` of the measured ones, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A measured
   rotation needs one. Those of side 1 are for both sides, which are off by the same factor.
 """
 
 import csv
+import difflib
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +29,16 @@ from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY
-from jaxrock.inverse.observations import SEEN, Observations
+from jaxrock.inverse.observations import SEEN, Observations, called
+
+EXAMPLE = """\
+# angles in degrees, sizes in metres; _sd: standard deviations; an empty field is not known
+name,alpha_deg,alpha_deg_sd,half_diagonal_m,observed,rotation_deg,rotation_deg_sd
+pedestal,9.2,0.5,0.45,toppled,,
+slab,12.4,0.6,0.80,rocked,5.1,0.8
+boulder,15.1,0.7,0.62,stood,,
+column,18.0,0.5,1.10,stood,,
+"""
 
 _DEGREE = np.pi / 180
 
@@ -119,7 +130,9 @@ def _check_header(file: str, header: list[str]) -> None:
         raise file_error(file, "must separate its fields by commas, not by semicolons.")
     unknown = [name for name in header if name not in _COLUMNS]
     if unknown:
-        raise file_error(file, f"has a column `{unknown[0]}`, but known are {', '.join(sorted(_COLUMNS))}.")
+        near = difflib.get_close_matches(unknown[0], sorted(_COLUMNS), n=3, cutoff=0.5)
+        rest = f"the nearest that is known: {', '.join(near)}" if near else f"known are {', '.join(sorted(_COLUMNS))}"
+        raise file_error(file, f"has a column `{unknown[0]}`; {rest}.")
     twice = [name for name in header if header.count(name) > 1]
     if twice:
         raise file_error(file, f"has the column `{twice[0]}` twice.")
@@ -162,10 +175,9 @@ def _rock(fields: dict[str, str]) -> dict:
                 return empty if value is None else value * factor, (sd or 0.0) * factor
         return empty, 0.0
 
-    fields = fields | {"observed": fields["observed"].lower()}
-    if fields["observed"] not in SEEN:
+    if called(fields["observed"]) is None:
         raise ValueError(f"`observed` must be {', '.join(SEEN)}, but is {fields['observed']!r}.")
-    rock = {"name": fields.get("name", ""), "observed": fields["observed"]}
+    rock = {"name": fields.get("name", ""), "observed": called(fields["observed"])}
     if "width_m" in fields:
         rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))
     elif "alpha1_rad" in fields or "alpha1_deg" in fields:

@@ -17,6 +17,12 @@ from jaxrock.blocks.restitution import Corners, Housner, PerSide
 from jaxrock.blocks.rigid import Block
 
 SEEN = ("survived", "toppled", "rotation")
+_ALSO = {  # what people write, too
+    "survived": ("stood", "stands", "standing", "stable", "survives", "upright"),
+    "toppled": ("fell", "fallen", "falls", "overturned", "overturns", "topples"),
+    "rotation": ("rocked", "measured"),
+}
+_CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
 SURVIVED, TOPPLED, ROTATION = range(3)
 Rocks = Inexact[Array, " rocks"]
 
@@ -254,9 +260,14 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
     if isinstance(seen, str) or len(seen) != count:
         raise ValueError(f"Argument `seen` must have a word for each of {count} rocks, but is {seen!r}.")
     for word in seen:
-        if word not in SEEN:
+        if called(word) is None:
             raise ValueError(f"Argument `seen` must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.")
-    return jnp.asarray([SEEN.index(word) for word in seen])
+    return jnp.asarray([SEEN.index(called(word)) for word in seen])
+
+
+def called(word: str) -> str | None:
+    """What has been seen of a rock, by the name that it has here; None for a word that is not known."""
+    return _CALLED.get(word.strip().lower()) if isinstance(word, str) else None
 
 
 def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
