@@ -200,7 +200,7 @@ def scalar(name: str, array: Inexact[Array, "..."]) -> Inexact[Array, ""]:
 
 def whole(name: str, value: Any, least: int | None = None, most: int | None = None) -> int:
     """Return `value` if it is a whole number, from `least` up to `most`."""
-    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    good = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))  # which NumPy counts
     if not (good and (least is None or value >= least) and (most is None or value <= most)):
         ends = "" if least is None else f", at least {least}" if most is None else f" from {least} to {most}"
         raise ValueError(f"Argument `{name}` must be a whole number{ends}, but is {shown(value)}.")

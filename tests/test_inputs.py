@@ -607,3 +607,26 @@ def test_a_block_that_is_balanced_exactly_is_too_close_to_call(model):
     engine = rk.Series(order=4, max_steps=100)
     result = rk.outcome(BLOCK, 0 * SINE, model, initial=(0.2, 0.0), engine=engine)
     assert result.status == rk.Status.undecided
+
+
+def test_single_precision_among_double():
+    """Numbers of less precision go with the others."""
+    ratio = np.array([0.5, 2.0], np.float32)
+    found = rk.closed_form.sine_pulse.after_pulse_limits(ratio, np.array(0.9))
+    expected = rk.closed_form.sine_pulse.after_pulse_limits(ratio.astype(float), np.array(0.9))
+    np.testing.assert_array_equal(found, expected)
+    response = rk.simulate(BLOCK, SINE)
+    np.testing.assert_array_equal(response(ratio), response(ratio.astype(float)))
+
+
+def test_a_length_of_time_is_no_number():
+    with pytest.raises(ValueError, match="Argument `count` must be a whole number"):
+        rk.use_cpu_devices(np.timedelta64(1, "s"))
+    with pytest.raises(ValueError, match="Argument `rtol` must be a number"):
+        rk.Diffrax(rtol=np.timedelta64(1, "s"))
+
+
+def test_a_hazard_curve_is_not_extended_beyond_numbers():
+    curve = rk.HazardCurve(np.array([0.1, 0.2]), np.array([0.1, 0.01]))
+    with pytest.raises(ValueError, match="Argument `lowest` and `highest` must be levels up to which"):
+        curve.extended(1e-223, 1.0)

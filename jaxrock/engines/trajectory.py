@@ -38,7 +38,8 @@ class Trajectory(eqx.Module):
         """Times within the history."""
         self.check_single()
         end = self.duration * (1 + 1e-12)  # a time computed as the duration may round past it
-        return checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
+        time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
+        return time.astype(jnp.result_type(time, self.duration))
 
     def along(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
         """`follow(node, elapsed)` from the node before each time; results have the shape of `time`."""

@@ -155,7 +155,9 @@ class HazardCurve(eqx.Module):
 
         def law(a, b):
             exponent = jnp.log(rates[a] / rates[b]) / jnp.log(self.levels[b] / self.levels[a])
-            return rates[a] * (levels / self.levels[a]) ** -exponent
+            found = rates[a] * (levels / self.levels[a]) ** -exponent
+            said = "be levels up to which the power laws stay below the largest number"
+            return checked("lowest` and `highest", found, said, lambda rate: rate < jnp.inf)
 
         inner = jnp.pad(rates, 1)
         inner = jnp.where(levels > self.levels[last], law(last - 1, last), inner)

@@ -27,7 +27,8 @@ def elementwise(**checks: Callable) -> Callable:
             given = signature.bind(*args, **kwargs).arguments
             given = {name: checks[name](name, value) for name, value in given.items()}
             together(**given)
-            return compiled(*given.values())
+            kind = jnp.result_type(*given.values())
+            return compiled(*(x.astype(kind) for x in given.values()))
 
         return checked_and_compiled
 
