@@ -154,7 +154,8 @@ def known(allowed: Range) -> Check:
     """One number in a range, which is a setting: no array, and not traced."""
 
     def check(name: str, value: Any) -> float:
-        if isinstance(value, (bool, np.bool_, np.timedelta64)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        number = isinstance(value, (int, float, np.integer, np.floating))
+        if not number or isinstance(value, (bool, np.bool_, np.timedelta64)):
             raise ValueError(f"Argument `{name}` must be a number, but is {shown(value)}.")
         return float(allowed(name, value))
 
