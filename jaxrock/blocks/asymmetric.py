@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
+from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
@@ -52,6 +52,7 @@ class AsymmetricBlock(eqx.Module):
     given_radius_ratio: Real | None = parameter("-", ratio, follows="radius_ratio", argument="radius_ratio")
     law: AbstractRestitution
 
+    @with_throw
     def __init__(
         self,
         alpha1: ArrayLike,
@@ -69,6 +70,7 @@ class AsymmetricBlock(eqx.Module):
         self.law = PerSide(*pair("restitution", restitution)) if two else law_of(restitution, AngularMomentum())
 
     @classmethod
+    @with_throw
     def from_radii(
         cls,
         alpha1: ArrayLike,
@@ -99,6 +101,7 @@ class AsymmetricBlock(eqx.Module):
         return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
 
     @classmethod
+    @with_throw
     def from_frequencies(
         cls,
         alpha1: ArrayLike,
@@ -130,6 +133,7 @@ class AsymmetricBlock(eqx.Module):
         return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
 
     @classmethod
+    @with_throw
     def from_corners(
         cls,
         corner1: Values,
@@ -165,6 +169,7 @@ class AsymmetricBlock(eqx.Module):
         return cls.from_radii(*alphas, *radii, gyration_radius, restitution, gravity)
 
     @classmethod
+    @with_throw
     @arguments
     def from_outline(
         cls,

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, below_one, checked, one_of, size, whole
+from jaxrock._checks import Range, below_one, checked, one_of, size, whole, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
@@ -65,6 +65,7 @@ class FlexibleBlock(eqx.Module):
     impacts: str = eqx.field(static=True)
     base: str = eqx.field(static=True)
 
+    @with_throw
     def __init__(
         self,
         width: ArrayLike,

@@ -26,7 +26,7 @@ class LogDensity(eqx.Module):
 
     Coordinate i of a point leads into the range of parameter i: its share of the range (of the range of logarithms, if
     it is searched in them) is 1/(1 + exp(-x)). Made by `log_density`; a pytree, for `jit`, `vmap` and derivatives of
-    every order.
+    every order. Nothing is raised for any point: a motion that there is not, and what is no number, has minus infinity.
     """
 
     problem: Problem
@@ -88,9 +88,12 @@ def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
         raise ValueError(
             f"Argument `point` must end with an axis of {len(problem.names)}, but has shape {point.shape}."
         )
+    nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
+    point = jnp.where(nowhere[..., None], 0.0, point)
     value = problem.log_density(density._place(point))
     volume = jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point)
-    return value + jnp.sum(volume, axis=-1) if by_point else value
+    value = value + jnp.sum(volume, axis=-1) if by_point else value
+    return jnp.where(nowhere, -jnp.inf, value)
 
 
 @arguments
