@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
-from scipy.stats import qmc
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, together
@@ -67,6 +66,8 @@ class LogDensity(eqx.Module):
         self, count: Annotated[int, at_least(1, 10**6)], seed: Annotated[int, at_least(0)] = 0
     ) -> Float[Array, "count parameters"]:
         """So many points, spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
+        from scipy.stats import qmc  # it takes a third of a second
+
         share = jnp.asarray(qmc.Halton(len(self.names), seed=seed).random(count), self.problem.ends.dtype)
         return jnp.log(share) - jnp.log1p(-share)
 
