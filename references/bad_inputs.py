@@ -390,6 +390,7 @@ CALLS: dict[str, Call] = {
             "scatter": 0.3,
             "lapse": 0.02,
             "starts": 1,
+            "optimizer": None,
             **QUICK,
             "progress": False,
         },
