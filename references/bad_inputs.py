@@ -427,6 +427,7 @@ CALLS: dict[str, Call] = {
             "effective_size": 1,
             "steps": 1,
             "seed": 1,
+            "sampler": None,
             **QUICK,
             "progress": False,
         },

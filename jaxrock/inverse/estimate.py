@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import TOPPLED, Observations
@@ -63,7 +64,7 @@ class EstimateStatus(eqx.Enumeration):
     not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
 
 
-class Estimate(eqx.Module):
+class Estimate(AbstractTable):
     """The motion that observations allow; arrays have the order of `names`.
 
     - `names`, `values`: the parameters and where their likelihood (with priors: posterior density) is largest.
@@ -110,6 +111,17 @@ class Estimate(eqx.Module):
     def __getitem__(self, name: str) -> Real:
         """The value of a parameter."""
         return self.values[self.names.index(name)]
+
+    @property
+    def _columns(self):
+        ends = {"low": 0, "high": 1}
+        return {
+            "parameter": Column(("parameter",), self.names),
+            "value": Column(("parameter",), self.values, "that of the parameter"),
+            **{k: Column(("parameter",), self.interval[:, i], "that of the parameter") for k, i in ends.items()},
+            **{f"open_{k}": Column(("parameter",), self.open[:, i]) for k, i in ends.items()},
+            **{name: Column((), getattr(self, name)) for name in ("log_likelihood", "surprise", "scatter", "status")},
+        }
 
 
 @arguments

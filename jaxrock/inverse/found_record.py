@@ -18,6 +18,7 @@ from jaxrock._checks import finite, not_negative, one_of, scalar, shown
 from jaxrock._parameters import broadcast, leaves_of
 from jaxrock._precision import say_if_single
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -50,7 +51,7 @@ class RecordStatus(eqx.Enumeration):
     )
 
 
-class FoundRecord(eqx.Module):
+class FoundRecord(AbstractTable):
     """A record that brings blocks to margins.
 
     - `record`: the `Record`; `start`: the one that was changed.
@@ -76,6 +77,19 @@ class FoundRecord(eqx.Module):
     changes: Real
     path: Real
     status: RecordStatus
+
+    @property
+    def _columns(self):
+        before, after = self.start.samples, self.record.samples
+        return {
+            "time": Column(("time",), self.start.knots, "s"),
+            "start": Column(("time",), before, "g"),
+            "record": Column(("time",), after, "g"),
+            "added": Column(("time",), after - before, "g"),
+            "change": Column((), self.change, "g"),
+            "scaling": Column((), self.scaling, "g"),
+            "status": Column((), self.status),
+        }
 
 
 def _usual():

@@ -47,7 +47,7 @@ class LogDensity(eqx.Module):
 
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
         """Parameters by name, in their units, at points."""
-        return self.problem.values(self._place(self._checked(point)))
+        return self.problem.values(self.place(self._checked(point)))
 
     @arguments
     def point(self, values: dict[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
@@ -77,9 +77,14 @@ class LogDensity(eqx.Module):
             raise ValueError(f"Argument `point` must end with an axis of {size}, but has shape {point.shape}.")
         return point
 
-    def _place(self, point: Real) -> Real:
+    def place(self, point: Real) -> Real:
+        """Parameters, or their logarithms where they are searched in these, at points."""
         low, high = self.problem.ends.T
         return low + (high - low) * jax.nn.sigmoid(point)
+
+    def log_volume(self, point: Real) -> Real:
+        """What the log-density has more than the objective: of the coordinates, (...)."""
+        return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
 
 
 @eqx.filter_jit
@@ -91,9 +96,8 @@ def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
         )
     nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
     point = jnp.where(nowhere[..., None], 0.0, point)
-    value = problem.log_density(density._place(point))
-    volume = jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point)
-    value = value + jnp.sum(volume, axis=-1) if by_point else value
+    value = problem.log_density(density.place(point))
+    value = value + density.log_volume(point) if by_point else value
     return jnp.where(nowhere, -jnp.inf, value)
 
 
