@@ -36,7 +36,13 @@ def walk(density):
 SAMPLERS = {"NumPyro NUTS": nuts_of_numpyro, "BlackJAX NUTS": nuts, "BlackJAX random walk": walk}
 
 
-@pytest.mark.parametrize("make", SAMPLERS.values(), ids=SAMPLERS)
+QUICKLY = ("BlackJAX NUTS", "BlackJAX random walk")
+rows = [
+    pytest.param(make, id=name, marks=() if name in QUICKLY else pytest.mark.slow) for name, make in SAMPLERS.items()
+]
+
+
+@pytest.mark.parametrize("make", rows)
 def test_a_normal_distribution(make):
     begun = np.tile(MEAN + DEVIATION, (8, 1))
     rounds = list(itertools.islice(rounds_of(make, normal, begun, seed=3), 3))
