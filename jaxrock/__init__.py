@@ -61,6 +61,11 @@ from jaxrock.inverse.feasible import (
     feasible_region as feasible_region,
     unexceeded_motion as unexceeded_motion,
 )
+from jaxrock.inverse.found_record import (
+    FoundRecord as FoundRecord,
+    RecordStatus as RecordStatus,
+    find_record as find_record,
+)
 from jaxrock.inverse.history_fit import (
     HistoryFit as HistoryFit,
     HistoryStatus as HistoryStatus,

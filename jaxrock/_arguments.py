@@ -204,3 +204,10 @@ def list_of(kind: type | Callable, words: str) -> Check:
         return values
 
     return check
+
+
+def gradient_transformation(name: str, value: Any) -> Any:
+    """An optimiser of optax, or None."""
+    if value is not None and not (hasattr(value, "init") and hasattr(value, "update")):
+        raise ValueError(f"Argument `{name}` must be an optax.GradientTransformation, but is {shown(value)}.")
+    return value

@@ -3,6 +3,7 @@
 import contextlib
 import contextvars
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -77,9 +78,12 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     """Return `value` as an array for which `holds` is true everywhere.
 
     A known value that fails raises ValueError at once, within `jax.jit` too; one that is traced carries a check, which
-    raises when the compiled function meets it (see `_guard`).
+    raises when the compiled function meets it (see `_guard`). Where nothing may be raised (see `with_throw`), what
+    fails is not a number.
     """
     array = as_real(name, value)
+    if _marks.get():
+        return jnp.where(holds(array), array, jnp.nan)
     message = f"Argument `{name}` must {allowed}"
     if isinstance(array, jax.core.Tracer):
         return watched(array, message, _failed(holds)(array))
@@ -131,6 +135,48 @@ def put_down():
         yield checks
     finally:
         _put_down.reset(before)
+
+
+# Whether numbers outside of their ranges are marked, and raise nothing; every thread has its own.
+_marks = contextvars.ContextVar("marks", default=False)
+
+
+@contextlib.contextmanager
+def marked(unless: bool = False):
+    """Numbers outside of their ranges become what is not a number, whether they are known or traced.
+
+    Not around anything that JAX traces and keeps: a program would go on marking.
+    """
+    before = _marks.set(_marks.get() or not unless)
+    try:
+        yield
+    finally:
+        _marks.reset(before)
+
+
+def with_throw(function: Callable) -> Callable:
+    """Decorate what makes a block, a law or a motion: it takes `throw`, too.
+
+    False: a number outside of its range becomes what is not a number, and nothing is raised, so that optimisers may
+    take a step there; the outcome of such a scene is not a number either, and its status says so. What is no number at
+    all, or of a wrong shape, raises all the same.
+    """
+
+    @functools.wraps(function)
+    def made(*args, throw: bool = True, **kwargs):
+        if throw is not True and throw is not False:
+            raise ValueError(f"Argument `throw` must be True or False, but is {shown(throw)}.")
+        if throw:
+            return function(*args, **kwargs)
+        with marked():
+            return function(*args, **kwargs)
+
+    told = inspect.signature(function)
+    parameter = inspect.Parameter("throw", inspect.Parameter.KEYWORD_ONLY, default=True, annotation=bool)
+    parts = list(told.parameters.values())
+    last = len(parts) - sum(part.kind is part.VAR_KEYWORD for part in parts)
+    made.__signature__ = told.replace(parameters=[*parts[:last], parameter, *parts[last:]])
+    return made
 
 
 class Range(NamedTuple):

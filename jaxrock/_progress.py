@@ -1,28 +1,38 @@
-"""A progress bar of one line on the error stream; silent where nobody watches."""
+"""A progress bar, by tqdm: on a terminal and in a notebook, if the work takes over a second; silent elsewhere."""
 
 import sys
-import time
+import warnings
 
 
 class Progress:
-    """Draw `done` of `total`; where `shown` is None, only on a terminal, and only if the work takes over a second."""
+    """Show `done` of `total`; where `shown` is None, only where somebody watches, and only what takes over a second."""
 
     def __init__(self, total: int, label: str, shown: bool | None = None):
-        self.total, self.label = total, label
-        self.shown = sys.stderr.isatty() if shown is None else shown
-        self.forced = bool(shown)
-        self.begun = time.monotonic()
-        self.done = 0
+        self.total, self.done, self.bar = total, 0, None
+        if _is_watched() if shown is None else shown:
+            self.bar = _kind()(total=total, desc=label, delay=0 if shown else 1)
 
     def add(self, more: int) -> None:
-        """Draw the bar with some more done."""
+        """Show the bar with some more done."""
         self.done += more
-        spent = time.monotonic() - self.begun
-        if not self.shown or (spent < 1 and not self.forced):
-            return
-        filled = 30 * self.done // self.total
-        left = spent * (self.total - self.done) / max(self.done, 1)
-        end = "\n" if self.done >= self.total else ""
-        bar = "#" * filled + "." * (30 - filled)
-        sys.stderr.write(f"\r{self.label} [{bar}] {self.done:,}/{self.total:,}  {left:5.0f} s left{end}")
-        sys.stderr.flush()
+        if self.bar is not None:
+            self.bar.update(more)
+            if self.done >= self.total:
+                self.bar.close()
+
+
+def _is_watched() -> bool:
+    """Whether this is a terminal, or a notebook, whose standard error is none."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return sys.stderr.isatty() or "IPKernelApp" in getattr(shell, "config", ())
+
+
+def _kind() -> type:
+    with warnings.catch_warnings():  # where a notebook has no widgets the bar is made of characters
+        warnings.simplefilter("ignore")
+        from tqdm.auto import tqdm
+
+    class Bar(tqdm):
+        monitor_interval = 0  # no thread that looks after it
+
+    return Bar

@@ -1,6 +1,10 @@
 """What became of a computation: every result carries one of these."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 
 class Status(eqx.Enumeration):
@@ -22,3 +26,20 @@ class Status(eqx.Enumeration):
         "The differential equation solver gave up: its nonlinear solver failed or its steps became too small."
     )
     not_finite = "The state or the motion stopped being a finite number. Check the inputs."
+
+
+@jax.jit
+def marked_result(result: Any, given: Any) -> Any:
+    """A result as it is, unless a number that was given is none: then none of the result is, and its status says so.
+
+    An engine may pass by a number that it does not come to need, and what it returns may look like a result.
+    """
+    numbers = [x for x in jax.tree.leaves(given) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    bad = jnp.stack([jnp.isnan(x).any() for x in numbers]).any()
+
+    def of(part):
+        if isinstance(part, Status):
+            return Status.where(bad, Status.not_finite, part)
+        return jnp.where(bad, jnp.nan, part) if jnp.issubdtype(jnp.result_type(part), jnp.inexact) else part
+
+    return jax.tree.map(of, result, is_leaf=lambda part: isinstance(part, Status))

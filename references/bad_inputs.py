@@ -390,6 +390,26 @@ CALLS: dict[str, Call] = {
             "scatter": 0.3,
             "lapse": 0.02,
             "starts": 1,
+            "optimizer": None,
+            **QUICK,
+            "progress": False,
+        },
+        True,
+        ".*",
+    ),
+    "find_record": Call(
+        rk.find_record,
+        {
+            "block": block(),
+            "start": rk.Record([0.0, 0.5, 0.5, 0.5, 0.0, 0.0], 0.1),
+            "target": "topple",
+            "optimizer": None,
+            "penalty": 1.0,
+            "band": (0.0, 4.0),
+            "baseline": False,
+            "starts": 2,
+            "steps": 2,
+            "seed": 1,
             **QUICK,
             "progress": False,
         },
@@ -407,6 +427,7 @@ CALLS: dict[str, Call] = {
             "effective_size": 1,
             "steps": 1,
             "seed": 1,
+            "sampler": None,
             **QUICK,
             "progress": False,
         },
@@ -496,11 +517,11 @@ for _module in ("pushover", "restitution", "sine_pulse", "single_lobe"):
 # Public names that nobody calls with arguments, and what is tried elsewhere.
 NOT_CALLED = {
     "AbstractEquation", "AbstractFragility", "AbstractMotion", "Coefficients", "Contact", "Critical", "Estimate",
-    "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FragilityFit", "Grid",
-    "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome", "OverturningMap", "Posterior",
-    "PosteriorStatus", "Response", "Sensitivity", "SensitivityMap", "SimulatedFragility", "SimulatedSurface",
-    "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms", "Unexceeded", "example_record", "keep_compiled",
-    "closed_form", "restitution", "similarity", "plot",
+    "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FoundRecord",
+    "FragilityFit", "Grid", "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome",
+    "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "Sensitivity", "SensitivityMap",
+    "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
+    "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
 }  # fmt: skip
 
 

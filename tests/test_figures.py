@@ -79,6 +79,21 @@ def test_sine_regions():
     np.testing.assert_allclose(curve.get_ydata(), sine_pulse.no_impact_limit(curve.get_xdata()))
 
 
+def test_found_record():
+    """Both records, what lies between them, and their spectra."""
+    number, start = jnp.zeros(()), rk.Record([0.1, 0.2, -0.3, 0.0], 0.5, "a start")
+    change = np.array([0.0, 0.1, 0.0, -0.1])
+    after = rk.Record(start.samples + change, 0.5)
+    status = rk.RecordStatus.successful
+    found = rk.FoundRecord(after, start, number, number, number[None], number, number[None], number[None], status)
+    records, between, spectra = rk.plot.found_record(found)
+    assert records.lines[0].get_label() == "a start"
+    for line, expected in ((records.lines[0], start.samples), (records.lines[1], after.samples)):
+        np.testing.assert_allclose(line.get_xydata(), np.stack([[0.0, 0.5, 1.0, 1.5], expected], axis=1))
+    np.testing.assert_allclose(between.lines[0].get_ydata(), change, atol=1e-16)
+    np.testing.assert_allclose(spectra.lines[1].get_xydata(), [[0.5, 0.1], [1.0, 0.0]], atol=1e-16)
+
+
 def test_feasible_region():
     """The best is the top of the scale; axes are logarithmic and have the units of the parameters."""
     rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)

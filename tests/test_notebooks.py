@@ -10,15 +10,17 @@ nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Minutes of compilation, of what `test_arcs`, `test_closed_forms`, `test_derivatives`, `test_critical`, `test_inverse`,
-# `test_springs`, `test_asymmetric_rocks` and `test_flexible` judge.
+# `test_springs`, `test_asymmetric_rocks`, `test_flexible`, `test_search` and `test_found_record` judge.
 SLOW = {
     "03_a_block_of_your_own",
     "05_one_sine_pulse",
     "07_sensitivity",
     "08_recover_a_pulse",
     "09_published_rocks",
+    "12_fit_it_yourself",
     "13_spring_models",
     "14_flexible_blocks",
+    "15_the_critical_record",
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
+from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.outline import Outline
@@ -55,6 +55,7 @@ class AsymmetricBlock(eqx.Module):
 
     __repr__ = described
 
+    @with_throw
     def __init__(
         self,
         alpha1: ArrayLike,
@@ -72,6 +73,7 @@ class AsymmetricBlock(eqx.Module):
         self.law = PerSide(*pair("restitution", restitution)) if two else law_of(restitution, AngularMomentum())
 
     @classmethod
+    @with_throw
     def from_radii(
         cls,
         alpha1: ArrayLike,
@@ -102,6 +104,7 @@ class AsymmetricBlock(eqx.Module):
         return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
 
     @classmethod
+    @with_throw
     def from_frequencies(
         cls,
         alpha1: ArrayLike,
@@ -133,6 +136,7 @@ class AsymmetricBlock(eqx.Module):
         return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
 
     @classmethod
+    @with_throw
     def from_corners(
         cls,
         corner1: Values,
@@ -168,6 +172,7 @@ class AsymmetricBlock(eqx.Module):
         return cls.from_radii(*alphas, *radii, gyration_radius, restitution, gravity)
 
     @classmethod
+    @with_throw
     @arguments
     def from_outline(
         cls,

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, below_one, checked, one_of, size, whole
+from jaxrock._checks import Range, below_one, checked, one_of, size, whole, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
@@ -68,6 +68,7 @@ class FlexibleBlock(eqx.Module):
 
     __repr__ = described
 
+    @with_throw
     def __init__(
         self,
         width: ArrayLike,

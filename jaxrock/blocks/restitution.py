@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, checked, not_negative, share, size, together
+from jaxrock._checks import Range, checked, not_negative, share, size, together, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
@@ -92,6 +92,7 @@ class Constant(AbstractRestitution):
 
     value: Real = parameter("-", share, symbol="e", argument="restitution")
 
+    @with_throw
     def __init__(self, value: ArrayLike):
         set_parameters(self, value=value)
 
@@ -120,6 +121,7 @@ class Housner(AbstractRestitution):
 
     inertia_ratio: Real | None = parameter("-", ratio_of_inertia)
 
+    @with_throw
     def __init__(self, inertia_ratio: ArrayLike | None = None):
         self.inertia_ratio = None if inertia_ratio is None else ratio_of_inertia("inertia_ratio", inertia_ratio)
 
@@ -170,11 +172,13 @@ class PerSide(AbstractRestitution):
     first: Real = parameter("-", not_negative, symbol="e1", argument="restitution")
     second: Real = parameter("-", not_negative, symbol="e2", argument="restitution")
 
+    @with_throw
     def __init__(self, first: ArrayLike, second: ArrayLike):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
         together(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
-        checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
+        product = checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
+        self.first = jnp.where(jnp.isnan(product), product, self.first)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """That of the side."""
@@ -203,6 +207,7 @@ class SpeedDependent(AbstractRestitution):
     violent: Real = parameter("-", share)
     scale: Real = parameter("rad/s", size)
 
+    @with_throw
     def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)
 

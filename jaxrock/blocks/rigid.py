@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, rate, size, together
+from jaxrock._checks import acute, rate, size, together, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.restitution import (
@@ -45,12 +45,14 @@ class Block(eqx.Module):
 
     __repr__ = described
 
+    @with_throw
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None):
         set_parameters(self, alpha=alpha, p=p)
         self.law = law_of(restitution, Housner())
         self.alpha = fitting_alpha(self.law, self.alpha)
 
     @classmethod
+    @with_throw
     def from_dimensions(
         cls,
         width: ArrayLike,
@@ -77,6 +79,7 @@ class Block(eqx.Module):
         return cls.from_radius(jnp.arctan2(width, height), half_diagonal, restitution, gravity=gravity)
 
     @classmethod
+    @with_throw
     def from_radius(
         cls,
         alpha: ArrayLike,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import Values, scalar, span
+from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
@@ -16,7 +16,7 @@ from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.status import Status
+from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 
 Scalar = Inexact[ArrayLike, "..."]
@@ -115,6 +115,7 @@ def outcome_flexible(
     *,
     duration: ArrayLike | None = None,
     max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
+    throw: bool = True,
 ) -> FlexibleOutcome:
     """Tell what becomes of a flexible block under a motion.
 
@@ -124,13 +125,16 @@ def outcome_flexible(
     - `motion`: any horizontal motion; the ground rests after its end.
     - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
     - `max_steps`: budget of steps besides four for each piece of the motion, at least 1.
+    - `throw`: as in `outcome`.
 
     **Returns:** a `FlexibleOutcome`. Its derivatives (forward and reverse) by block and motion are exact.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
     say_if_single()
-    return _outcome(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
+    stop = _duration(block, motion, duration, throw)
+    result = _outcome(block, motion, stop, _budget(motion, max_steps))
+    return result if throw else marked_result(result, (block, motion, stop))
 
 
 @arguments
@@ -141,12 +145,13 @@ def simulate_flexible(
     duration: ArrayLike | None = None,
     samples: Annotated[int, at_least(2, 10**7)] = 2001,
     max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
+    throw: bool = True,
 ) -> FlexibleResponse:
     """Compute the history of a flexible block under a motion.
 
     **Arguments:**
 
-    - `block`, `motion`, `duration`, `max_steps`: as in `outcome_flexible`.
+    - `block`, `motion`, `duration`, `max_steps`, `throw`: as in `outcome_flexible`.
     - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had by
       calling the result.
 
@@ -155,12 +160,14 @@ def simulate_flexible(
     **Raises:** ValueError for arguments outside their ranges.
     """
     say_if_single()
-    result, path = _simulate(block, motion, _duration(block, motion, duration), _budget(motion, max_steps))
+    stop = _duration(block, motion, duration, throw)
+    result, path = _simulate(block, motion, stop, _budget(motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    return FlexibleResponse(time, *_along(path, time, "outputs")[:3], result, path)
+    response = FlexibleResponse(time, *_along(path, time, "outputs")[:3], result, path)
+    return response if throw else marked_result(response, (block, motion, stop))
 
 
-def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None) -> Scalar:
+def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> Scalar:
     check_single(block=block, motion=motion)
     if motion.vertical_bounds is not None:
         raise ValueError(
@@ -168,7 +175,8 @@ def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike 
         )
     if duration is None:
         return motion.end + 10 / block.p
-    return scalar("duration", span("duration", duration))
+    with marked(unless=throw):
+        return scalar("duration", span("duration", duration))
 
 
 def _budget(motion: AbstractMotion, max_steps: int) -> int:

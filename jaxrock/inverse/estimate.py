@@ -7,7 +7,7 @@ range that was searched, and say so.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,11 +16,13 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
 from jaxrock.inverse.scatter import NODES
+from jaxrock.inverse.search import Trace, optimizer_or_none, summits_of
 from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -62,7 +64,7 @@ class EstimateStatus(eqx.Enumeration):
     not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
 
 
-class Estimate(eqx.Module):
+class Estimate(AbstractTable):
     """The motion that observations allow; arrays have the order of `names`.
 
     - `names`, `values`: the parameters and where their likelihood (with priors: posterior density) is largest.
@@ -80,6 +82,8 @@ class Estimate(eqx.Module):
     - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
       least with which they would not; infinite if there is none up to ten times as large.
     - `summits`, `summit_values`: (starts, parameters) where each start arrived, and (starts,) the log-likelihood there.
+    - `trace`: a `Trace` of the search from these starts, but for what was looked at beside their best; with
+      `plot.search`.
     - `responses`: how many scenes were computed.
     - `remarks`: what is to be said about it, in words.
     - `status`: an `EstimateStatus`.
@@ -99,6 +103,7 @@ class Estimate(eqx.Module):
     consistent_scatter: Real
     summits: Real
     summit_values: Real
+    trace: Trace
     responses: int = eqx.field(static=True)
     remarks: tuple[str, ...] = eqx.field(static=True)
     status: EstimateStatus
@@ -106,6 +111,17 @@ class Estimate(eqx.Module):
     def __getitem__(self, name: str) -> Real:
         """The value of a parameter."""
         return self.values[self.names.index(name)]
+
+    @property
+    def _columns(self):
+        ends = {"low": 0, "high": 1}
+        return {
+            "parameter": Column(("parameter",), self.names),
+            "value": Column(("parameter",), self.values, "that of the parameter"),
+            **{k: Column(("parameter",), self.interval[:, i], "that of the parameter") for k, i in ends.items()},
+            **{f"open_{k}": Column(("parameter",), self.open[:, i]) for k, i in ends.items()},
+            **{name: Column((), getattr(self, name)) for name in ("log_likelihood", "surprise", "scatter", "status")},
+        }
 
 
 @arguments
@@ -117,6 +133,7 @@ def estimate_motion(
     *,
     lapse: ArrayLike = 0.02,
     starts: Annotated[int, at_least(1, 10**6)] = 64,
+    optimizer: Annotated[Any, optimizer_or_none] = None,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -133,6 +150,10 @@ def estimate_motion(
       observation says nothing; see `Likelihood`. They are not estimated.
     - `starts`: points from which the maximum is looked for, at least 1: the best of four times as many, spread over the
       ranges.
+    - `optimizer`: what climbs from them: an `optax.GradientTransformation`, such as `optax.adam(0.1)`, or a minimiser
+      of optimistix, such as `optimistix.BFGS(rtol=1e-6, atol=1e-6)`, over angles: a parameter goes from one end of its
+      range to the other within pi. None: own climbers, by BFGS, in rounds that wait for nobody. Intervals are found by
+      these in any case.
     - `model`, `engine`: as in `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -145,11 +166,12 @@ def estimate_motion(
     problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
     bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
-    summits = climb(evaluate, _starts(starts, evaluate))
+    summits = summits_of(evaluate, _starts(starts, evaluate), optimizer)
+    trace = Trace.of(evaluate, summits)
     if not np.isfinite(evaluate.lowest):
         raise ValueError("Argument `unknowns` must have ranges in which there are motions, but all its values are bad.")
     for _ in range(_ROUNDS_BESIDE):
-        more, before = climb(evaluate, _beside(evaluate, summits)), summits.values.max()
+        more, before = summits_of(evaluate, _beside(evaluate, summits), optimizer), summits.values.max()
         summits = _joined(more, summits)
         if summits.values.max() < before + _GAIN:
             break
@@ -161,7 +183,7 @@ def estimate_motion(
             break
         # A profile went over a pass to a higher summit.
         summits = _joined(climb(evaluate, profiled.better[None]), summits)
-    result = _conclude(evaluate, summits, shape, profiled)
+    result = _conclude(evaluate, summits, shape, profiled, trace)
     bar.add(bar.total - bar.done)
     return result
 
@@ -189,20 +211,19 @@ def _beside(evaluate: Evaluator, summits: Summits) -> np.ndarray:
 
 
 def _joined(more: Summits, summits: Summits) -> Summits:
-    return Summits(*(np.concatenate(pair) for pair in zip(more, summits)))
+    return Summits(*(np.concatenate(pair) for pair in zip(more[:3], summits[:3])))
 
 
 def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
-    """Places spread evenly over the ranges: multiples of irrational numbers, modulo one."""
+    """Places spread evenly over the ranges (Halton's sequence)."""
+    from scipy.stats import qmc  # it takes a third of a second
+
     low, high = evaluate.ends
-    size = low.size
-    root = np.roots([1, *[0] * (size - 1), -1, -1])
-    ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
-    share = (0.5 + np.outer(np.arange(count), ratio ** -np.arange(1.0, size + 1))) % 1
+    share = qmc.Halton(low.size, scramble=False).random(count + 1)[1:]  # the first is a corner
     return low + (high - low) * (0.01 + 0.98 * share)
 
 
-def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Profile) -> Estimate:
+def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Profile, trace: Trace) -> Estimate:
     problem = evaluate.problem
     best = int(np.argmax(summits.values))
     places = jnp.asarray(evaluate.places(summits.points))
@@ -250,6 +271,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         consistent_scatter=jnp.asarray(consistent),
         summits=jnp.stack(list(problem.values(places).values()), axis=-1),
         summit_values=jnp.asarray(summits.values),
+        trace=trace,
         responses=evaluate.count * per_point,
         remarks=remarks,
         status=status,

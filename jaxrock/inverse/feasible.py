@@ -12,18 +12,20 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import Values, finite, scalar, size
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.pulses import UNITS
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.spectra import axis
 
 _LANES = 64  # motions in one call of the compiled program
 
 
-class FeasibleRegion(eqx.Module):
+class FeasibleRegion(AbstractTable):
     """How well motions explain observations, over two parameters.
 
     - `names`: of the two; `values`: (rows,) of the first and (columns,) of the second.
@@ -36,6 +38,14 @@ class FeasibleRegion(eqx.Module):
     values: tuple[Float[Array, " rows"], Float[Array, " columns"]]
     log_likelihood: Float[Array, "rows columns"]
     allowed: Bool[Array, "rows columns"]
+
+    @property
+    def _columns(self):
+        return {
+            **{name: Column((name,), x, UNITS.get(name, "unknown")) for name, x in zip(self.names, self.values)},
+            "log_likelihood": Column(self.names, self.log_likelihood),
+            "allowed": Column(self.names, self.allowed),
+        }
 
 
 @arguments
@@ -82,7 +92,7 @@ def _log_likelihood(likelihood, values):
     return jnp.sum(likelihood.log_terms(values, slopes=False), axis=-1)
 
 
-class Unexceeded(eqx.Module):
+class Unexceeded(AbstractTable):
     """The largest motions that all rocks survive, and all weaker ones too.
 
     - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g] up to which every rock stands; infinite where no
@@ -97,6 +107,16 @@ class Unexceeded(eqx.Module):
     by_rock: Float[Array, "rocks n"]
     weakest: Int[Array, " n"]
     complete: Bool[Array, " n"]
+
+    @property
+    def _columns(self):
+        return {
+            "duration": Column(("duration",), self.durations, "s"),
+            "amplitude": Column(("duration",), self.amplitude, "g"),
+            "weakest": Column(("duration",), self.weakest),
+            "complete": Column(("duration",), self.complete),
+            "amplitude_by_rock": Column(("rock", "duration"), self.by_rock, "g"),
+        }
 
 
 @arguments

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxrock._arguments import arguments, at_least, list_of, pair
 from jaxrock._checks import Values, finite, inner_share, not_negative, positive, scalar
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -41,7 +42,7 @@ class HistoryStatus(eqx.Enumeration):
     not_simulated = "No start could be simulated to the end of the data: the numbers are not results."
 
 
-class HistoryFit(eqx.Module):
+class HistoryFit(AbstractTable):
     """What `fit_history` finds; parameters in the order of `names`.
 
     - `names`, `values`: of the parameters.
@@ -103,6 +104,20 @@ class HistoryFit(eqx.Module):
         t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)  # A&S 26.7.5
         half = t * np.sqrt(np.diag(covariance))
         return np.stack([self.values - half, self.values + half], axis=1)
+
+    @property
+    def _columns(self):
+        intervals = self.intervals()
+        own = "that of the parameter"
+        return {
+            "parameter": Column(("parameter",), self.names),
+            "value": Column(("parameter",), self.values, own),
+            "standard_error": Column(("parameter",), np.sqrt(np.diag(self.covariance)), own),
+            **{name: Column(("parameter",), intervals[:, i], own) for i, name in enumerate(("low", "high"))},
+            "scatter": Column((), self.scatter, "rad"),
+            "misfit": Column((), self.misfit),
+            "status": Column((), self.status),
+        }
 
 
 @arguments

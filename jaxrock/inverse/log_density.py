@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
-from scipy.stats import qmc
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, together
@@ -26,7 +25,7 @@ class LogDensity(eqx.Module):
 
     Coordinate i of a point leads into the range of parameter i: its share of the range (of the range of logarithms, if
     it is searched in them) is 1/(1 + exp(-x)). Made by `log_density`; a pytree, for `jit`, `vmap` and derivatives of
-    every order.
+    every order. Nothing is raised for any point: a motion that there is not, and what is no number, has minus infinity.
     """
 
     problem: Problem
@@ -48,7 +47,7 @@ class LogDensity(eqx.Module):
 
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
         """Parameters by name, in their units, at points."""
-        return self.problem.values(self._place(self._checked(point)))
+        return self.problem.values(self.place(self._checked(point)))
 
     @arguments
     def point(self, values: dict[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
@@ -67,6 +66,8 @@ class LogDensity(eqx.Module):
         self, count: Annotated[int, at_least(1, 10**6)], seed: Annotated[int, at_least(0)] = 0
     ) -> Float[Array, "count parameters"]:
         """So many points, spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
+        from scipy.stats import qmc  # it takes a third of a second
+
         share = jnp.asarray(qmc.Halton(len(self.names), seed=seed).random(count), self.problem.ends.dtype)
         return jnp.log(share) - jnp.log1p(-share)
 
@@ -76,9 +77,14 @@ class LogDensity(eqx.Module):
             raise ValueError(f"Argument `point` must end with an axis of {size}, but has shape {point.shape}.")
         return point
 
-    def _place(self, point: Real) -> Real:
+    def place(self, point: Real) -> Real:
+        """Parameters, or their logarithms where they are searched in these, at points."""
         low, high = self.problem.ends.T
         return low + (high - low) * jax.nn.sigmoid(point)
+
+    def log_volume(self, point: Real) -> Real:
+        """What the log-density has more than the objective: of the coordinates, (...)."""
+        return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
 
 
 @eqx.filter_jit
@@ -88,9 +94,11 @@ def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
         raise ValueError(
             f"Argument `point` must end with an axis of {len(problem.names)}, but has shape {point.shape}."
         )
-    value = problem.log_density(density._place(point))
-    volume = jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point)
-    return value + jnp.sum(volume, axis=-1) if by_point else value
+    nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
+    point = jnp.where(nowhere[..., None], 0.0, point)
+    value = problem.log_density(density.place(point))
+    value = value + density.log_volume(point) if by_point else value
+    return jnp.where(nowhere, -jnp.inf, value)
 
 
 @arguments

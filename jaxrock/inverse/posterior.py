@@ -3,11 +3,12 @@
 The posterior has several maxima and ridges, parameters are few, and densities are dear: so chains whose proposals learn
 where it is first (see `proposals`), from the maxima of an estimate and from everywhere. Whether chains agree tells
 whether they have arrived; not whether there is a maximum that neither the estimate nor any proposal has met. (Ensembles
-of walkers, by NumPyro's AIES, take many times as many points: benchmarks/inverse.md.)
+of walkers, by NumPyro's AIES, take many times as many points: benchmarks/inverse.md.) Any sampler of NumPyro or
+BlackJAX takes their place where one is given (see `samplers`).
 """
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,15 +18,19 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import inner_share, scalar
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
 from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.log_density import LogDensity
 from jaxrock.inverse.observations import Observations
+from jaxrock.inverse.samplers import rounds_of
 from jaxrock.inverse.scatter import NODES
 from jaxrock.inverse.unknowns import Problem, Unknown, in_batches
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.numerics.proposals import ROUNDS, around, begin, learn
+from jaxrock.motions.pulses import UNITS
+from jaxrock.numerics.proposals import ROUNDS, independent_proposals
 
 Real = Inexact[Array, "..."]
 _CHAINS = 8
@@ -33,7 +38,7 @@ _ROUND = 512  # points of a round: those of all chains together
 _LANES = 64  # points in one call of the compiled program
 _PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
 _DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
-_AROUND, _EVENLY = 0.05, 0.85  # how far from them, in ranges; share of the first points that is spread over everything
+_JITTER, _INSIDE = 0.1, 6.0  # of the points at which other samplers begin, around maxima, and how far out
 _ALIKE = 1.01  # R-hat
 _END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
 
@@ -52,7 +57,7 @@ class PosteriorStatus(eqx.Enumeration):
     )
 
 
-class Posterior(eqx.Module):
+class Posterior(AbstractTable):
     """Samples of a posterior distribution.
 
     - `names`: the parameters; `samples`: (chains, steps, parameters), in their units.
@@ -85,6 +90,14 @@ class Posterior(eqx.Module):
         flat = self.samples.reshape(-1, len(self.names))
         return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
 
+    def to_arviz(self):
+        """The samples for ArviZ (an extra of its own): an `InferenceData`, or from ArviZ 1.0 on a `DataTree`."""
+        import arviz
+
+        samples = {name: np.asarray(self.samples[..., i]) for i, name in enumerate(self.names)}
+        groups = {"posterior": samples, "sample_stats": {"lp": np.asarray(self.log_density)}}
+        return arviz.from_dict(**groups) if hasattr(arviz, "InferenceData") else arviz.from_dict(groups)
+
     def summary(self) -> str:
         """Mean, standard deviation, quantiles and diagnostics as a table, and the status."""
         lines = [f"{'':<12}{'mean':>10}{'sd':>10}{'2.5 %':>10}{'50 %':>10}{'97.5 %':>10}{'effective':>11}{'R-hat':>8}"]
@@ -94,6 +107,16 @@ class Posterior(eqx.Module):
             cells = "".join(f"{float(number):>10.4g}" for number in numbers)
             lines.append(f"{name:<12}{cells}{float(self.effective_size[i]):>11.0f}{float(self.r_hat[i]):>8.3f}")
         return "\n".join([*lines, PosteriorStatus[self.status]])
+
+    @property
+    def _columns(self):
+        samples = {name: self.samples[..., i] for i, name in enumerate(self.names)}
+        both = ("chain", "step")
+        return {
+            **{name: Column(both, values, UNITS.get(name, "unknown")) for name, values in samples.items()},
+            "log_density": Column(both, self.log_density),
+            "status": Column((), self.status),
+        }
 
 
 @arguments
@@ -108,6 +131,7 @@ def sample_motion(
     effective_size: Annotated[int, at_least(1, 10**9)] = 1000,
     steps: Annotated[int, at_least(1, 10**9)] = 4000,
     seed: Annotated[int, at_least(0)] = 0,
+    sampler: Callable | None = None,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -124,6 +148,10 @@ def sample_motion(
     - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
     - `steps`: of each of eight chains, at most; at least 1. Those before chains began anew are counted, but not used.
     - `seed`: of the random numbers.
+    - `sampler`: what makes another sampler of a `LogDensity`, such as
+      `lambda density: numpyro.infer.NUTS(potential_fn=lambda point: -density(point))` or
+      `lambda density: blackjax.nuts(density, 0.5, jnp.ones(2))`. Its eight chains begin at maxima of the estimate; the
+      first 500 steps of each are not kept. None: own chains, which are about ten times as fast here.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Posterior`.
@@ -143,23 +171,79 @@ def sample_motion(
             observations, motion, unknowns, scatter, lapse=lapse, model=model, engine=engine, progress=progress
         )
     problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
-    random, density = np.random.default_rng(seed), _Density(problem)
-    bar = Progress(ROUNDS + -(-steps * _CHAINS // _ROUND), "posterior", progress)
+    wanted = _Wanted(effective_size, steps, seed)
+    if sampler is None:
+        bar = Progress(ROUNDS + -(-steps * _CHAINS // _ROUND), "posterior", progress)
+        drawn = _by_proposals(problem, estimate, wanted, bar)
+    else:
+        bar = Progress(steps, "posterior", progress)
+        drawn = _by_another(sampler, problem, estimate, wanted, bar)
+    bar.add(bar.total - bar.done)
+    return _conclude(problem, estimate, drawn, effective_size)
+
+
+class _Wanted(NamedTuple):
+    """Independent samples, steps of each chain at most, and the seed."""
+
+    size: int
+    steps: int
+    seed: int
+
+    def is_reached(self, sizes: np.ndarray, r_hat: np.ndarray) -> bool:
+        """Whether chains agree, and hold enough independent samples."""
+        return bool(sizes.min() >= self.size and r_hat.max() < _ALIKE)
+
+
+class _Drawn(NamedTuple):
+    """Places (steps, chains, parameters), log-likelihood and log-prior there, diagnostics, and how many points were
+    computed."""
+
+    places: np.ndarray
+    values: np.ndarray
+    sizes: np.ndarray
+    r_hat: np.ndarray
+    points: int
+
+
+def _by_proposals(problem: Problem, estimate: Estimate, wanted: _Wanted, bar: Progress) -> _Drawn:
+    random, density = np.random.default_rng(wanted.seed), _Density(problem)
     low, high = np.asarray(problem.ends).T
-    first = around(_summits(problem, estimate), _AROUND, _EVENLY, low, high)
-    drawn = learn(density, first, _ROUND, random, lambda: bar.add(1))
-    chains = begin(drawn, _CHAINS, random)
-    for done in range(0, steps, _ROUND // _CHAINS):
+    settings = {"chains": _CHAINS, "points": _ROUND, "progress": lambda: bar.add(1)}
+    sampler = independent_proposals(density, low, high, **settings)
+    chains = sampler.init(_summits(problem, estimate), random)
+    for done in range(0, wanted.steps, _ROUND // _CHAINS):
         if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
-            chains = begin(chains.drawn, _CHAINS, random)  # they have met something, from which there is more to learn
-        chains = chains.follow(density, min(_ROUND // _CHAINS, steps - done), random)
+            chains = sampler.anew(random, chains)  # they have met something, from which there is more to learn
+        chains, _ = sampler.step(random, chains, min(_ROUND // _CHAINS, wanted.steps - done))
         sizes, r_hat = diagnostics(chains.places[1:])
         bar.add(1)
-        if sizes.min() >= effective_size and r_hat.max() < _ALIKE:
+        if wanted.is_reached(sizes, r_hat):
             break
-    bar.add(bar.total - bar.done)
-    places, values = chains.places[1:], chains.log_density[1:]
-    return _conclude(problem, estimate, places, values, sizes, r_hat, effective_size, density.count)
+    return _Drawn(chains.places[1:], chains.log_density[1:], sizes, r_hat, density.count)
+
+
+def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _Wanted, bar: Progress) -> _Drawn:
+    density = LogDensity(problem.current())
+    summits = problem.values(jnp.asarray(_summits(problem, estimate)))
+    points = np.clip(np.asarray(density.point(summits)), -_INSIDE, _INSIDE)
+    points = points[np.arange(_CHAINS) % len(points)]
+    points = points + _JITTER * np.random.default_rng(wanted.seed).normal(size=points.shape)
+    rounds, count = [], 0
+    for steps in rounds_of(make, density, points, wanted.seed):
+        rounds.append(steps)
+        count += steps.gradients
+        places = np.asarray(density.place(np.concatenate([each.points for each in rounds])))
+        sizes, r_hat = diagnostics(places)
+        bar.add(min(len(steps.points), bar.total - bar.done))
+        if len(places) >= wanted.steps or wanted.is_reached(sizes, r_hat):
+            break
+    points = np.concatenate([each.points for each in rounds])[: wanted.steps]
+    if rounds[0].log_density is None:
+        values = _Density(problem)(places.reshape(-1, places.shape[-1])).reshape(places.shape[:-1])[: wanted.steps]
+    else:
+        values = np.concatenate([each.log_density for each in rounds])[: wanted.steps]
+        values = values - np.asarray(density.log_volume(points))
+    return _Drawn(places[: wanted.steps], values, *diagnostics(places[: wanted.steps]), count)
 
 
 @eqx.filter_jit
@@ -204,16 +288,8 @@ def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(np.isnan(sizes), 0.0, sizes), np.where(np.isnan(r_hat), np.inf, r_hat)
 
 
-def _conclude(
-    problem: Problem,
-    estimate: Estimate,
-    places: np.ndarray,
-    density: np.ndarray,
-    sizes: np.ndarray,
-    r_hat: np.ndarray,
-    wanted: int,
-    points: int,
-) -> Posterior:
+def _conclude(problem: Problem, estimate: Estimate, drawn: _Drawn, wanted: int) -> Posterior:
+    places, density, sizes, r_hat, points = drawn
     low, high = np.asarray(problem.ends).T
     share = ((places - low) / (high - low)).reshape(-1, low.size)
     open_ = np.stack([(share < _END).mean(axis=0), (share > 1 - _END).mean(axis=0)], axis=1) > _END / 5

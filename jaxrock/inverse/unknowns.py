@@ -174,9 +174,13 @@ class Evaluator:
     def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and slopes at places, and by them."""
         values, slopes = in_batches(lambda part: _batch(self.problem, part)[:2], places, _LANES, self.progress)
+        self.note(places, values)
+        return values, slopes
+
+    def note(self, places: np.ndarray, values: np.ndarray) -> None:
+        """Count, and keep, values at places that somebody else has computed."""
         self.count += len(places)
         self.known = np.concatenate([self.known[0], places]), np.concatenate([self.known[1], values])
-        return values, slopes
 
     @property
     def lowest(self) -> float:

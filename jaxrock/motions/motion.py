@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, delay, factor, if_known, not_nan
+from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
@@ -107,6 +107,7 @@ class AbstractMotion(eqx.Module):
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
         return WithVertical(self, vertical)
 
+    @with_throw
     def shifted(self, delay: ArrayLike) -> "Shifted":
         """The same motion after `delay` seconds of quiet (0 or more)."""
         return Shifted(self, delay)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, not_negative, size, strength
+from jaxrock._checks import Values, not_negative, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion
@@ -62,6 +62,7 @@ class Record(_Straight):
     dt: Inexact[Array, "..."] = parameter("s", size)
     label: Label = eqx.field(static=True)
 
+    @with_throw
     @arguments
     def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
         samples = strength("acceleration", acceleration)

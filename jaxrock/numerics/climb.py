@@ -24,11 +24,13 @@ _NOWHERE = -1e300  # the value where there is none
 
 
 class Summits(NamedTuple):
-    """Where climbers arrived: (climbers, dimensions), (climbers,), and whether each is on a summit."""
+    """Where climbers arrived: (climbers, dimensions), (climbers,), and whether each is on a summit; and their paths,
+    points (rounds, climbers, dimensions) and values (rounds, climbers), which are not numbers after a climber's end."""
 
     points: np.ndarray
     values: np.ndarray
     arrived: np.ndarray
+    path: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def climb(
@@ -61,7 +63,10 @@ def climb(
     inverse = np.tile(np.eye(size), (count, 1, 1))  # of minus the Hessian
     fresh, done, arrived = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
     search, step = np.zeros_like(points), np.ones(count)
+    path = []
     for number in range(rounds):
+        on_the_way = ~done & (values > _NOWHERE)
+        path.append((np.where(done[:, None], np.nan, points), np.where(on_the_way, values, np.nan)))
         direction = np.einsum("cij,cj->ci", inverse, slopes)
         direction *= np.minimum(1.0, _LONGEST_STEP / np.maximum(np.max(np.abs(direction), axis=1), 1e-300))[:, None]
         search[fresh], step[fresh] = direction[fresh], 1.0
@@ -87,7 +92,7 @@ def climb(
         bad = active[~good]
         shorter = expected[~good] / np.maximum(2 * (expected[~good] - gain[~good]), 1e-300)
         step[bad] *= np.clip(shorter, 0.1, 0.5)
-    return Summits(points, values, arrived)
+    return Summits(points, values, arrived, tuple(map(np.array, zip(*path))))
 
 
 def _bfgs(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:

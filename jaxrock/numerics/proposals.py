@@ -5,12 +5,22 @@ any other. How often one is taken tells how near the proposals are to the distri
 were computed before: kernels around some of these, drawn by their weights, each about as wide as its neighbours are
 apart (Cappe et al. 2004). A small share is spread evenly over the box, so that no place is out of reach; but chains
 that agree cannot tell of a summit so narrow that no proposal has met it.
+
+`independent_proposals` makes of it a sampler in the manner of BlackJAX, for any density over a box whose values at many
+places are cheaper together:
+
+    sampler = independent_proposals(log_density, low=np.zeros(2), high=np.ones(2))
+    state = sampler.init(np.array([[0.3, 0.5]]), key)
+    for number in range(20):
+        state, info = sampler.step(jax.random.fold_in(key, number), state)
+    state.places[1:]
 """
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 ROUNDS = 12  # of learning, at most
@@ -21,6 +31,7 @@ _KERNELS = 400  # at most
 _NEIGHBOURS = 25  # kernels by whose distances one is as wide as it is; at least six for each dimension
 _WIDER = 0.03  # than that, of the width of all
 _EVENLY = 0.05
+_AROUND, _FIRST_EVENLY = 0.05, 0.85  # widths of the first kernels, in boxes; the share that is even then
 _FEWEST = 50  # points that weights must leave; otherwise they are made more alike
 _TRIED = 256  # places of each kernel, to see how much of it is in the box
 
@@ -224,3 +235,72 @@ def begin(drawn: Drawn, count: int, random: np.random.Generator) -> Chains:
     at = random.choice(weights.size, size=count, p=weights / weights.sum())
     places, values = drawn.places[at], drawn.log_density[at]
     return Chains(places[None], values[None], values - kernels.log_density(places), kernels, drawn)
+
+
+class Taken(NamedTuple):
+    """What a round of steps has come to: places (steps, chains, dimensions), log-densities there (steps, chains), and
+    the share of proposals that were taken."""
+
+    places: np.ndarray
+    log_density: np.ndarray
+    acceptance_rate: float
+
+
+class Sampler(NamedTuple):
+    """A sampler in the manner of BlackJAX; its states are `Chains`, and nothing else remembers anything.
+
+    - `init(places, key)`: chains that have learned, from first places (n, dimensions) where the density is large.
+    - `step(key, state, steps)`: the chains a round later (or so many steps), and what was `Taken` in it.
+    - `anew(key, state)`: chains that begin anew, with proposals that learned from all that was met since.
+
+    A key is one of JAX, or a generator of random numbers of NumPy.
+    """
+
+    init: Callable[..., Chains]
+    step: Callable[..., tuple[Chains, Taken]]
+    anew: Callable[..., Chains]
+
+
+def independent_proposals(
+    log_density: Callable[[np.ndarray], np.ndarray],
+    low: np.ndarray,
+    high: np.ndarray,
+    *,
+    chains: int = 8,
+    points: int = 512,
+    progress: Callable[[], None] = lambda: None,
+) -> Sampler:
+    """A sampler for a density that is dear, and known at many places at once.
+
+    **Arguments:**
+
+    - `log_density`: logarithms (n,) of the density at places (n, dimensions), but for a constant.
+    - `low`, `high`: (dimensions,) the box outside of which there is none of it.
+    - `chains`: how many; `points`: how many places are computed together, a multiple of them.
+    - `progress`: called after every round of learning.
+
+    **Returns:** a `Sampler`.
+    """
+    low, high = np.asarray(low, float), np.asarray(high, float)
+
+    def init(places, key) -> Chains:
+        random = _random(key)
+        first = around(np.atleast_2d(places), _AROUND, _FIRST_EVENLY, low, high)
+        return begin(learn(log_density, first, points, random, progress), chains, random)
+
+    def step(key, state: Chains, steps: int = points // chains) -> tuple[Chains, Taken]:
+        new = state.follow(log_density, steps, _random(key))
+        places = new.places[-steps - 1 :]
+        moved = np.any(np.diff(places, axis=0) != 0, axis=2)
+        return new, Taken(places[1:], new.log_density[-steps:], float(np.mean(moved)))
+
+    def anew(key, state: Chains) -> Chains:
+        return begin(state.drawn, chains, _random(key))
+
+    return Sampler(init, step, anew)
+
+
+def _random(key: Any) -> np.random.Generator:
+    if isinstance(key, np.random.Generator):
+        return key
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())

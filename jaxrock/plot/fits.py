@@ -1,5 +1,8 @@
-"""Figures of fits to measured histories."""
+"""Figures of fits to measured histories, and of records that were looked for."""
 
+import numpy as np
+
+from jaxrock.inverse.found_record import FoundRecord
 from jaxrock.inverse.history_fit import HistoryFit
 from jaxrock.plot.style import BLUE, GREY, RED
 
@@ -25,5 +28,34 @@ def history_fit(fit: HistoryFit, time, axes=None):
     axes[1].axhline(0, color=GREY, linewidth=0.5)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
     axes[1].set(xlabel="time [s]", ylabel="residual")
+    axes[0].legend(fontsize=8, frameon=False, loc="upper right")
+    return axes
+
+
+def found_record(found: FoundRecord, axes=None):
+    """Draw a record that was found, the one that was changed, and the change, in time and by frequency.
+
+    **Arguments:**
+
+    - `found`: result of `find_record`.
+    - `axes`: three matplotlib axes; None makes a figure.
+
+    **Returns:** the axes.
+    """
+    import matplotlib.pyplot as plt
+
+    if axes is None:
+        _, axes = plt.subplots(3, 1, figsize=(7, 6), layout="constrained", height_ratios=(2, 1, 1))
+    before, after, dt = np.asarray(found.start.samples), np.asarray(found.record.samples), float(found.start.dt)
+    time, change = dt * np.arange(before.size), after - before
+    axes[0].plot(time, before, color=GREY, linewidth=0.8, label=found.start.name or "before")
+    axes[0].plot(time, after, color=BLUE, linewidth=0.5, label="found")
+    axes[1].plot(time, change, color=RED, linewidth=0.5)
+    frequency = np.fft.rfftfreq(before.size, dt)[1:]
+    for samples, color in ((before, GREY), (change, RED)):
+        axes[2].loglog(frequency, dt * np.abs(np.fft.rfft(samples))[1:], color=color, linewidth=0.5)
+    axes[0].set(xlabel="time [s]", ylabel="acceleration [g]")
+    axes[1].set(xlabel="time [s]", ylabel="change [g]")
+    axes[2].set(xlabel="frequency [Hz]", ylabel="spectrum [g s]")
     axes[0].legend(fontsize=8, frameon=False, loc="upper right")
     return axes

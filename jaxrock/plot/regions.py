@@ -5,7 +5,7 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import RED
+from jaxrock.plot.style import GREY, RED
 
 
 def feasible_region(
@@ -46,4 +46,35 @@ def feasible_region(
     axis.set(ylabel=labels[0], xlabel=labels[1])
     if wall is not None or estimate is not None:
         axis.legend(frameon=False, fontsize=8)
+    return axis
+
+
+def search(estimate: Estimate, region: FeasibleRegion | None = None, axis=None):
+    """Draw where the search of an estimate has been: a line from each start to a dot where it ended.
+
+    **Arguments:**
+
+    - `estimate`: result of `estimate_motion`.
+    - `region`: a `FeasibleRegion` behind it, whose parameters are drawn; None: the first two of the estimate.
+    - `axis`: matplotlib axis; None makes a figure.
+
+    **Returns:** the axis.
+    """
+    import matplotlib.pyplot as plt
+
+    if axis is None:
+        _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
+    names = estimate.names[:2] if region is None else region.names
+    if len(names) < 2 or not set(names) <= set(estimate.names):
+        raise ValueError(f"Argument `estimate` must have two parameters to draw, but has {', '.join(estimate.names)}.")
+    if region is not None:
+        feasible_region(region, estimate, axis=axis)
+    else:
+        axis.set(ylabel=names[0], xlabel=names[1])
+    rows, columns = (np.asarray(estimate.trace.values)[..., estimate.names.index(name)] for name in names)
+    for row, column in zip(rows.T, columns.T):
+        here = np.flatnonzero(~np.isnan(row))
+        if here.size:
+            axis.plot(column[here], row[here], color=GREY, linewidth=0.7)
+            axis.plot(column[here[-1]], row[here[-1]], ".", color=RED, markersize=4)
     return axis

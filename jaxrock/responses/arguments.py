@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Inexact
 
-from jaxrock._checks import as_real, checked, scalar, shown, strength
+from jaxrock._checks import as_real, checked, marked, scalar, shown, strength
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -30,8 +30,13 @@ def engine_of(engine: AbstractEngine | None, model: AbstractEquation) -> Abstrac
     return Diffrax()
 
 
-def start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
-    """Initial rotation and angular velocity, checked."""
+def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[Scalar, Scalar]:
+    """Initial rotation and angular velocity, checked; what fails is not a number unless it is to `throw`."""
+    with marked(unless=throw):
+        return _start_of(initial)
+
+
+def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
     rotation, velocity = initial
     rotation = checked(
         "initial[0]", rotation, "be a rotation in (-pi/2, pi/2)", lambda x: (x > -np.pi / 2) & (x < np.pi / 2)

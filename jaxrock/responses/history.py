@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import Values, scalar, span
+from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -23,7 +23,7 @@ from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
-from jaxrock.status import Status
+from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 
 Scalar = Inexact[ArrayLike, "..."]
@@ -181,12 +181,13 @@ def simulate(
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
     samples: Annotated[int, at_least(2, 10**7)] = 2001,
+    throw: bool = True,
 ) -> Response | FlexibleResponse:
     """Compute the history of a block under a motion.
 
     **Arguments:**
 
-    - `block`, `motion`, `model`, `initial`, `engine`: as in `outcome`.
+    - `block`, `motion`, `model`, `initial`, `engine`, `throw`: as in `outcome`.
     - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
     - `samples`: number of equally spaced points of the ready-made history, at least 2; any other time is had
       by calling the result.
@@ -197,24 +198,26 @@ def simulate(
     """
     if isinstance(block, FlexibleBlock):
         budget = steps_of_flexible(model, initial, engine)
-        return simulate_flexible(block, motion, duration=duration, samples=samples, **budget)
+        return simulate_flexible(block, motion, duration=duration, samples=samples, throw=throw, **budget)
     if duration is not None:
-        duration = scalar("duration", span("duration", duration))
+        with marked(unless=throw):
+            duration = scalar("duration", span("duration", duration))
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model)
-    summary, path = _simulate(block, padded(motion), model, start_of(initial), duration, engine)
+    start = start_of(initial, throw)
+    summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    return Response(time, *_evaluate(path, time), summary, path)
+    response = Response(time, *_evaluate(path, time), summary, path)
+    return response if throw else marked_result(response, (block, motion, model, start, duration))
 
 
 @jax.jit
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
-    stop = motion.end + 10 / block.p if duration is None else jnp.asarray(duration)
-
+    scene = Scene.of(block, motion, model)
+    stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration)
     run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like, plain=_plainly)
     state, nodes, final = run((block, motion, model, initial, stop, engine))
-    scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, stop, history=True)
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
     # The largest within the duration: the end may be on the way to a peak.

@@ -25,7 +25,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
-from jaxrock.status import Status
+from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.recipe import Passes
 
@@ -87,6 +87,7 @@ def outcome(
     initial: Annotated[tuple[ArrayLike, ArrayLike], pair] = (0.0, 0.0),
     duration: ArrayLike | None = None,
     engine: AbstractEngine | None = None,
+    throw: bool = True,
 ) -> Outcome | FlexibleOutcome:
     """Tell what becomes of a block under a motion and in the free stage after it.
 
@@ -99,13 +100,17 @@ def outcome(
     - `duration`: how long to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A rigid
       block is followed to its end.
     - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
+    - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is not a
+      number, its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with
+      `throw=False`, too.
 
     **Returns:** an `Outcome`; of a flexible block, to which `model` and `initial` do not apply, a `FlexibleOutcome`.
 
     **Raises:** ValueError for arguments outside their ranges, or that do not apply; arrays where scalars are wanted.
     """
     if isinstance(block, FlexibleBlock):
-        return outcome_flexible(block, motion, duration=duration, **steps_of_flexible(model, initial, engine))
+        settings = steps_of_flexible(model, initial, engine)
+        return outcome_flexible(block, motion, duration=duration, throw=throw, **settings)
     if duration is not None:
         raise ValueError(
             "Argument `duration` does not apply to the outcome of a rigid block, which is followed to its end: use "
@@ -113,7 +118,9 @@ def outcome(
         )
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model)
-    return _outcome(block, padded(motion), model, start_of(initial), engine)
+    start = start_of(initial, throw)
+    result = _outcome(block, padded(motion), model, start, engine)
+    return result if throw else marked_result(result, (block, motion, model, start))
 
 
 @jax.jit
@@ -202,6 +209,8 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
     eps = jnp.finfo(state.closeness.dtype).eps
     unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
     graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
+    margin = jnp.where(overturned, -final.closeness_beyond, final.closeness)
+    status = Status.where(state.done, final.status, unfinished)
     return Outcome(
         differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
         clearance=jnp.where(overturned, final.clearance, final.peak_clearance),
@@ -210,7 +219,7 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
         time_of_max=unless_overturned(final.peak_time),
         impact_count=final.impacts,
         overturned=overturned,
-        margin=jnp.where(overturned, -final.closeness_beyond, final.closeness),
+        margin=margin,
         error=unless_overturned(final.error),
-        status=Status.where(state.done, final.status, unfinished),
+        status=Status.where(jnp.isnan(margin), Status.not_finite, status),
     )

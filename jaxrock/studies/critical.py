@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import ratio, scalar
-from jaxrock._described import described
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound, uplift_threshold
@@ -38,7 +38,7 @@ _LEAST = 1e-12  # [g]; amplitudes are factors on a motion
 _TIGHT = 4e-15  # width of a bracket, relative
 
 
-class Critical(eqx.Module):
+class Critical(AbstractTable):
     """Ends of overturning intervals, in rising order; (ends,) for one scene, (scenes, ends) for many, then filled up.
 
     - `count`: number of ends.
@@ -63,12 +63,19 @@ class Critical(eqx.Module):
     complete: Bool[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
 
-    __repr__ = described
-
     @property
     def lowest(self) -> Float[Array, "..."]:
         """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none."""
         return jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
+
+    @property
+    def _columns(self):
+        scenes = () if self.value.ndim == 1 else ("scene",)
+        ends, slopes = (*scenes, "end"), zip(self.names, jnp.moveaxis(self.derivative, -1, 0))
+        each = {name: getattr(self, name) for name in ("intensity", "rising", "impacts", "balanced")}
+        each |= {f"derivative.{name}": slope for name, slope in slopes}
+        told = {name: Column(ends, values) for name, values in ({"value": self.value} | each).items()}
+        return told | {name: Column(scenes, getattr(self, name)) for name in ("count", "complete")}
 
 
 @arguments

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Range, Values, not_nan, ratio
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.restitution import AbstractRestitution, Restitution
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -26,7 +27,7 @@ from jaxrock.sweeps.sweep import surface
 from jaxrock.transforms.user_function import current_function
 
 
-class Spectrum(eqx.Module):
+class Spectrum(AbstractTable):
     """A rocking spectrum; every result has the shape (..., len(abscissa)).
 
     - `abscissa`: 2 pi/p [s], or the frequency ratio omega/p [-] of a self-similar spectrum.
@@ -57,8 +58,21 @@ class Spectrum(eqx.Module):
         """Uplift threshold over the peak acceleration [-], 1/intensity; None of a rocking spectrum."""
         return None if self.intensity is None else 1 / self.intensity
 
+    @property
+    def _columns(self):
+        rocking = self.intensity is None
+        across = "abscissa" if rocking else "frequency_ratio"
+        axes = (*self.parameters, *(() if rocking else ("intensity",)), across)
+        results = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
+        return {
+            **{name: Column((name,), values) for name, values in self.parameters.items()},
+            "intensity": Column(("intensity",), self.intensity),
+            across: Column((across,), self.abscissa, "s" if rocking else "-"),
+            **{name: Column(axes, getattr(self, name)) for name in results},
+        }
 
-class OverturningMap(eqx.Module):
+
+class OverturningMap(AbstractTable):
     """An overturning map; every result has the shape (len(intensity), len(frequency_ratio)), or (..., of these two).
 
     - `frequency_ratio`: omega/p [-]; `intensity`: peak acceleration over the uplift threshold [-].
@@ -86,6 +100,16 @@ class OverturningMap(eqx.Module):
     def uplift_strength(self) -> Float[Array, " rows"]:
         """Uplift threshold over the peak acceleration [-], 1/intensity."""
         return 1 / self.intensity
+
+    @property
+    def _columns(self):
+        axes = (*self.parameters, "intensity", "frequency_ratio")
+        results = ("state", "max_rotation", "impact_count", "margin", "status")
+        return {
+            **{name: Column((name,), values) for name, values in self.parameters.items()},
+            **{name: Column((name,), getattr(self, name)) for name in axes[-2:]},
+            **{name: Column(axes, getattr(self, name)) for name in results},
+        }
 
 
 @arguments

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Num
 
 from jaxrock._aside import uninterrupted, written_aside
+from jaxrock._tables import is_status, items_of, needed
 from jaxrock.sweeps import netcdf
 from jaxrock.sweeps.description import fingerprint
-from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, needed, own_names, shape_of
+from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, own_names, shape_of
 from jaxrock.sweeps.plan import Plan
 from jaxrock.sweeps.store import create, local, opened
 
@@ -59,6 +60,19 @@ class Grid(eqx.Module):
             name: ((name,) if self.outer else (POINT,), np.asarray(values)) for name, values in self.axes.items()
         }
         return xarray.Dataset(variables, coordinates, {"layout": layout_name(self.outer)})
+
+    def to_pandas(self):
+        """The results as a `pandas.DataFrame`, indexed by the axes: a column for each result, a status in words.
+
+        **Raises:** as `to_xarray`; ImportError without pandas.
+        """
+        pandas = needed("pandas")
+        frame = self.to_xarray().to_dataframe()
+        for path, part in jax.tree_util.tree_leaves_with_path(self.values, is_leaf=is_status):
+            if is_status(part):
+                name = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
+                frame[name] = pandas.Categorical.from_codes(frame[name], items_of(part))
+        return frame
 
     def _leaves(self) -> dict[str, np.ndarray]:
         """Results by names that files can have."""

@@ -1,6 +1,5 @@
 """How axes, results and their dimensions are called, in memory and in files."""
 
-import importlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -68,11 +67,3 @@ def _can_be_stored(name: str) -> bool:
     plain = name.isprintable() and name == name.strip() and not set(name) & {"/", "\\"}
     reserved = name in ("", ".", "..") or name.startswith("__") or name.endswith(".json")
     return plain and not reserved and len(name.encode()) <= _LONGEST
-
-
-def needed(module: str):
-    """Import a module of the extra `store`, or say how to get it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f'This needs {module}: `pip install "jaxrock[store]"`.') from error

@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 
 from jaxrock._aside import written_aside
-from jaxrock.sweeps.labels import needed
+from jaxrock._tables import needed
 
 _MARK = b"\njaxrock sha256 "
 _DIGEST = hashlib.sha256().digest_size

@@ -17,8 +17,9 @@ import jax
 import numpy as np
 
 from jaxrock._aside import uninterrupted, written_aside
+from jaxrock._tables import needed
 from jaxrock.sweeps.description import Description, described, digest_of_axis
-from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, needed, shape_of
+from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, shape_of
 from jaxrock.sweeps.plan import Plan
 
 _DIGEST = hashlib.sha256().digest_size

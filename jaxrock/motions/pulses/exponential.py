@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int
 
-from jaxrock._checks import not_nan, size, strength
+from jaxrock._checks import not_nan, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.lookup import pick
@@ -20,6 +20,7 @@ class RectangularPulse(AbstractPulse):
         """What the command line calls it."""
         return "rectangle"
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
@@ -50,6 +51,7 @@ class TriangularPulse(AbstractPulse):
         """What the command line calls it."""
         return "triangle"
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
@@ -101,6 +103,7 @@ class ExponentialPulse(AbstractPulse):
     duration: Real = parameter("s", size, symbol="t_d")
     shape: Real = parameter("-", not_nan, symbol="beta")
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike):
         set_parameters(self, amplitude=amplitude, duration=duration, shape=shape)
 

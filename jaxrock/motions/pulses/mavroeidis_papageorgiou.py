@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import Range, size, strength
+from jaxrock._checks import Range, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.motions.pulses.sinusoidal import sinusoid
@@ -38,6 +38,7 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
     oscillations: Real = parameter("-", _above_one, symbol="gamma")
     phase: Real = parameter("rad", _phase, symbol="nu")
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
         set_parameters(self, amplitude=amplitude, period=period)
         set_parameters(self, oscillations=oscillations, phase=phase)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import one_of, size, strength
+from jaxrock._checks import one_of, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.xla_cpu import keep
@@ -41,6 +41,7 @@ class RickerPulse(AbstractPulse):
     center: Real = parameter("s", size)
     kind: str = eqx.field(static=True)
 
+    @with_throw
     def __init__(
         self, amplitude: ArrayLike, period: ArrayLike, kind: str = "symmetric", center: ArrayLike | None = None
     ):

@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from jaxrock._checks import size, strength
+from jaxrock._checks import size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
 from jaxrock.numerics.elementary import sine_cosine_of_any
@@ -32,6 +32,7 @@ class HalfSinePulse(AbstractPulse):
     amplitude: Real = parameter("g", strength, symbol="a_g")
     duration: Real = parameter("s", size, symbol="t_d")
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
@@ -58,6 +59,7 @@ class _OneCycle(AbstractPulse):
     amplitude: Real = parameter("g", strength, symbol="a_g")
     period: Real = parameter("s", size, symbol="T")
 
+    @with_throw
     def __init__(self, amplitude: ArrayLike, period: ArrayLike):
         set_parameters(self, amplitude=amplitude, period=period)
 

@@ -1,0 +1,83 @@
+"""Results that are tables, for xarray and pandas: with names and units, and a status in words."""
+
+import abc
+import importlib
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxrock._described import described
+
+
+class Column(NamedTuple):
+    """Values, the names of their dimensions, and their unit."""
+
+    dimensions: tuple[str, ...]
+    values: Any
+    unit: str = "-"
+
+
+class AbstractTable(eqx.Module):
+    """A result that tells its `_columns`, by name: those called like their only dimension are coordinates."""
+
+    __repr__ = described
+
+    @property
+    @abc.abstractmethod
+    def _columns(self) -> dict[str, Column]:
+        """All columns; some of them may be None, and are left out."""
+
+    def to_xarray(self):
+        """The result as an `xarray.Dataset`: units are attributes, a status is the name of its item.
+
+        **Raises:** ImportError without xarray.
+        """
+        xarray = needed("xarray")
+        columns = {name: column for name, column in self._columns.items() if column.values is not None}
+        told = {
+            name: xarray.Variable(column.dimensions, _plain(column.values), {"units": column.unit})
+            for name, column in columns.items()
+        }
+        own = {name: told.pop(name) for name, column in columns.items() if column.dimensions == (name,)}
+        return xarray.Dataset(told, own, attrs={"result": type(self).__name__})
+
+    def to_pandas(self):
+        """The result as a `pandas.DataFrame`, indexed by its coordinates: a status is a category, and units stand by
+        column in `attrs["units"]`.
+
+        **Raises:** ImportError without xarray, or pandas.
+        """
+        needed("pandas")
+        table = self.to_xarray()
+        frame = table.to_dataframe() if table.dims else table.expand_dims("row").to_dataframe()
+        for name, column in self._columns.items():
+            if name in frame and is_status(column.values):
+                frame[name] = frame[name].astype("category")
+        frame.attrs["units"] = {name: table[name].attrs["units"] for name in table.variables}
+        return frame
+
+
+def is_status(values: Any) -> bool:
+    """Whether it is a status, or an array of them."""
+    return hasattr(values, "_enumeration")
+
+
+def _plain(values: Any) -> np.ndarray:
+    """Values as NumPy's; of a status the names of items."""
+    if not is_status(values):
+        return np.asarray(values)
+    return np.array(items_of(values))[np.asarray(values._value)]
+
+
+def items_of(status: Any) -> list[str]:
+    """The names of all items of a status' kind, in the order of their numbers."""
+    return list(status._enumeration._name_to_item)
+
+
+def needed(module: str):
+    """Import a module of the extra `store`, or say how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f'This needs {module}: `pip install "jaxrock[store]"`.') from error

@@ -1,0 +1,271 @@
+"""Critical excitation: the least-changed record that topples blocks, spares them, or brings them to a margin.
+
+There are as many unknowns as samples, and margins are neither convex nor continuous in them: what is found is a local
+minimum of the change, the least of those from several starts. Each start is a direction of change: louder or softer,
+where an optimiser of optax goes, and against the slopes of the margins under records nearby.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxrock._arguments import arguments, at_least, gradient_transformation, known, pair
+from jaxrock._checks import finite, not_negative, one_of, scalar, shown
+from jaxrock._parameters import broadcast, leaves_of
+from jaxrock._precision import say_if_single
+from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.nearest_change import Found, Search, Site, allowed_changes, least_change, rms
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.motions.record import Record
+from jaxrock.responses.current_model import current_model
+
+Real = Float[Array, "..."]
+Target = str | ArrayLike | Sequence[str | float]
+_APPROACH = 40  # steps of the optimiser
+_NEARBY = 0.15  # root mean square of what is added to a record to start nearby, over the record's
+_SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that, or above
+_USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth digit decides
+
+
+class RecordStatus(eqx.Enumeration):
+    """What became of a search for a record; `RecordStatus[found.status]` is the message."""
+
+    successful = "The margins are as wanted. No record near this one that does as much is nearer to the start."
+    unchanged = "The margins are as wanted under the record as it is."
+    useless_slopes = (
+        "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
+        "long that slopes lead nowhere, and digits of the record decide that nobody measures. There are nearer ones."
+    )
+    not_reached = (
+        "No change was found that makes margins as wanted: none on straight lines from the start, nor on the way of "
+        "the optimiser. More `starts`, a wider `band`, or fewer blocks may help."
+    )
+
+
+class FoundRecord(AbstractTable):
+    """A record that brings blocks to margins.
+
+    - `record`: the `Record`; `start`: the one that was changed.
+    - `change`: root mean square of the change [g]; infinite if nothing was found, and the record is the start.
+    - `scaling`: root mean square of the change that it takes to scale the start until margins are as wanted [g];
+      infinite if no factor does it.
+    - `margin`: (blocks,) margins under the record.
+    - `slope`: by how much the margin that changes most does so for a change of root mean square 1 g [1/g], where the
+      search turned last. (At the verge itself a block in balance may wait for what is left of the record, and slopes
+      grow as exp(p t).)
+    - `changes`: (starts,) root mean squares of the changes to which each start came [g]; infinite where it did not
+      come to anything. Those that differ are local minima.
+    - `path`: (steps,) root mean squares on the way from the start that came farthest [g].
+    - `status`: a `RecordStatus`.
+    """
+
+    record: Record
+    start: Record
+    change: Real
+    scaling: Real
+    margin: Real
+    slope: Real
+    changes: Real
+    path: Real
+    status: RecordStatus
+
+    @property
+    def _columns(self):
+        before, after = self.start.samples, self.record.samples
+        return {
+            "time": Column(("time",), self.start.knots, "s"),
+            "start": Column(("time",), before, "g"),
+            "record": Column(("time",), after, "g"),
+            "added": Column(("time",), after - before, "g"),
+            "change": Column((), self.change, "g"),
+            "scaling": Column((), self.scaling, "g"),
+            "status": Column((), self.status),
+        }
+
+
+def _usual():
+    """Momentum, in steps of two hundredths of the record at first."""
+    import optax
+
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.sgd(0.02, momentum=0.9))
+
+
+@arguments
+def find_record(
+    block: Block | AsymmetricBlock,
+    start: Record,
+    target: Target = "topple",
+    *,
+    optimizer: Annotated[Any, gradient_transformation] = None,
+    penalty: Annotated[float, known(not_negative)] = 1.0,
+    band: Annotated[tuple[float, float] | None, pair] = None,
+    baseline: bool = True,
+    starts: Annotated[int, at_least(1, 10**4)] = 6,
+    steps: Annotated[int, at_least(1, 10**6)] = 60,
+    seed: Annotated[int, at_least(0)] = 0,
+    model: AbstractEquation = Housner(),
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> FoundRecord:
+    """Find the record nearest to a given one that topples a block, spares it, or brings it to a margin.
+
+    **Arguments:**
+
+    - `block`: a `Block` or `AsymmetricBlock`, of scalars or of (blocks,) arrays: all of these at once.
+    - `start`: the `Record` to change.
+    - `target`: "topple", "spare", or a margin to be come to, which a block that is above comes to from above; one for
+      all blocks, or a list.
+    - `optimizer`: what looks for a first change, by slopes of margins: an `optax.GradientTransformation`, for changes
+      in root mean squares of the record; None: momentum with clipped slopes. `penalty`: weight of the squared change
+      beside the margins there, 0 or more.
+    - `band`: frequencies between which the record may change [Hz]; None: at all.
+    - `baseline`: whether velocity and displacement of the ground at the end of the record stay as they are.
+    - `starts`: directions from which the nearest record is looked for, at least 1: three, and others from records
+      nearby by `seed`. `steps`: for each, at most.
+    - `model`, `engine`, `progress`: as in `estimate_motion`.
+
+    **Returns:** a `FoundRecord`.
+
+    **Raises:** ValueError for arguments outside their ranges, and for a record that does not shake.
+
+    **Source:** Hasofer & Lind (1974), Rackwitz & Fiessler (1978), the nearest point of a limit surface; Drenick (1970),
+    critical excitation.
+    """
+    say_if_single()
+    samples = np.asarray(start.samples)
+    if samples.ndim != 1:
+        raise ValueError(f"Argument `start` must be one record, but has samples of shape {samples.shape}.")
+    size = float(rms(samples))
+    if not size > 0:
+        raise ValueError("Argument `start` must shake, but all its samples are zero.")
+    site = _site(block, start, target, model, engine)
+    search = Search(site, size, allowed_changes(samples.size, float(start.dt), _checked_band(band), baseline))
+    if search.reached(np.zeros((1, samples.size)))[0]:
+        return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0)
+    bar = Progress(starts * steps, "record", progress)
+    scaled = [search.along(direction) for direction in (samples, -samples)]
+    directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
+    found = []
+    for number in range(starts):
+        reached = search.along(directions(number))
+        found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
+        bar.add((number + 1) * steps - bar.done)
+    lengths = [each.length if each else np.inf for each in found]
+    return _result(search, start, found[int(np.argmin(lengths))], lengths, min(_length(each) for each in scaled))
+
+
+def _length(found: Found | None) -> float:
+    return np.inf if found is None else found.length
+
+
+def _checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None:
+    if band is None:
+        return None
+    low, high = (float(scalar(f"band[{i}]", not_negative(f"band[{i}]", x))) for i, x in enumerate(band))
+    if not low < high:
+        raise ValueError(f"Argument `band` must rise, but is {shown(band)}.")
+    return low, high
+
+
+def _site(block, start: Record, target, model: AbstractEquation, engine: AbstractEngine | None) -> Site:
+    """The blocks, each with the margin that is wanted of it, and on which side of that it is to come."""
+    shape = np.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(block) if leaf.declared.axes == 0))
+    if len(shape) > 1:
+        raise ValueError(f"Argument `block` must be one block or a list of them, but has shape {shape}.")
+    count = shape[0] if shape else 1
+    blocks = broadcast(block, (count,))
+    targets = [target] * count if isinstance(target, str) or np.ndim(target) == 0 else list(target)
+    if len(targets) != count:
+        raise ValueError(f"Argument `target` must be one for each of {count} blocks, but has {len(targets)}.")
+    for each in targets:
+        if isinstance(each, str):
+            one_of("target", each, tuple(_SIDES))
+    wanted = jnp.asarray([0.0 if isinstance(x, str) else float(scalar("target", finite("target", x))) for x in targets])
+    model = current_model(model, blocks, start)
+    site = Site(blocks, start.samples, start.dt, jnp.ones(count), wanted, model, engine)
+    margin = site.margins(jnp.zeros_like(start.samples))[0]
+    from_above = [x > y for x, y in zip(margin, wanted)]
+    sides = [_SIDES[x] if isinstance(x, str) else 1.0 if above else -1.0 for x, above in zip(targets, from_above)]
+    return eqx.tree_at(lambda it: it.side, site, jnp.asarray(sides))
+
+
+class _Directions(NamedTuple):
+    """Directions of change by number."""
+
+    search: Search
+    samples: np.ndarray
+    optimizer: Any
+    penalty: float
+    random: np.random.Generator
+
+    def __call__(self, number: int) -> np.ndarray:
+        """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby."""
+        if number == 0:
+            louder, softer = (self.search.along(self.search.allowed(x)) for x in (self.samples, -self.samples))
+            best = min(louder, softer, key=_length)
+            return self.samples * 0.0 if best is None else best.direction
+        if number == 1:
+            return self._by_optimizer()
+        nearby = self.search.allowed(self._noise()) if number > 2 else np.zeros_like(self.samples)
+        excess, slopes = self.search.slopes(nearby)
+        straight = least_change(slopes, -excess)
+        return nearby * 0.0 if straight is None else straight
+
+    def _noise(self) -> np.ndarray:
+        """A record like the one that is changed, with other phases."""
+        spectrum = np.fft.rfft(self.samples)
+        turned = spectrum * np.exp(2j * np.pi * self.random.uniform(size=spectrum.size))
+        noise = np.fft.irfft(turned, self.samples.size)
+        return _NEARBY * self.search.size * noise / max(rms(noise), 1e-300)
+
+    def _by_optimizer(self) -> np.ndarray:
+        """Where the optimiser comes to what is wanted, or where it ends; for changes in root mean squares."""
+        import optax
+
+        optimizer = optax.with_extra_args_support(self.optimizer or _usual())
+        unit = self.search.size * np.sqrt(self.samples.size)
+        place = jnp.zeros(self.samples.size)
+        state = optimizer.init(place)
+        for _ in range(_APPROACH):
+            excess, slopes = self.search.slopes(np.asarray(place) * unit)
+            if (excess <= 0).all():
+                break
+            value = np.sum(np.maximum(excess, 0.0)) + self.penalty * np.sum(place**2)
+            slope = jnp.asarray(unit * np.sum(slopes[excess > 0], axis=0)) + 2 * self.penalty * place
+            changes, state = optimizer.update(slope, state, place, value=value, grad=slope)
+            place = jnp.asarray(self.search.allowed(np.asarray(place + changes)))
+        return np.asarray(place)
+
+
+def _result(search: Search, start: Record, found: Found | None, lengths: list[float], scaling: float) -> FoundRecord:
+    change = np.zeros_like(start.samples) if found is None else found.change
+    margin, _ = search.site.margins(jnp.asarray(change))
+    slope = np.nan if found is None else found.slope
+    status = RecordStatus.successful
+    if found is None:
+        status = RecordStatus.not_reached
+    elif found.length == 0:
+        status = RecordStatus.unchanged
+    elif slope > _USELESS:
+        status = RecordStatus.useless_slopes
+    name = f"{start.name}, changed".removeprefix(", ")
+    return FoundRecord(
+        record=start if found is None else Record(start.samples + change, start.dt, name),
+        start=start,
+        change=jnp.asarray(_length(found)),
+        scaling=jnp.asarray(scaling),
+        margin=margin,
+        slope=jnp.asarray(slope),
+        changes=jnp.asarray(lengths),
+        path=jnp.asarray(found.lengths if found else ()),
+        status=status,
+    )

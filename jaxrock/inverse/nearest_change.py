@@ -1,0 +1,215 @@
+"""The nearest place, in a space of changes of a record, where margins of blocks are as wanted: by slopes and rays.
+
+On the straight line from no change to a change that does what is wanted there is a first one that does. So a direction
+has a length, which is known by margins alone, and directions are turned by slopes: towards the least change that would
+do if margins were straight (Hasofer & Lind 1974; Rackwitz & Fiessler 1978), by that much, or less, as makes the length
+shorter. Verdicts decide about every step, so that margins that jump, or have a kink, mislead nobody.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from scipy.optimize import nnls
+
+from jaxrock._parameters import one_of_many, shared
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.record import Record
+from jaxrock.responses.outcome import outcome
+from jaxrock.status import Status
+
+_LANES = 64  # records in one call of the compiled program
+_SHORTEST, _LONGEST = 1e-4, 1e2  # lengths of changes that are looked at first, in root mean squares of the record
+_CLOSER = 5  # times that the place on a line is looked for, each 64 times as close
+_TURNS = 0.5 ** np.arange(8)  # shares of the way to the direction that straight margins would have
+_SHORTER = np.array([0.7, 0.85, 0.93, 0.97, 0.985, 0.993, 0.997, 0.999])  # of the length before
+
+
+class Site(eqx.Module):
+    """Blocks under a record, and the margins that are wanted: not above `target` where `side` is 1, not below it where
+    that is -1."""
+
+    blocks: Block | AsymmetricBlock
+    samples: Float[Array, " n"]
+    dt: Float[ArrayLike, ""]
+    side: Float[Array, " blocks"]
+    target: Float[Array, " blocks"]
+    model: AbstractEquation
+    engine: AbstractEngine | None
+
+    def margin(self, block: Block | AsymmetricBlock, change: Float[Array, " n"]):
+        """The margin of a block under the changed record, and whether it is known."""
+        record = Record(self.samples + change, self.dt, throw=False)
+        result = outcome(block, record, self.model, engine=self.engine, throw=False)
+        return result.margin, result.status == Status.successful
+
+    def margins(self, change: Float[Array, " n"]) -> tuple[Float[Array, " blocks"], Bool[Array, " blocks"]]:
+        """Those of all blocks."""
+        own = jax.tree.map(lambda whole: None if whole else 0, shared(self.blocks))
+        return jax.vmap(lambda block: self.margin(block, change), in_axes=(own,))(self.blocks)
+
+
+@eqx.filter_jit
+def _reached(site: Site, changes: Float[Array, "lanes n"]) -> Bool[Array, " lanes"]:
+    margin, known = jax.vmap(site.margins)(changes)
+    return jnp.all((site.side * (margin - site.target) <= 0) & known, axis=1)
+
+
+@eqx.filter_jit
+def _margin_and_slopes(site: Site, number: Int[ArrayLike, ""], change: Float[Array, " n"]):
+    block = one_of_many(site.blocks, number)
+    return jax.value_and_grad(lambda change: site.margin(block, change)[0])(change)
+
+
+class Found(NamedTuple):
+    """A change that does what is wanted: its direction, of root mean square 1, and its length [g]; the lengths on the
+    way to it, and the largest slope of a margin by a length [1/g] where it was turned last."""
+
+    direction: np.ndarray
+    length: float
+    lengths: tuple[float, ...] = ()
+    slope: float = np.nan
+
+    @property
+    def change(self) -> np.ndarray:
+        """The change itself [g]."""
+        return self.length * self.direction
+
+
+class Search(NamedTuple):
+    """A site, the root mean square of its record [g], and the projection of changes (..., n) onto those allowed."""
+
+    site: Site
+    size: float
+    allowed: Callable[[np.ndarray], np.ndarray]
+
+    def reached(self, changes: np.ndarray) -> np.ndarray:
+        """Whether changes, (lanes, n), do what is wanted."""
+        found = []
+        for begin in range(0, len(changes), _LANES):
+            part = changes[begin : begin + _LANES]
+            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
+            found.append(np.asarray(_reached(self.site, padded))[: len(part)])
+        return np.concatenate(found)
+
+    def slopes(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By how much margins fail, (blocks,), and its derivatives by the allowed changes, (blocks, n) [1/g]."""
+        found = [_margin_and_slopes(self.site, number, change) for number in range(self.site.side.size)]
+        margin, slopes = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
+        side = np.asarray(self.site.side)
+        slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
+        return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)
+
+    def along(self, direction: np.ndarray) -> Found | None:
+        """The first change in a direction that does what is wanted, about; None: there is none."""
+        scale = rms(direction)
+        if not scale > 0:
+            return None
+        direction = direction / scale
+        lengths = self.size * np.geomspace(_SHORTEST, _LONGEST, _LANES)
+        good = self.reached(lengths[:, None] * direction)
+        if not good.any():
+            return None
+        first = int(np.argmax(good))
+        return self._closer(Found(direction, lengths[first]), lengths[first - 1] if first else 0.0)
+
+    def _closer(self, found: Found, below: float) -> Found:
+        """The same where it does just what is wanted; it does not `below`."""
+        above = found.length
+        for _ in range(_CLOSER):
+            lengths = np.linspace(below, above, _LANES + 1)[1:]
+            good = self.reached(lengths[:, None] * found.direction)
+            good[-1] = True
+            first = int(np.argmax(good))
+            below, above = lengths[first - 1] if first else below, lengths[first]
+        return found._replace(length=float(above))
+
+    def nearer(self, found: Found, steps: int, progress: Callable[[], None] = lambda: None) -> Found:
+        """A shorter change that does what is wanted as well: none near it is shorter by a thousandth."""
+        lengths, slope = [found.length], np.nan
+        for _ in range(steps):
+            excess, slopes = self.slopes(found.change)
+            slope = float(rms(slopes).max()) * slopes.shape[1]
+            straight = least_change(slopes, slopes @ found.change - excess)
+            progress()
+            if straight is None:
+                break
+            turned = (1 - _TURNS[:, None]) * found.change + _TURNS[:, None] * straight
+            turned = turned / np.maximum(rms(turned), 1e-300)[:, None]
+            shorter = found.length * _SHORTER
+            tried = self.reached((turned[:, None] * shorter[:, None]).reshape(-1, turned.shape[1]))
+            good = tried.reshape(_TURNS.size, _SHORTER.size)
+            if not good.any():
+                break
+            best = np.where(good.any(axis=1), good.argmax(axis=1), _SHORTER.size)
+            turn = int(np.argmin(best))
+            found = found._replace(direction=turned[turn], length=float(shorter[best[turn]]))
+            lengths.append(found.length)
+        return self._to_the_verge(found)._replace(lengths=tuple(lengths), slope=slope)
+
+    def _to_the_verge(self, found: Found) -> Found:
+        lengths = found.length * np.linspace(0.9, 1.0, _LANES)
+        bad = np.flatnonzero(~self.reached(lengths[:, None] * found.direction)[:-1])
+        if not bad.size:
+            return found
+        return self._closer(found._replace(length=lengths[bad[-1] + 1]), lengths[bad[-1]])
+
+
+def rms(changes: np.ndarray) -> Any:
+    """Root mean squares, (...), of changes (..., n)."""
+    return np.sqrt(np.mean(np.square(changes), axis=-1))
+
+
+def least_change(slopes: np.ndarray, bound: np.ndarray) -> np.ndarray | None:
+    """The shortest change (n,) with slopes @ change <= bound, of slopes (blocks, n); None where there is none.
+
+    **Source:** Lawson & Hanson (1974), 23.4: least distance programming.
+    """
+    scale = np.linalg.norm(slopes, axis=1)
+    if not (scale > 0).all():
+        return None
+    rows, bound = slopes / scale[:, None], bound / scale
+    size = np.abs(bound).max()
+    if size == 0:
+        return np.zeros(slopes.shape[1])
+    matrix = np.vstack([-rows.T, -bound[None] / size])
+    weights, _ = nnls(matrix, np.append(np.zeros(rows.shape[1]), 1.0))
+    left = matrix @ weights
+    left[-1] -= 1.0
+    return None if left[-1] > -1e-12 else -left[:-1] / left[-1] * size
+
+
+def allowed_changes(count: int, dt: float, band: tuple[float, float] | None, baseline: bool) -> Callable:
+    """The orthogonal projection of changes, (..., n), onto those within a band of frequencies [Hz] that leave velocity
+    and displacement at the end of the record as they are, if `baseline`."""
+    inside = np.ones(count // 2 + 1, bool)
+    if band is not None:
+        frequency = np.fft.rfftfreq(count, dt)
+        inside = (frequency >= band[0]) & (frequency <= band[1])
+
+    def in_band(changes: np.ndarray) -> np.ndarray:
+        return changes if inside.all() else np.fft.irfft(np.fft.rfft(changes, axis=-1) * inside, count, axis=-1)
+
+    if not baseline or count < 4:
+        return in_band
+    time = dt * np.arange(count)
+    velocity, displacement = np.ones(count), time[-1] - time
+    # Of straight lines between samples, exactly.
+    velocity[[0, -1]] = 0.5
+    displacement[[0, -1]] = time[-1] / 2 - dt / 6, dt / 6
+    both = in_band(np.stack([velocity, displacement / time[-1]]))
+    left, sizes, rows = np.linalg.svd(both, full_matrices=False)
+    rows = rows[sizes > 1e-12 * np.sqrt(count)]
+
+    def projected(changes: np.ndarray) -> np.ndarray:
+        changes = in_band(changes)
+        return changes - (changes @ rows.T) @ rows
+
+    return projected

@@ -1,0 +1,161 @@
+"""Searches for the maxima of a likelihood from many starts, by own climbers or by optimisers of optax and optimistix.
+
+Optimisers of other libraries take their steps side by side, in one compiled program, until each of them says that it
+has arrived; where they have been is known afterwards, as it is of own climbers.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Inexact
+
+from jaxrock._checks import shown
+from jaxrock.inverse.unknowns import Evaluator, Problem
+from jaxrock.numerics.climb import Summits, climb
+
+Real = Inexact[Array, "..."]
+_TOGETHER = 8  # climbers in one call of the compiled program
+_STEPS = 300  # of an optimiser, at most
+_TOLERANCE = 1e-6  # relative and absolute, at which an optimiser of optax has arrived
+_PATIENCE, _LEAST = 40, 1e-7  # steps in which one must gain so much; for those that never say that they have arrived
+
+
+class Trace(eqx.Module):
+    """Where a search from many starts has been; what has ended, or has no motion, is not a number from then on.
+
+    - `values`: (steps, starts, parameters), in the order of an estimate's `names`, in their units.
+    - `log_likelihood`: (steps, starts), with the priors.
+    """
+
+    values: Float[Array, "steps starts parameters"]
+    log_likelihood: Float[Array, "steps starts"]
+
+    @classmethod
+    def of(cls, evaluate: Evaluator, summits: Summits) -> "Trace":
+        """That of points on the way to summits."""
+        points, values = summits.path
+        places = jnp.asarray(evaluate.places(points))
+        parameters = jnp.stack(list(evaluate.problem.values(places).values()), axis=-1)
+        gone = jnp.isnan(jnp.asarray(values))
+        return cls(jnp.where(gone[..., None], jnp.nan, parameters), jnp.asarray(values))
+
+
+def optimizer_or_none(name: str, value: Any) -> Any:
+    """An optimiser of optax, or a minimiser of optimistix, or None."""
+    if value is None or _is_of_optax(value):
+        return value
+    import optimistix
+
+    if isinstance(value, optimistix.AbstractMinimiser):
+        return value
+    said = "be an optax.GradientTransformation or an optimistix.AbstractMinimiser"
+    raise ValueError(f"Argument `{name}` must {said}, but is {shown(value)}.")
+
+
+def _is_of_optax(value: Any) -> bool:
+    return not isinstance(value, type) and callable(getattr(value, "update", None)) and hasattr(value, "init")
+
+
+def summits_of(evaluate: Evaluator, starts: np.ndarray, optimizer: Any = None) -> Summits:
+    """Maxima from many starts, by an optimiser; None: own climbers."""
+    return climb(evaluate, starts) if optimizer is None else _Foreign.of(optimizer, evaluate).climbed(starts)
+
+
+class _Foreign:
+    """Climbers by a minimiser of optimistix, or of optax within one."""
+
+    def __init__(self, solver: Any, evaluate: Evaluator):
+        self.solver, self.evaluate = solver, evaluate
+        self.low, self.high = evaluate.ends
+
+    @classmethod
+    def of(cls, optimizer: Any, evaluate: Evaluator) -> "_Foreign":
+        import optimistix
+
+        if not isinstance(optimizer, optimistix.AbstractMinimiser):
+            import optax
+
+            optimizer = optax.with_extra_args_support(optimizer)
+            optimizer = optimistix.OptaxMinimiser(optimizer, rtol=_TOLERANCE, atol=_TOLERANCE)
+        return cls(optimizer, evaluate)
+
+    def climbed(self, starts: np.ndarray) -> Summits:
+        """Where climbers arrive."""
+        parts = [self._together(starts[i : i + _TOGETHER]) for i in range(0, len(starts), _TOGETHER)]
+        best, arrived = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        values, _ = self.evaluate(best)
+        longest = max(len(part[2]) for part in parts)
+        paths = [np.concatenate([_lengthened(np.array(part[i]), longest) for part in parts], axis=1) for i in (2, 3)]
+        return Summits(best, values, arrived & np.isfinite(values), tuple(paths))
+
+    def _together(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, list, list]:
+        """The best points, whether they are those of climbers that have arrived, and all points and values."""
+        count, all_points, all_values = len(starts), [], []
+        points = jnp.asarray(np.pad(starts, ((0, _TOGETHER - count), (0, 0)), mode="edge"))
+        problem, ends = self.evaluate.problem, jnp.asarray(self.evaluate.ends)
+        state = _begun(self.solver, problem, ends, points)
+        done, arrived = np.zeros(count, bool), np.zeros(count, bool)
+        since, top = np.zeros(count, int), np.full(count, -np.inf)
+        best = np.array(starts)
+        for _ in range(_STEPS):
+            points, state, (at, loss), ended = _stepped(self.solver, problem, ends, points, state)
+            at, value = np.asarray(at)[:count], -np.asarray(loss)[:count]
+            self.evaluate.note(self.evaluate.places(at), value)
+            all_points.append(np.where(done[:, None], np.nan, at))
+            all_values.append(np.where(done | ~np.isfinite(value), np.nan, value))
+            gained = np.where(np.isfinite(value), value, -np.inf) > top + _LEAST
+            better = (value > top) & ~done
+            best[better], top[better] = at[better], value[better]
+            since = np.where(gained, 0, since + 1)
+            newly = ~done & (np.asarray(ended)[:count] | (since >= _PATIENCE))
+            arrived |= newly
+            done |= newly
+            if done.all():
+                break
+        return best, arrived, all_points, all_values
+
+
+def _lengthened(path: np.ndarray, steps: int) -> np.ndarray:
+    return np.pad(path, ((0, steps - len(path)), *((0, 0),) * (path.ndim - 1)), constant_values=np.nan)
+
+
+def _loss_of(problem: Problem, ends: Real):
+    """What is to be made small at a point, and the point and that once more: the end of a step may be another."""
+
+    def loss(point, _):
+        low, high = ends
+        value = -problem.log_density(low + (high - low) * (1 + jnp.sin(point)) / 2)
+        return value, (point, value)
+
+    return loss
+
+
+def _each(function):
+    """A function of one climber's point and state, of many."""
+    return eqx.filter_vmap(function, in_axes=eqx.if_array(0), out_axes=eqx.if_array(0))
+
+
+@eqx.filter_jit
+def _begun(solver, problem: Problem, ends: Real, points: Real):
+    loss = _loss_of(problem, ends)
+
+    def one(point):
+        value, aux = jax.eval_shape(loss, point, None)
+        return solver.init(loss, point, None, {}, value, aux, frozenset())
+
+    return _each(one)(points)
+
+
+@eqx.filter_jit
+def _stepped(solver, problem: Problem, ends: Real, points: Real, state):
+    loss = _loss_of(problem, ends)
+
+    def one(point, state):
+        new, state, aux = solver.step(loss, point, None, {}, state, frozenset())
+        ended, _ = solver.terminate(loss, new, None, {}, state, frozenset())
+        return new, state, aux, ended
+
+    return _each(one)(points, state)

@@ -1,0 +1,119 @@
+"""Results as tables of xarray and pandas: names, units, a status in words; of results that are made by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock._tables import AbstractTable, items_of
+
+pytest.importorskip("xarray")
+pytest.importorskip("pandas")
+
+ONE = jnp.asarray(1.0)
+STATUS = jax.tree.map(lambda *x: jnp.stack(x), rk.Status.successful, rk.Status.undecided, rk.Status.not_finite)
+RECORD = rk.Record([0.1, 0.2, -0.3], 0.5)
+
+
+def made(kind, **fields):
+    """A result of which only some fields are known."""
+    result = object.__new__(kind)
+    for name, value in fields.items():
+        object.__setattr__(result, name, value)
+    return result
+
+
+TABLES = {
+    "spectrum": made(
+        rk.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0), max_velocity=jnp.ones(3),
+        impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3), status=STATUS, intensity=None,
+        parameters={},
+    ),
+    "self-similar spectrum": made(
+        rk.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.ones((2, 1, 3)),
+        max_velocity=jnp.ones((2, 1, 3)), impact_count=jnp.ones((2, 1, 3)), overturned=jnp.zeros((2, 1, 3), bool),
+        margin=jnp.ones((2, 1, 3)), status=jax.tree.map(lambda x: jnp.tile(x, (2, 1, 1)), STATUS),
+        intensity=jnp.array([1.5]), parameters={"shape": jnp.array([0.0, 1.0])},
+    ),
+    "map": made(
+        rk.OverturningMap, frequency_ratio=jnp.array([1.0, 2.0, 3.0]), intensity=jnp.array([2.0]),
+        state=jnp.ones((1, 3)), max_rotation=jnp.ones((1, 3)), impact_count=jnp.ones((1, 3)), margin=jnp.ones((1, 3)),
+        status=jax.tree.map(lambda x: x[None], STATUS), parameters={},
+    ),
+    "critical amplitudes": made(
+        rk.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)), rising=jnp.ones((1, 2)),
+        impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
+        complete=jnp.array([True]), names=("alpha",),
+    ),
+    "estimate": made(
+        rk.Estimate, names=("amplitude", "period"), values=jnp.array([0.3, 0.8]), interval=jnp.ones((2, 2)),
+        open=jnp.zeros((2, 2), bool), log_likelihood=ONE, surprise=ONE, scatter=ONE,
+        status=rk.EstimateStatus.open_interval,
+    ),
+    "posterior": made(
+        rk.Posterior, names=("amplitude",), samples=jnp.ones((2, 3, 1)), log_density=jnp.ones((2, 3)),
+        status=rk.PosteriorStatus.not_converged,
+    ),
+    "region": made(
+        rk.FeasibleRegion, names=("amplitude", "period"), values=(jnp.ones(2), jnp.ones(3)),
+        log_likelihood=jnp.ones((2, 3)), allowed=jnp.ones((2, 3), bool),
+    ),
+    "unexceeded": made(
+        rk.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)), weakest=jnp.ones(3),
+        complete=jnp.ones(3, bool),
+    ),
+    "found record": made(
+        rk.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE, status=rk.RecordStatus.useless_slopes
+    ),
+    "history fit": made(
+        rk.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1), scatter=0.1,
+        residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.HistoryStatus.not_identified,
+    ),
+}  # fmt: skip
+
+
+def kinds(kind):
+    return {kind} | {below for each in kind.__subclasses__() for below in kinds(each)}
+
+
+def test_all_tables_are_tried():
+    assert {type(table) for table in TABLES.values()} == kinds(AbstractTable) - {AbstractTable}
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+def test_tables(table):
+    """Every column has its unit, and every row of the frame is one of the dataset."""
+    data, frame = table.to_xarray(), table.to_pandas()
+    assert data.attrs["result"] == type(table).__name__
+    assert all(variable.attrs["units"] for variable in data.variables.values())
+    assert len(frame) == max(np.prod([*data.sizes.values()], dtype=int), 1)
+    assert set(frame.columns) == set(data.data_vars)
+    assert set(frame.attrs["units"]) == set(data.variables)
+    assert "status" not in frame or frame["status"].dtype == "category"
+
+
+def test_the_words_of_a_status():
+    data = TABLES["spectrum"].to_xarray()
+    assert data["status"].values.tolist() == ["successful", "undecided", "not_finite"]
+    assert data["abscissa"].attrs["units"] == "s" and "intensity" not in data
+    assert TABLES["estimate"].to_xarray()["status"].item() == "open_interval"
+    for kind in (rk.Status, rk.EstimateStatus, rk.RecordStatus):
+        for name in items_of(kind.successful):
+            item = getattr(kind, name)
+            assert items_of(item)[int(item._value)] == name
+
+
+def test_values_are_where_they_belong():
+    data = TABLES["self-similar spectrum"].to_xarray()
+    assert data["margin"].dims == ("shape", "intensity", "frequency_ratio")
+    assert TABLES["estimate"].to_pandas().loc["period", "value"] == 0.8
+    assert TABLES["posterior"].to_xarray()["amplitude"].attrs["units"] == "g"
+    np.testing.assert_array_equal(TABLES["found record"].to_xarray()["time"], [0.0, 0.5, 1.0])
+
+
+def test_a_grid_in_pandas():
+    grid = rk.Grid({"x": np.array([1.0, 2.0, 3.0])}, {"status": STATUS, "double": np.array([2.0, 4.0, 6.0])})
+    frame = grid.to_pandas()
+    assert frame["status"].tolist() == ["successful", "undecided", "not_finite"]
+    assert frame.loc[2.0, "double"] == 4.0

@@ -1,0 +1,166 @@
+"""Trial steps outside of a range: with `throw=False` they are not numbers, which a status tells, and nothing raises."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jaxrock as rk
+
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
+BLOCK, SINE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.3, 1.0)
+NAN, INF = np.nan, np.inf
+
+# What makes a part of a scene of one number, a good one and a bad one.
+NUMBERS = {
+    "alpha": (lambda x, **k: rk.Block(x, 2.0, 0.9, **k), 0.2, -0.1),
+    "alpha beyond Housner's value": (lambda x, **k: rk.Block(x, 2.0, **k), 0.2, 1.2),
+    "p": (lambda x, **k: rk.Block(0.2, x, 0.9, **k), 2.0, 0.0),
+    "restitution": (lambda x, **k: rk.Block(0.2, 2.0, x, **k), 0.9, 1.3),
+    "width": (lambda x, **k: rk.Block.from_dimensions(x, 3.0, 0.9, **k), 0.5, -0.5),
+    "radius": (lambda x, **k: rk.Block.from_radius(0.2, x, 0.9, **k), 1.0, INF),
+    "inertia ratio": (lambda x, **k: rk.restitution.Housner(x, **k), 0.75, 1.2),
+    "scale of a law": (lambda x, **k: rk.restitution.SpeedDependent(0.9, 0.5, x, **k), 0.5, -0.5),
+    "restitution of two sides": (lambda x, **k: rk.restitution.PerSide(x, 1.2, **k), 0.8, 0.9),
+    "inertia of two sides": (lambda x, **k: rk.AsymmetricBlock(0.2, 0.3, 2.0, x, **k), 0.75, 2.0),
+    "second frequency": (lambda x, **k: rk.AsymmetricBlock.from_frequencies(0.2, 0.3, 2.0, x, 0.9, **k), 2.0, 9.0),
+    "distance of a corner": (lambda x, **k: rk.AsymmetricBlock.from_radii(0.2, 0.3, x, 1.0, 0.5, **k), 1.0, -1.0),
+    "place of a corner": (
+        lambda x, **k: rk.AsymmetricBlock.from_corners(x * jnp.array([1.0, 0.0]), [-0.2, 0.0], [0.0, 1.0], 0.5, **k),
+        0.2, -0.2,
+    ),
+    "stiffness": (lambda x, **k: rk.FlexibleBlock(0.5, 3.0, x, 2000.0, 0.05, **k), 1e9, 0.0),
+    "amplitude": (lambda x, **k: rk.SinePulse(x, 1.0, **k), 0.3, NAN),
+    "period": (lambda x, **k: rk.SinePulse(0.3, x, **k), 1.0, -1.0),
+    "duration": (lambda x, **k: rk.HalfSinePulse(0.3, x, **k), 1.0, 0.0),
+    "cosine": (lambda x, **k: rk.CosinePulse(0.3, x, **k), 1.0, 0.0),
+    "rectangle": (lambda x, **k: rk.RectangularPulse(0.3, x, **k), 1.0, 0.0),
+    "triangle": (lambda x, **k: rk.TriangularPulse(0.3, x, **k), 1.0, 0.0),
+    "shape": (lambda x, **k: rk.ExponentialPulse(0.3, 1.0, x, **k), 1.0, NAN),
+    "centre": (lambda x, **k: rk.RickerPulse(0.3, 1.0, center=x, **k), 1.0, -1.0),
+    "oscillations": (lambda x, **k: rk.MavroeidisPapageorgiouPulse(0.3, 1.0, x, **k), 2.0, 0.5),
+    "sample": (lambda x, **k: rk.Record(jnp.stack([jnp.asarray(0.1), jnp.asarray(x)]), 0.1, **k), 0.3, INF),
+    "time step": (lambda x, **k: rk.Record([0.1, 0.3], x, **k), 0.1, 0.0),
+    "delay": (lambda x, **k: SINE.shifted(x, **k), 0.5, -0.5),
+}  # fmt: skip
+
+
+def is_number(part) -> bool:
+    return not any(bool(jnp.isnan(x).any()) for x in jax.tree.leaves(part))
+
+
+@pytest.mark.parametrize(("make", "good", "bad"), NUMBERS.values(), ids=NUMBERS)
+def test_parts_of_a_scene(make, good, bad):
+    """Known, and traced."""
+    with pytest.raises(ValueError, match="must"):
+        make(bad)
+    for through in (lambda x: make(x, throw=False), jax.jit(lambda x: make(x, throw=False))):
+        assert is_number(through(good))
+        assert not is_number(through(bad))
+    assert jax.tree.all(jax.tree.map(np.array_equal, make(good, throw=False), make(good)))
+    with pytest.raises(ValueError, match="must"):  # as before
+        make(bad)
+
+
+def test_all_that_makes_a_scene_takes_throw():
+    names = [name for name in dir(rk) if name.endswith(("Block", "Pulse", "Record")) and name != "FoundRecord"]
+    classes = [getattr(rk, name) for name in names]
+    made = [kind for kind in classes if not inspect.isabstract(kind)]
+    made += [getattr(kind, name) for kind in classes for name in dir(kind) if name.startswith("from_")]
+    made += [rk.outcome, rk.simulate, rk.outcome_flexible, rk.simulate_flexible]
+    assert len(made) > 18
+    for each in made:
+        assert "throw" in inspect.signature(each).parameters, each
+
+
+def no_result(result, reals) -> bool:
+    finite = [bool(jnp.isfinite(x).any()) for x in reals]
+    return bool(result.status == rk.Status.not_finite) and not any(finite)
+
+
+SCENES = {
+    "alpha": (rk.Block(-0.2, 2.0, throw=False), SINE, {}),
+    "restitution": (rk.Block(0.2, 2.0, 1.3, throw=False), SINE, {}),
+    "period": (BLOCK, rk.SinePulse(0.3, -1.0, throw=False), {}),
+    "amplitude": (BLOCK, rk.SinePulse(INF, 1.0, throw=False), {}),
+    "initial": (BLOCK, SINE, {"initial": (2.0, 0.0)}),
+}
+
+
+@pytest.mark.parametrize(("block", "motion", "more"), SCENES.values(), ids=SCENES)
+def test_scenes(block, motion, more):
+    """One without a restitution looks like a result otherwise, as long as it does not come to an impact."""
+    outcome = rk.outcome(block, motion, **QUICK, **more, throw=False)
+    assert no_result(outcome, [outcome.margin, outcome.max_rotation, outcome.time_of_max, outcome.error])
+    history = rk.simulate(block, motion, **QUICK, **more, duration=2.0, samples=5, throw=False)
+    assert no_result(history, [history.rotation, history.velocity, history.max_rotation, history.margin])
+
+
+def test_a_duration():
+    history = rk.simulate(BLOCK, SINE, **QUICK, duration=-1.0, samples=5, throw=False)
+    assert no_result(history, [history.rotation, history.max_rotation])
+
+
+def test_an_asymmetric_block_without_a_duration():
+    """The motion, and 10/p of free rocking."""
+    history = rk.simulate(rk.AsymmetricBlock(0.2, 0.3, 2.0), SINE, **QUICK, samples=5)
+    np.testing.assert_allclose(history.duration, 1.0 + 10 / 2.0)
+
+
+def test_a_margin_that_is_no_number_is_never_successful():
+    """With or without `throw`."""
+    result = rk.outcome(rk.Block(0.2, 2.0, 1.3, throw=False), rk.SinePulse(0.5, 1.0))
+    assert jnp.isnan(result.margin) and bool(result.status == rk.Status.not_finite)
+
+
+def margin(x):
+    block = rk.Block(0.2, x[0], x[1], throw=False)
+    return rk.outcome(block, rk.SinePulse(0.3, x[2], throw=False), **QUICK, throw=False).margin
+
+
+def test_lanes():
+    points = jnp.array([[2.0, 0.9, 1.0], [-2.0, 0.9, 1.0], [2.0, 1.1, 1.0], [2.0, 0.9, 0.0], [2.0, 0.9, 1.1]])
+    found, slopes = jax.jit(jax.vmap(jax.value_and_grad(margin)))(points)
+    np.testing.assert_array_equal(jnp.isnan(found), [False, True, True, True, False])
+    assert (slopes[1:4] == 0).all() and (slopes[0] != 0).all()
+    with_throw = rk.outcome(rk.Block(0.2, 2.0, 0.9), SINE, **QUICK).margin
+    np.testing.assert_allclose(found[0], with_throw, rtol=1e-13)
+
+
+def test_what_is_no_number_at_all_raises():
+    with pytest.raises(ValueError, match="`alpha` must be a number"):
+        rk.Block(True, 2.0, throw=False)
+    with pytest.raises(ValueError, match="shapes that go together"):
+        rk.Block(np.ones(2) / 5, np.ones(3), throw=False)
+
+
+def test_an_optimiser_without_bounds():
+    """Its first steps, as long as the slope is steep, leave the range of the restitution. It finds the least margin of
+    a grid, or a lower one."""
+    tried = []
+
+    def loss(x):
+        value, slope = of(jnp.asarray(x))
+        tried.append(bool(jnp.isnan(value)))
+        return (1.0, np.zeros(3)) if tried[-1] else (float(value), np.asarray(slope))
+
+    of = jax.jit(jax.value_and_grad(margin))
+    found = minimize(loss, [2.0, 0.97, 1.0], jac=True, method="L-BFGS-B", options={"maxiter": 8})
+    assert any(tried)
+    assert found.fun < of(jnp.array([2.0, 0.97, 1.0]))[0]
+
+
+def test_the_log_density_of_any_point():
+    """Infinite ones are ends of ranges; for what is not a number nothing is likely."""
+    rocks = rk.Observations([0.2], [2.0], ["survived"])
+    unknowns = {"amplitude": rk.Unknown(0.1, 1.0), "period": rk.Unknown(-0.5, 1.0, log=False)}
+    density = rk.log_density(rocks, rk.SinePulse, unknowns, model=rk.Linear(), engine=rk.Series(order=4))
+    points = jnp.array([[0.0, 0.5], [0.0, -3.0], [INF, 1.0], [0.0, -INF], [NAN, 0.0], [1e9, -1e9]])
+    for found in (density.objective(points), jax.jit(lambda x: density(x))(points)):
+        assert jnp.isfinite(found[0])
+        assert (found[jnp.array([1, 3, 4, 5])] == -INF).all()
+    slopes = jax.jit(jax.grad(lambda x: density.objective(x).sum()))(points)
+    assert jnp.isfinite(slopes[:2]).all()
