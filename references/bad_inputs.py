@@ -495,7 +495,8 @@ for _module in ("pushover", "restitution", "sine_pulse", "single_lobe"):
 
 # Public names that nobody calls with arguments, and what is tried elsewhere.
 NOT_CALLED = {
-    "AbstractEquation", "AbstractFragility", "AbstractMotion", "Coefficients", "Contact", "Critical", "Estimate",
+    "AbstractEquation", "AbstractFragility", "AbstractMotion", "Borders", "Coefficients", "Contact", "Critical",
+    "Estimate", "Region", "overturning_borders",
     "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FragilityFit", "Grid",
     "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome", "OverturningMap", "Posterior",
     "PosteriorStatus", "Response", "Sensitivity", "SensitivityMap", "SimulatedFragility", "SimulatedSurface",
