@@ -158,7 +158,7 @@ def _symbols(axis, body: Body, rotation: float, modelled: bool) -> None:
         longer = length > 1.5 * np.hypot(*body.centre)
         name = names[longer] if length > body.centre[1] * (1 + 1e-9) else r"$R\cos\alpha$"
         foot, head = (turned(np.array([side * 0.5 * gap, y]), np.zeros(2), rotation) for y in (0, length))
-        _between(axis, foot, head, name, (side * 0.7 * gap, 0))
+        _between(axis, foot, head, name, (side * (0.7 if len(name) < 5 else 1.7) * gap, 0))
         return
     centre = at(*body.centre)
     axis.plot(*np.transpose([pivot, centre]), **_INK)

@@ -71,8 +71,12 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
     give no sign of themselves beside them may be missed; a safe gap between different numbers of impacts is not.
 
     **Raises:** ValueError for a map with further axes, of one column or one row, or that was not computed by
-    `overturning_map`.
+    `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
     """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(result)):
+        raise TypeError(
+            "Borders are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap)."
+        )
     ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     if result.parameters or result.scene is None or min(ratio.size, intensity.size) < 2 or ratio.ndim > 1:
         raise ValueError(

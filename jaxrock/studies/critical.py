@@ -90,7 +90,8 @@ def critical_amplitudes(
     **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
     themselves beside them may be missed; a safe gap between different numbers of impacts is not.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges; TypeError within `jax.jit`, `jax.vmap` or a derivative,
+    as the number of ends is not known before: `derivative` has what these would give.
 
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
@@ -123,7 +124,7 @@ def critical_durations(
 
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** as `critical_amplitudes`.
     """
     low, high = _rising("factor", factor)
     if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
