@@ -114,6 +114,11 @@ from jaxrock.studies import (
     saved_outcomes as _saved_outcomes,  # noqa: F401  (what `Grid.load` knows again)
     similarity as similarity,
 )
+from jaxrock.studies.borders import (
+    Borders as Borders,
+    Region as Region,
+    overturning_borders as overturning_borders,
+)
 from jaxrock.studies.critical import (
     Critical as Critical,
     critical_amplitudes as critical_amplitudes,

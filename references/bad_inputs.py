@@ -522,6 +522,7 @@ NOT_CALLED = {
     "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "Sensitivity", "SensitivityMap",
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
+    "Borders", "Region", "overturning_borders",
 }  # fmt: skip
 
 

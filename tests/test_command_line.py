@@ -116,9 +116,10 @@ def test_run_on_files(command, at2, column, tmp_path):
     assert history[-1, 0] == 4.0
 
 
-def test_run_of_a_block_that_overturns(command, at2):
-    status, table, _ = command("run", at2, *GIVEN, "--scale", "8")
+def test_run_of_a_block_that_overturns(command, at2, tmp_path):
+    status, table, _ = command("run", at2, *GIVEN, "--scale", "8", "--animate")
     assert status == 0
+    assert (tmp_path / "out" / "animation.gif").read_bytes().startswith(b"GIF89a")
     assert table["verdict"] == "OVERTURNS"
     assert table["restitution"] == "0.9000"
     assert table["peak rotation"] == table["peak angular velocity"] == "overturned"

@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom, with fewer points; the files are left alone."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -32,10 +33,29 @@ def rows():
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("path", list(rows()))
 def test_notebook(path, monkeypatch, tmp_path_factory):
-    monkeypatch.setenv("JAXROCK_NOTEBOOK_POINTS", "24")
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path_factory.getbasetemp() / "kept for notebooks"))
     notebook = nbformat.read(path, as_version=4)
-    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    with_fewer_points(notebook)
+    beside = {"metadata": {"path": str(path.parent)}}  # where its data are
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=beside).execute()
+
+
+def with_fewer_points(notebook):
+    """The number that every longer notebook states once, as `points = ...`."""
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.source = re.sub(r"^points = \d+", "points = 24", cell.source, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_readers_see(path):
+    """Sizes are stated once, data stand in files, and what was drawn is kept."""
+    code = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    text = "\n".join(cell.source for cell in code)
+    assert "environ" not in text and len(re.findall(r"^points = ", text, flags=re.MULTILINE)) <= 1
+    for numbers in re.findall(r"\[([^\[\]]*)\]", text):
+        assert len(re.findall(r"\d\.\d+", numbers)) <= 12, numbers
+    assert any(cell.outputs for cell in code)
 
 
 @pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")

@@ -128,7 +128,7 @@ def test_figures_of_single_lobes(lobes, tmp_path):
     few = {"uplift_strength": [0.5, 0.8], "pulse_duration": [0.5, 1.0, 2.0]}
     axis = rk.plot.overturning(rk.overturning_map(**few, **given), by_duration=True)
     assert "uplift strength" in axis.get_ylabel() and "duration" in axis.get_xlabel()
-    assert axis.get_xlim()[1] == pytest.approx(2.5) and axis.get_ylim()[1] < 1
+    assert axis.get_xlim()[1] == pytest.approx(2.0) and axis.get_ylim()[1] < 1
     axes = rk.plot.spectrum(rk.self_similar_spectrum(**few, **given), by_duration=True)
     np.testing.assert_allclose(axes[0].lines[0].get_xdata(), [0.5, 1.0, 2.0])
     assert [text.get_text() for text in axes[0].get_legend().get_texts()][:2] == ["0.5", "0.8"]
@@ -207,3 +207,45 @@ def test_surfaces_go_through_transformations(name):
     np.testing.assert_allclose(values, [total(float(x)) for x in at], rtol=1e-11)
     difference = (total(float(at[0]) + step) - total(float(at[0]) - step)) / (2 * step)
     assert float(slopes[0]) == pytest.approx(float(difference), rel=1e-5)
+
+
+def test_sensitivities_go_through_transformations():
+    """Second derivatives of the peak, both ways round, and many scenes at once."""
+
+    def elasticity(amplitude):
+        found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7), rk.Linear()).max_rotation
+        return found.derivative[3] * amplitude / found.value, found.elasticity  # by the amplitude
+
+    at = jnp.array([0.3, 0.31])
+    rows, every = jax.jit(jax.vmap(elasticity))(at)
+    np.testing.assert_allclose(every[:, 3], rows, rtol=1e-12)
+    step = 1e-5
+    difference = (elasticity(0.3 + step)[0] - elasticity(0.3 - step)[0]) / (2 * step)
+    for derivative in (jax.jacfwd, jax.grad):
+        assert float(derivative(lambda a: elasticity(a)[0])(0.3)) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_maps_go_through_forward_mode():
+    """By the axes of single lobes: strength, duration and shape, beside the closed form's wall."""
+
+    def margin(x):
+        found = rk.overturning_map(
+            pulse_duration=x[1:2], uplift_strength=x[:1], shape=x[2], pulse=rk.ExponentialPulse, restitution=0.9,
+            model=rk.Linear(), progress=False,
+        )  # fmt: skip
+        return found.margin[0, 0]
+
+    duration, shape = 1.5, 0.5
+    wall = single_lobe.safety_wall(duration, shape)
+    slopes = jax.jacfwd(margin)(jnp.array([float(wall) + 1e-9, duration, shape]))
+    by_duration, by_shape = jax.grad(single_lobe.safety_wall, argnums=(0, 1))(duration, shape)
+    np.testing.assert_allclose(-slopes[1:] / slopes[0], [by_duration, by_shape], rtol=1e-6)
+
+
+def test_borders_cannot_be_traced():
+    def found(alpha):
+        surface = rk.overturning_map([1.0, 2.0], [2.0, 3.0], alpha=alpha, model=rk.Linear(), restitution=0.9)
+        return rk.overturning_borders(surface).crowded
+
+    with pytest.raises(TypeError, match="Borders are searched .* they cannot be traced"):
+        jax.jit(found)(0.2)

@@ -23,6 +23,7 @@ _EPILOG = """examples:
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
   jaxrock run motion.AT2 --width 0.5 --height 2   the same for your block and record
   jaxrock run data.csv --dt 0.01 --unit cm/s2     a column of numbers
+  jaxrock run --animate                           and a film of it, animation.gif
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow

@@ -33,6 +33,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         words = f"{meaning} (default {ends[0]:g} {ends[1]:g})"
         parser.add_argument("--" + name.replace("_", "-"), type=number, nargs=2, metavar=("FROM", "TO"), help=words)
     parser.add_argument("--points", type=int, default=128, help="points along each axis (default 128)")
+    parser.add_argument("--pixels", action="store_true", help="draw the points' verdicts alone, not the exact borders")
     add_pulse(parser)
 
 
@@ -55,7 +56,8 @@ def _run(arguments: argparse.Namespace) -> int:
               *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
               )  # fmt: skip
     print(f"wrote {arguments.out / 'map.csv'}")
-    save(rk.plot.overturning(result, by_duration=by_duration).figure, arguments.out / "map.png")
+    exact = False if arguments.pixels else None
+    save(rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure, arguments.out / "map.png")
     return status_of_surface(result.status)
 
 

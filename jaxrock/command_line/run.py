@@ -18,6 +18,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--duration", type=number, help="how long to follow the block [s] (default: a little past the record)"
     )
+    parser.add_argument(
+        "--animate", nargs="?", const="gif", choices=("gif", "html", "mp4"), help="also write a film (default gif)"
+    )
     add_restitution(parser)
     add_record(parser)
 
@@ -30,6 +33,10 @@ def _run(arguments: argparse.Namespace) -> int:
     size = ("block, width x height", f"{arguments.width:g} x {arguments.height:g}", "m")
     print(f"{record.name or 'unnamed record'}\n{table(_rows(size, block, record, model, result))}")
     _write(arguments.out, response)
+    if arguments.animate:
+        path = arguments.out / f"animation.{arguments.animate}"
+        rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
+        print(f"wrote {path}")
     good = (result.status == rk.Status.successful) & (response.status == rk.Status.successful)
     if not good:
         worse = response.status if response.status != rk.Status.successful else result.status

@@ -42,12 +42,12 @@ class Trajectory(eqx.Module):
         return time.astype(jnp.result_type(time, self.duration))
 
     def along(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
-        """`follow(node, elapsed)` from the node before each time; results have the shape of `time`."""
+        """`follow(node, elapsed)` from the node before each time; results have the shape of `time` in front."""
 
         def at(t):
             return follow(*self.before(t))
 
-        return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(at)(time.ravel()))
+        return jax.tree.map(lambda x: x.reshape(*time.shape, *x.shape[1:]), jax.vmap(at)(time.ravel()))
 
     def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
         """The node before a time, and how long after it that is [s]."""

@@ -5,6 +5,7 @@ from typing import Annotated
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
@@ -12,6 +13,7 @@ from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
+from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
@@ -52,6 +54,19 @@ class FlexibleResponse(eqx.Module):
         **Raises:** ValueError for a time outside the history.
         """
         return _along(self.trajectory, self.trajectory.checked(time), "outputs")[:3]
+
+    def column(self, time: Values) -> Inexact[Array, "..."]:
+        """Displacements of the masses relative to the ground [m], from the base (which stays) to the top.
+
+        **Arguments:**
+
+        - `time`: any shape, in [0, duration] [s].
+
+        **Returns:** an array of one axis more than `time`, of length `masses`.
+
+        **Raises:** ValueError for a time outside the history.
+        """
+        return _along(self.trajectory, self.trajectory.checked(time), "column")
 
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
@@ -208,13 +223,18 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
 
 @eqx.filter_jit
 def _along(path: Trajectory, time, what: str):
-    """Outputs, or energies, at times."""
+    """Outputs, displacements of the masses, or energies, at times."""
     scene = path.stepper
-    scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * jnp.cos(scene.numbers.alpha) * scene.block.length
+    reach = jnp.cos(scene.numbers.alpha) * scene.block.length
+    shapes = np.vstack([np.zeros(scene.block.masses - 1), unit_column(scene.block.masses).shapes])
+    scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * reach
 
     def follow(node, elapsed):
         curve, length, _, _ = scene.arc(node)
         x = jnp.where(node.done, 0.0, elapsed / length)  # the last node is the end of the history
-        return tuple(curve.outputs(x) * scales) if what == "outputs" else scene.energy(curve.state(x))
+        if what == "outputs":
+            return tuple(curve.outputs(x) * scales)
+        state = curve.state(x)
+        return scene.energy(state) if what == "energy" else reach * (shapes @ state[: shapes.shape[1]])
 
     return path.along(time, follow)

@@ -3,10 +3,13 @@
 Imports everything but `command_line`. One module for each kind of result; another figure is a function in one of them.
 """
 
+from jaxrock.plot.animations import animate as animate, save_animation as save_animation
 from jaxrock.plot.closed_forms import safety_regions as safety_regions, sine_regions as sine_regions
+from jaxrock.plot.drawings import scene as scene
 from jaxrock.plot.fits import found_record as found_record, history_fit as history_fit
 from jaxrock.plot.fragilities import fragility as fragility, fragility_surface as fragility_surface
 from jaxrock.plot.regions import feasible_region as feasible_region, search as search
 from jaxrock.plot.responses import history as history, phase as phase
 from jaxrock.plot.sensitivities import critical as critical, sensitivity_map as sensitivity_map, tornado as tornado
-from jaxrock.plot.surfaces import overturning as overturning, spectrum as spectrum
+from jaxrock.plot.style import log_ticks as log_ticks
+from jaxrock.plot.surfaces import borders as borders, overturning as overturning, spectrum as spectrum

@@ -1,5 +1,7 @@
 """Figures of closed forms: safety regions under single lobes and one cycle of a sine."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from jaxrock.closed_form import sine_pulse, single_lobe
@@ -59,18 +61,51 @@ def sine_regions(restitution: float, axis=None, *, frequency_ratio=None):
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
     ratio = np.linspace(0.3, 8, 300) if frequency_ratio is None else np.asarray(frequency_ratio, float)
-    after = [np.asarray(x) for x in sine_pulse.after_pulse_limits(ratio, restitution)]
-    limit = np.asarray(sine_pulse.impact_time_limit(ratio))
+
+    def after(k):
+        return lambda ratio: np.asarray(sine_pulse.after_pulse_limits(ratio, restitution)[k])
+
+    def lower(ratio):
+        edge = after(0)(ratio)
+        return np.where(edge > np.asarray(sine_pulse.impact_time_limit(ratio)), edge, np.inf)
+
     curves = {
-        "case 2: no impact": (sine_pulse.no_impact_limit(ratio), "black", "-"),
-        "case 1.2: impact after the pulse": (after[1], "#0d2f4a", "-"),
-        None: (np.where(after[0] > limit, after[0], np.inf), "#0d2f4a", "-"),
-        "case 1.1: impact during the pulse": (sine_pulse.during_pulse_limit(ratio, restitution), "#7a1a14", "-"),
-        "first impact as the pulse ends": (limit, GREY, "--"),
+        "case 2: no impact": (sine_pulse.no_impact_limit, "black", "-"),
+        "case 1.2: impact after the pulse": (after(1), "#0d2f4a", "-"),
+        None: (lower, "#0d2f4a", "-"),
+        "case 1.1: impact during the pulse": (lambda x: sine_pulse.during_pulse_limit(x, restitution), "#7a1a14", "-"),
+        "first impact as the pulse ends": (sine_pulse.impact_time_limit, GREY, "--"),
     }
     for name, (curve, color, style) in curves.items():
-        curve = np.where(np.isfinite(curve), curve, np.nan)
-        axis.plot(ratio, curve, color=color, linestyle=style, linewidth=1.2, label=name)
+        axis.plot(*_to_its_tips(curve, ratio), color=color, linestyle=style, linewidth=1.2, label=name)
     axis.set(xlabel=r"frequency ratio $\omega/p$", ylabel="intensity $a_g/g\\alpha$")
-    axis.legend(loc="upper left", fontsize=7)
+    before = axis.get_legend()
+    axis.legend(loc="upper left" if before is None else "lower right", fontsize=7)
+    if before is not None:
+        axis.add_artist(before)  # of the map below
     return axis
+
+
+def _to_its_tips(curve: Callable, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve, also between the last place at which it is known and the one beyond where it ends."""
+
+    def at(places: np.ndarray) -> np.ndarray:
+        # In pieces of one size: one program.
+        whole = np.resize(places, (-(-places.size // x.size), x.size))
+        return np.concatenate([np.asarray(curve(piece)) for piece in whole])[: places.size]
+
+    y = at(x)
+    known = np.isfinite(y)
+    ends = np.flatnonzero(known[1:] != known[:-1])
+    inner = start = np.where(known[ends], x[ends], x[ends + 1])
+    outer = np.where(known[ends], x[ends + 1], x[ends])
+    for _ in range(45 if ends.size else 0):
+        middle = (inner + outer) / 2
+        there = np.isfinite(at(middle))
+        inner, outer = np.where(there, middle, inner), np.where(there, outer, middle)
+    if ends.size:
+        share = 1 - np.linspace(1, 0, 20)[1:, None] ** 3  # they turn over there
+        more = (start + share * (inner - start)).ravel()
+        x, y = np.concatenate([x, more]), np.concatenate([y, at(more)])
+    order = np.argsort(x)
+    return x[order], np.where(np.isfinite(y), y, np.nan)[order]

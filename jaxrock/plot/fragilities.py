@@ -5,7 +5,7 @@ import numpy as np
 from jaxrock.hazard.fragility import LogNormalFragility
 from jaxrock.hazard.simulated_fragility import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
-from jaxrock.plot.style import BLUE, RED, SAND
+from jaxrock.plot.style import BLUE, RED, SAND, log_ticks
 
 
 def fragility(simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis=None):
@@ -36,7 +36,7 @@ def fragility(simulated: SimulatedFragility, fit: LogNormalFragility | None = No
     unit = {"PGA": "PGA [g]", "PGV": "PGV [m/s]"}[simulated.measure]
     axis.set(xscale="log", xlabel=unit, ylabel="probability to topple", ylim=(-0.02, 1.02))
     axis.legend(loc="upper left", fontsize=8, frameon=False)
-    return axis
+    return log_ticks(axis)
 
 
 def fragility_surface(

@@ -5,7 +5,7 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED
+from jaxrock.plot.style import GREY, RED, log_ticks
 
 
 def feasible_region(
@@ -22,7 +22,6 @@ def feasible_region(
     **Returns:** the axis.
     """
     import matplotlib.pyplot as plt
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
@@ -35,12 +34,10 @@ def feasible_region(
         axis.plot(wall.durations, wall.amplitude, color=RED, linewidth=1, label="up to here all that stand, stand")
     if estimate is not None and set(region.names) <= set(estimate.names):
         axis.plot(estimate[region.names[1]], estimate[region.names[0]], "k+", markersize=9, label="most likely")
-    for values, scale, ticks in ((rows, axis.set_yscale, axis.yaxis), (columns, axis.set_xscale, axis.xaxis)):
+    for values, scale in ((rows, axis.set_yscale), (columns, axis.set_xscale)):
         if values.min() > 0:
             scale("log")
-            ticks.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
-            ticks.set_minor_formatter(NullFormatter())
+    log_ticks(axis)
     axis.set(xlim=(columns.min(), columns.max()), ylim=(rows.min(), rows.max()))
     labels = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
     axis.set(ylabel=labels[0], xlabel=labels[1])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.flexible.response import FlexibleResponse
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 
@@ -12,6 +13,11 @@ from jaxrock.responses.history import Response
 @jax.jit
 def _acceleration(motion, time):
     return motion.acceleration(time)
+
+
+def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
+    """Ground acceleration at times [g]."""
+    return np.asarray(_acceleration(motion, time))
 
 
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -50,7 +56,7 @@ def history(response: Response, axes=None):
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
     scene = response.scene
     time, rotation, velocity = _dense(response)
-    acceleration = np.asarray(_acceleration(scene.motion, time))
+    acceleration = acceleration_of(scene.motion, time)
     impacts = np.asarray(response.impact_times)
     speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
     for axis, curve in zip(axes, (rotation, velocity, acceleration)):

@@ -2,9 +2,14 @@
 
 import numpy as np
 
+from jaxrock.engines.taylor.careful import Series
 from jaxrock.plot.style import BLUE, GREY, RED
+from jaxrock.responses.arguments import engine_of
+from jaxrock.studies.borders import Region, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
+_SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
+_STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
 _DURATION = "pulse duration $p\\,t_d$"
 
 
@@ -38,6 +43,7 @@ def spectrum(result: Spectrum, axes=None, *, by_duration: bool = False):
         for i, (curve, color) in enumerate(zip(values, colors)):
             label = None if labels is None else f"{float(labels[i]):g}"
             axis.plot(abscissa, curve, color=color, linewidth=1, label=label)
+            axis.plot(abscissa[alone := _alone(curve)], curve[alone], ".", color=color, markersize=4)
         axis.set_ylim(bottom=0)
         lost = rows.any(axis=0)
         if lost.any():
@@ -59,8 +65,10 @@ def spectrum(result: Spectrum, axes=None, *, by_duration: bool = False):
     return axes
 
 
-def overturning(result: OverturningMap, axis=None, *, by_duration: bool = False):
-    """Draw an overturning map: safe, overturned without impact, overturned after impacts.
+def overturning(
+    result: OverturningMap, axis=None, *, by_duration: bool = False, exact: bool | None = None, safe: bool = True
+):
+    """Draw an overturning map: survivors by their peak rotation, overturned without impact, overturned after impacts.
 
     **Arguments:**
 
@@ -68,33 +76,48 @@ def overturning(result: OverturningMap, axis=None, *, by_duration: bool = False)
     - `axis`: matplotlib axis; None makes a figure.
     - `by_duration`: uplift strength over pulse duration, as single-lobe pulses are drawn, in place of intensity over
       frequency ratio.
+    - `exact`: whether borders are drawn where they are (`overturning_borders`: islands and gaps too, whatever the grid;
+      pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map.
+    - `safe`: whether survivors are coloured, with a scale beside the axis.
 
     **Returns:** the axis.
 
     **Raises:** ValueError for a map with further axes.
     """
     import matplotlib.pyplot as plt
-    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
     from matplotlib.patches import Patch
 
     _without_more(result)
-
     if axis is None:
         _, axis = plt.subplots(figsize=(7, 5), layout="constrained")
-    names = ("not computed", "safe", "overturned without impact", "overturned after impacts")
-    colors = ("black", "#f3efe6", BLUE, RED)
-    axis.pcolormesh(
-        np.asarray(result.pulse_duration if by_duration else result.frequency_ratio),
-        np.asarray(result.uplift_strength if by_duration else result.intensity),
-        np.asarray(result.state),
-        cmap=ListedColormap(colors),
-        norm=BoundaryNorm((-1.5, -0.5, 0.5, 1.5, 2.5), 4),
-        shading="nearest",
-        rasterized=True,
-    )
-    shown = sorted(set(np.unique(np.asarray(result.state)).tolist()) | {0, 1, 2})
-    handles = [Patch(facecolor=colors[i + 1], edgecolor=GREY, label=names[i + 1]) for i in shown]
+    x = np.asarray(result.pulse_duration if by_duration else result.frequency_ratio)
+    y = np.asarray(result.uplift_strength if by_duration else result.intensity)
+    state = np.asarray(result.state)
+    axis.set_facecolor(_SAFE[0])
+    if safe:
+        shades = LinearSegmentedColormap.from_list("survivors", _SAFE)
+        peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation), np.nan))
+        picture = axis.pcolormesh(x, y, peaks, cmap=shades, vmin=0, vmax=1, shading="nearest", rasterized=True)
+        axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
+    pixels = np.ones(x.size, bool)
+    if _is_quick(result) if exact is None else exact:
+        found = overturning_borders(result)
+        pixels = _within(np.asarray(result.frequency_ratio), found.crowded)
+        for region in found.regions:
+            draw_region(axis, region, by_duration)
+    lost = np.ma.masked_where((state == 0) | ~pixels, state)
+    colors, norm = ListedColormap(_STATES), BoundaryNorm((-1.5, 0.5, 1.5, 2.5), 3)
+    axis.pcolormesh(x, y, lost, cmap=colors, norm=norm, shading="nearest", rasterized=True)
+    if (state == -1).any():
+        rows, columns = np.nonzero(state == -1)
+        axis.plot(x[columns], y[rows], "kx", markersize=3)
+    names = {-1: "not computed", 0: "safe", 1: "overturned without impact", 2: "overturned after impacts"}
+    colors = dict(zip((-1, 1, 2, 0), (*_STATES, _SAFE[0])))
+    shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
+    handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
     axis.legend(handles=handles, loc="upper left", fontsize=8)
+    axis.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()))
     axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
     axis.set_ylabel(
         "uplift strength (uplift threshold / peak acceleration)"
@@ -102,6 +125,77 @@ def overturning(result: OverturningMap, axis=None, *, by_duration: bool = False)
         else "intensity (peak acceleration / uplift threshold)"
     )
     return axis
+
+
+def draw_region(axis, region: Region, by_duration: bool = False) -> None:
+    """A region of overturned blocks between its borders."""
+    x, edges = np.asarray(region.frequency_ratio), (region.lower, region.upper)
+    if by_duration:
+        x, edges = 2 * np.pi / x, tuple(1 / edge for edge in edges)
+    color = BLUE if region.impacts == 0 else RED
+    axis.fill_between(x, *edges, facecolor=color, edgecolor="none", linewidth=0)
+    for edge in edges:
+        axis.plot(x, edge, color="black", linewidth=0.5)
+
+
+def borders(result: OverturningMap, axis=None, *, by_strength: bool = False, scale: float = 1.0, **line):
+    """Draw the borders of an overturning map alone: to lay several over each other.
+
+    **Arguments:**
+
+    - `result`: as in `overturning`.
+    - `axis`: matplotlib axis; None makes a figure.
+    - `by_strength`: uplift strength, one over the intensity, upward in place of the intensity.
+    - `scale`: factor on what is drawn upward.
+    - `line`: colour, style, width and label, as matplotlib names them.
+
+    **Returns:** the axis.
+
+    **Raises:** ValueError for a map with further axes.
+    """
+    import matplotlib.pyplot as plt
+
+    _without_more(result)
+    if axis is None:
+        _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    label = line.pop("label", None)
+    ends = [edge(np.asarray(result.intensity)) for edge in (np.min, np.max)]
+    for region in overturning_borders(result).regions:
+        for edge in (region.lower, region.upper):
+            inside = (edge > ends[0] * (1 + 1e-12)) & (edge < ends[1] * (1 - 1e-12))
+            if inside.any():  # not the edge of the map
+                shown = scale * np.where(inside, 1 / edge if by_strength else edge, np.nan)
+                axis.plot(region.frequency_ratio, shown, label=label, **line)
+                label = None
+    return axis
+
+
+def _is_quick(result: OverturningMap) -> bool:
+    if result.scene is None or min(result.state.shape) < 2:
+        return False
+    *_, model, engine = result.scene
+    return isinstance(engine_of(engine, model), Series)
+
+
+def _within(x: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """Which pixels lie in ranges, or reach into them."""
+    half = np.abs(np.gradient(x)) / 2 if x.size > 1 else 0 * x
+    return ((x[:, None] + half[:, None] > ranges[:, 0]) & (x[:, None] - half[:, None] < ranges[:, 1])).any(1)
+
+
+def _beyond(peaks: np.ndarray) -> np.ndarray:
+    """Peaks with those of the nearest survivors in the pixels that borders cut."""
+    around = np.pad(peaks, 1, constant_values=np.nan)
+    n, m = peaks.shape
+    moved = [around[i : i + n, j : j + m] for i in range(3) for j in range(3)]
+    nearest = np.fmax.reduce(moved)
+    return np.where(np.isnan(peaks), nearest, peaks)
+
+
+def _alone(curve: np.ndarray) -> np.ndarray:
+    """Survivors between overturned blocks, of which no line is drawn."""
+    there = np.pad(np.isfinite(curve), 1)
+    return there[1:-1] & ~there[:-2] & ~there[2:]
 
 
 def _without_more(result: Spectrum | OverturningMap) -> None:

@@ -88,7 +88,8 @@ def sensitivity(
 
     **Returns:** a `Sensitivity`. Derivatives are partial: `alpha` with the restitution following it if that is
     Housner's, but at a fixed amplitude [g]; `amplitude` of a record scales all of it; `uplift_strength`, the uplift
-    threshold over the amplitude, is changed by the amplitude.
+    threshold over the amplitude, is changed by the amplitude. It is a plain function of arrays: `jax.jit`, `jax.vmap`
+    and further derivatives go through it.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
@@ -172,6 +173,7 @@ def sensitivity_map(
     - `alpha`, `restitution`, `model`, `engine`, `progress`: as in `self_similar_spectrum`.
 
     **Returns:** a `SensitivityMap`.
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
     **Raises:** ValueError for arguments outside their ranges.
 

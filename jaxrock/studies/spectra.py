@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -80,6 +80,7 @@ class OverturningMap(AbstractTable):
     - `state`: 0 safe, 1 overturned without impact, 2 overturned after impacts, -1 not computed (see `status`).
     - `max_rotation`: peak |rotation| over alpha [-]; infinite where the block overturned.
     - `impact_count`, `margin`, `status`: as in `Outcome`.
+    - `scene`: what was shaken, and how, for `overturning_borders`.
     """
 
     frequency_ratio: Float[Array, " columns"]
@@ -90,6 +91,7 @@ class OverturningMap(AbstractTable):
     margin: Float[Array, "*more rows columns"]
     status: Status
     parameters: dict[str, Float[Array, " _"]] = eqx.field(default_factory=dict)
+    scene: Any = None
 
     @property
     def pulse_duration(self) -> Float[Array, " columns"]:
@@ -185,8 +187,8 @@ def self_similar_spectrum(
     **Source:** Dimitrakopoulos & DeJong (2012), section 4; Voyagaki, Psycharis & Mylonakis (2012), 2.2, figure 3.5.
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
-    scene = alpha, restitution, pulse, model, engine
-    results = _over_pulses(_peaks_under_pulse, axes, *scene, "spectrum", progress)
+    scene = _scene(axes, alpha, restitution, pulse, model, engine)
+    results = _over_pulses(_peaks_under_pulse, axes, scene, "spectrum", progress)
     return Spectrum(abscissa=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
 
@@ -218,9 +220,11 @@ def overturning_map(
     (2012), 2.2, figures 3.1 to 3.3 and 3.6.
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
-    scene = alpha, restitution, pulse, model, engine
-    results = _over_pulses(_states_under_pulse, axes, *scene, "map", progress)
-    return OverturningMap(frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
+    scene = _scene(axes, alpha, restitution, pulse, model, engine)
+    results = _over_pulses(_states_under_pulse, axes, scene, "map", progress)
+    return OverturningMap(
+        frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, scene=scene, **results
+    )
 
 
 class _PulseAxes(NamedTuple):
@@ -246,11 +250,6 @@ class _PulseAxes(NamedTuple):
         """The parameters that are axes."""
         return {name: values for name, values in self.parameters.items() if values.ndim}
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of the results."""
-        return (*(values.size for values in self.lists.values()), self.intensity.size, self.ratio.size)
-
 
 def _either(name: str, values: Values | None, other: str, others: Values | None, product: float) -> Float[Array, " n"]:
     """An axis, given by itself or by what it makes a number with."""
@@ -260,19 +259,24 @@ def _either(name: str, values: Values | None, other: str, others: Values | None,
     return axis(name, values) if others is None else product / axis(other, others)
 
 
-def _over_pulses(function, axes: _PulseAxes, alpha, restitution, pulse, model, engine, label, progress) -> dict:
-    """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
-    block, names = Block(alpha, 1.0, restitution), tuple(axes.parameters)
-    more = [jnp.atleast_1d(values) for values in axes.parameters.values()]
+def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
+    """What is the same at all points: a pytree, with the parameters of the pulse that are numbers."""
+    block, lists = Block(alpha, 1.0, restitution), tuple(axes.lists)
+    numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
+    number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
 
-    number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *more, axes.intensity, axes.ratio))
-    given = pulse if not names else lambda size, extent, *more: pulse(size, extent, **dict(zip(names, more)))
-    pulse_now = current_function(given, number, number, *(number for _ in names))
-    model = current_model(model, block, axes.ratio, axes.intensity)
-    scene = block.alpha, scaled_law(block), pulse_now, model, engine
+    def given(size, extent, *listed):
+        return pulse(size, extent, **numbers, **dict(zip(lists, listed)))
+
+    made = current_function(given if axes.parameters else pulse, number, number, *(number for _ in lists))
+    return block.alpha, scaled_law(block), made, current_model(model, block, axes.ratio, axes.intensity), engine
+
+
+def _over_pulses(function, axes: _PulseAxes, scene: tuple, label: str, progress: bool | None) -> dict:
+    """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
+    points = (*axes.lists.values(), axes.intensity, axes.ratio)
     # Neighbours in intensity share a chunk: they move alike.
-    results = surface(function, (*more, axes.intensity, axes.ratio), scene, label, progress, columns=True)
-    return jax.tree.map(lambda x: x.reshape(axes.shape), results)
+    return surface(function, points, scene, label, progress, columns=True)
 
 
 def scaled_law(block: Block) -> AbstractRestitution:
@@ -321,7 +325,8 @@ def _under_motion(period, scene):
     return _peaks(outcome(block, motion, model, engine=engine), block)
 
 
-def _under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
+def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
+    """The outcome at one point, and the block: `(*parameters, intensity, ratio, scene)`."""
     *parameters, intensity, ratio, (alpha, restitution, pulse, model, engine) = point_and_scene
     block = Block(alpha, jnp.ones_like(alpha), restitution)
     motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio, *parameters)
@@ -329,8 +334,8 @@ def _under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
 
 
 def _peaks_under_pulse(*point_and_scene) -> dict:
-    return _peaks(*_under_pulse(*point_and_scene))
+    return _peaks(*under_pulse(*point_and_scene))
 
 
 def _states_under_pulse(*point_and_scene) -> dict:
-    return _states(*_under_pulse(*point_and_scene))
+    return _states(*under_pulse(*point_and_scene))

@@ -1,0 +1,177 @@
+"""Films of responses: the block on the moving ground, its history beside it, impacts and the verdict."""
+
+import html
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from jaxrock._arguments import arguments, at_least, path_of
+from jaxrock._checks import Values, scalar, size
+from jaxrock.blocks.rigid import Block
+from jaxrock.flexible.response import FlexibleResponse
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.plot.bodies import AnyBlock, Body
+from jaxrock.plot.drawings import draw, draw_ground
+from jaxrock.plot.responses import acceleration_of
+from jaxrock.plot.style import BLUE, GREY, RED, SAND
+from jaxrock.responses.history import Response
+from jaxrock.status import Status
+
+_LONGEST = 20.0  # seconds of a film whose speed is not given
+_FLASH = 0.12  # seconds of the film that an impact is seen
+
+
+@arguments
+def animate(
+    response: Response | FlexibleResponse,
+    block: AnyBlock | None = None,
+    *,
+    model: AbstractEquation = Housner(),
+    speed: Values | None = None,
+    fps: Annotated[int, at_least(1, 240)] = 20,
+):
+    """Make a film of a response: the block to scale, impacts, the ground's acceleration, and at the end the verdict.
+
+    **Arguments:**
+
+    - `response`: result of `simulate`, of one scene.
+    - `block`: what is drawn; None: the rectangle of the response's slenderness and frequency parameter, or its flexible
+      block. An asymmetric block must be given.
+    - `model`: a `Spring`, whose column is drawn then.
+    - `speed`: seconds of the response per second of the film, positive; None: 1, or what makes it last 20 s.
+    - `fps`: pictures per second, at least 1.
+
+    **Returns:** a `matplotlib.animation.FuncAnimation`. `save_animation` writes it; in a notebook
+    `IPython.display.HTML(film.to_jshtml())` shows it.
+
+    **Raises:** ValueError for arguments outside their ranges, or a response of many scenes.
+    """
+    from matplotlib.animation import FuncAnimation
+
+    duration, flexible = float(response.duration), isinstance(response, FlexibleResponse)
+    rate = max(1.0, duration / _LONGEST) if speed is None else float(scalar("speed", size("speed", speed)))
+    body = Body.of(_drawn(response, block), model)
+    count = int(np.ceil(duration * fps / rate)) + 1
+    time = np.minimum(np.arange(count) * rate / fps, duration)
+    rotation, bending = np.asarray(response(time)[0]), [None] * count
+    if flexible:
+        alpha, heights = float(response.scene.block.alpha), body.heights
+        bending = np.asarray(response.column(time)) - np.cos(alpha) * rotation[:, None] * heights
+    parts = _Parts(response, body, rate)
+    last = min(fps, 20)  # pictures of the verdict
+
+    def show(number: int) -> list:
+        k = min(number, count - 1)
+        return parts.show(float(time[k]), body.pose(float(rotation[k]), bending[k]), number >= count - 1)
+
+    return FuncAnimation(parts.figure, show, frames=count + last, interval=1000 / fps, blit=False, repeat=True)
+
+
+def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> AnyBlock:
+    response.trajectory.check_single()
+    if isinstance(response, FlexibleResponse):
+        return response.scene.block
+    if block is not None:
+        return block
+    if response.scene.far is not None:
+        raise ValueError("Argument `block` must be given for the response of an asymmetric block: its shape is drawn.")
+    return Block(response.scene.alpha, response.scene.p, 1.0)
+
+
+class _Parts:
+    """The figure of a film, and what moves in it."""
+
+    def __init__(self, response, body: Body, rate: float):
+        import matplotlib.pyplot as plt
+
+        self.response, self.rate = response, rate
+        self.figure, axes = plt.subplot_mosaic(
+            [["scene", "rotation"], ["scene", "ground"]], figsize=(8, 4), width_ratios=(1.1, 1), layout="constrained"
+        )
+        scene, size = axes["scene"], body.size
+        scene.set(xlim=(-1.1 * size, 1.1 * size), ylim=(-0.25 * size, 1.1 * size), aspect="equal")
+        scene.set_axis_off()
+        draw_ground(scene, body)
+        self.outline, self.column, self.masses = draw(scene, body, body.pose(0.0))
+        (self.flash,) = scene.plot([], [], "*", color=RED, markersize=16, zorder=5)
+        self.words = scene.set_title("", fontsize=10)
+        peak = float(np.max(np.asarray(self._motion.bounds)))
+        self.reach = 0.8 * size / max(peak, 1e-12)
+        self.arrow = scene.quiver(
+            0, -0.15 * size, 0, 0, color=BLUE, angles="xy", scale_units="xy", scale=1, width=0.012
+        )
+        self.impacts = np.asarray(response.impact_times)
+        self.cursors = self._histories(axes["rotation"], axes["ground"])
+        self.figure.canvas.draw()
+        self.figure.set_layout_engine("none")  # where things are is found once, not for every picture
+        fallen = not bool(np.asarray(response.status == Status.successful))
+        self.verdict = ("no result: see its status" if fallen
+                        else "overturns" if bool(response.overturned) else "stands")  # fmt: skip
+
+    @property
+    def _motion(self):
+        scene = self.response.scene
+        return scene.ground if isinstance(self.response, FlexibleResponse) else scene.motion
+
+    def _histories(self, above, below) -> list:
+        response, end = self.response, float(self.response.duration)
+        time = np.linspace(0, end, 4001)
+        alpha = response.scene.block.alpha if isinstance(response, FlexibleResponse) else response.scene.alpha
+        above.plot(time, np.asarray(response(time)[0]) / float(alpha), color=BLUE, linewidth=0.9)
+        above.plot(self.impacts, 0 * self.impacts, "|", color=RED, markersize=6)
+        below.plot(time, acceleration_of(self._motion, time), color="black", linewidth=0.7)
+        above.set_ylim(*np.clip(above.get_ylim(), -2.5, 2.5))
+        for axis, label in ((above, r"$\theta/\alpha$"), (below, r"$\ddot u_g$ [g]")):
+            axis.axhline(0, color=GREY, linewidth=0.5)
+            axis.set(xlim=(0, end), ylabel=label)
+        above.tick_params(labelbottom=False)
+        below.set_xlabel("time [s]")
+        return [axis.axvline(0, color=SAND, linewidth=1.4) for axis in (above, below)]
+
+    def show(self, time: float, shapes, over: bool) -> list:
+        """Move everything to a time."""
+        self.outline.set_xy(shapes.outline)
+        self.column.set_data(*shapes.column.T)
+        self.masses.set_data(*shapes.masses.T)
+        self.arrow.set_UVC(self.reach * float(acceleration_of(self._motion, np.array([time]))[0]), 0.0)
+        for cursor in self.cursors:
+            cursor.set_xdata([time, time])
+        count = int(np.searchsorted(self.impacts, time, side="right"))
+        hit = count > 0 and time - self.impacts[count - 1] < _FLASH * self.rate and not over
+        self.flash.set_data(*([[x] for x in shapes.pivot] if hit else ([], [])))
+        faster = "" if self.rate == 1 else f", {self.rate:.3g} times as fast"
+        said = f": {self.verdict}" if over else ""
+        self.words.set_text(f"{time:.2f} s{faster}, {count} impact{'' if count == 1 else 's'}{said}")
+        self.words.set_color(RED if over and self.verdict != "stands" else "black")
+        return [self.outline, self.column, self.masses, self.flash, self.words, self.arrow, *self.cursors]
+
+
+@arguments
+def save_animation(film, path: Annotated[str | Path, path_of], *, dpi: Annotated[int, at_least(10, 1000)] = 80) -> None:
+    """Write a film as its file's name says: GIF, HTML that plays by itself, or MP4.
+
+    **Arguments:**
+
+    - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4.
+    - `dpi`: dots per inch.
+
+    **Raises:** ValueError for another ending; for MP4 where the program ffmpeg is not installed.
+    """
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    fps = 1000 / film.event_source.interval
+    kind = path.suffix.lower()
+    if kind == ".gif":
+        film.save(path, writer=PillowWriter(fps=fps), dpi=dpi)
+    elif kind == ".html":
+        with_size = film.to_jshtml(fps=fps, embed_frames=True)
+        title = html.escape(path.stem)
+        path.write_text(f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}", encoding="utf-8")
+    elif kind == ".mp4":
+        if not FFMpegWriter.isAvailable():
+            raise ValueError("Argument `path` must end with .gif or .html: for .mp4 the program ffmpeg is not there.")
+        film.save(path, writer=FFMpegWriter(fps=fps), dpi=dpi)
+    else:
+        raise ValueError(f"Argument `path` must end with .gif, .html or .mp4, but is {str(path)!r}.")

@@ -1,0 +1,101 @@
+"""Blocks as they are drawn: outline, column and masses in metres, at any rotation."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrock._parameters import check_single
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.rigid import GRAVITY, Block
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.spring import Spring
+
+AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+
+
+class Shapes(NamedTuple):
+    """What is drawn of a body at one moment; (n, 2) places [m]."""
+
+    outline: np.ndarray
+    column: np.ndarray
+    masses: np.ndarray
+    pivot: np.ndarray  # (2,)
+
+
+class Body(NamedTuple):
+    """A block at rest: the corners on the ground, midway between them the origin; and the column that models it.
+
+    A rigid block has the column's heights and masses empty.
+    """
+
+    outline: np.ndarray  # (n, 2) [m]
+    right: np.ndarray  # (2,) corner 1
+    left: np.ndarray  # corner 2
+    centre: np.ndarray
+    heights: np.ndarray  # of the nodes of the column [m]
+    masses: np.ndarray  # heights of its masses [m]
+
+    @classmethod
+    def of(cls, block: AnyBlock, model: AbstractEquation) -> "Body":
+        """Of a block of scalars. What its parameters do not tell is drawn as simply as may be: the rectangle of its p,
+        or the parallelogram about its centre of mass."""
+        check_single(block=block)
+        if isinstance(block, AsymmetricBlock):
+            return cls._asymmetric(block)
+        alpha = float(block.alpha)
+        radius = float(block.length) / 2 if isinstance(block, FlexibleBlock) else float(block.half_diagonal)
+        b, h = radius * np.sin(alpha), radius * np.cos(alpha)
+        side = np.linspace(0, 2 * h, 25)
+        across = np.repeat(b, side.size)
+        outline = np.concatenate([np.stack([across, side], 1), np.stack([-across, side[::-1]], 1)])
+        corners = np.array([b, 0.0]), np.array([-b, 0.0])
+        return cls(outline, *corners, np.array([0.0, h]), *_column(block, model, radius, h))
+
+    @classmethod
+    def _asymmetric(cls, block: AsymmetricBlock) -> "Body":
+        alphas = np.array([float(block.alpha1), float(block.alpha2)])
+        first = float(block.inertia_ratio) * GRAVITY / float(block.p1) ** 2
+        radii = first * np.array([1.0, float(block.radius_ratio)])
+        (b1, b2), (h1, h2) = radii * np.sin(alphas), radii * np.cos(alphas)
+        centre = np.array([(b2 - b1) / 2, max(h1, h2)])
+        right, left = centre + [b1, -h1], centre - [b2, h2]
+        outline = np.stack([left, right, 2 * centre - left, 2 * centre - right])
+        return cls(outline, right, left, centre, np.zeros(0), np.zeros(0))
+
+    @property
+    def size(self) -> float:
+        """Largest distance from the origin [m]."""
+        return float(max(np.hypot(*self.outline.T).max(), self.heights.max(initial=0.0)))
+
+    def pose(self, rotation: float, bending: np.ndarray | None = None) -> Shapes:
+        """Turned by a rotation [rad] about the corner on which it stands, and bent: (nodes,) [m], across the column."""
+        pivot = self.right if rotation >= 0 else self.left
+        outline, column = self.outline, np.stack([0 * self.heights, self.heights], 1)
+        if bending is not None and self.heights.size:
+            share = self.outline[:, 1] / self.outline[:, 1].max() * self.heights[-1]
+            outline = outline + np.stack([np.interp(share, self.heights, bending), 0 * share], 1)
+            column = column + np.stack([bending, 0 * bending], 1)
+        column = turned(column, np.zeros(2), rotation)
+        masses = np.stack([np.interp(self.masses, self.heights, x) for x in column.T], 1) if column.size else column
+        return Shapes(turned(outline, pivot, rotation), column, masses, pivot)
+
+
+def _column(block: Block | FlexibleBlock, model: AbstractEquation, radius: float, h: float) -> tuple:
+    """Heights of the nodes and of the masses of the column that models a block."""
+    if isinstance(block, FlexibleBlock):
+        nodes = np.linspace(0, 2 * radius, block.masses)
+        return nodes, nodes
+    if not isinstance(model, Spring):
+        return np.zeros(0), np.zeros(0)
+    if model.kind == "mmSM":
+        masses = np.zeros(0) if model.masses is None else np.linspace(0, 2 * radius, model.masses)
+        return np.array([0.0, 2 * radius]), masses
+    height = {"SM1": radius, "SM2": radius, "SM3": h}[model.kind]
+    return np.array([0.0, height]), np.array([0.0 if model.kind == "SM2" else height])
+
+
+def turned(points: np.ndarray, pivot: np.ndarray, rotation: float) -> np.ndarray:
+    """Places [m] turned about a pivot; a positive rotation is clockwise: the block leans to the right."""
+    sine, cosine = np.sin(rotation), np.cos(rotation)
+    return pivot + (points - pivot) @ np.array([[cosine, -sine], [sine, cosine]])

@@ -1,0 +1,212 @@
+"""Drawings of scenes, to scale: a block or the column that models it, the ground, the motion, and their symbols."""
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxrock._arguments import arguments
+from jaxrock._checks import Range, scalar, strength
+from jaxrock._parameters import declared
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.cantilever import unit_column
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.models.spring import Spring
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.plot.bodies import AnyBlock, Body, turned
+from jaxrock.plot.responses import acceleration_of
+from jaxrock.plot.style import BLUE, GREY, RED, SAND
+
+_turn = Range("be in [-pi/2, pi/2]", -np.pi / 2, np.pi / 2, lambda x: abs(x) <= np.pi / 2 + 1e-6)
+_PAPER = "#efe3c8"
+_INK = {"color": "black", "linewidth": 0.8}
+
+
+@arguments
+def scene(
+    block: AnyBlock,
+    motion: AbstractMotion | None = None,
+    axis=None,
+    *,
+    model: AbstractEquation = Housner(),
+    rotation: ArrayLike = 0.0,
+    bending: ArrayLike = 0.0,
+):
+    """Draw a block, or the spring or column that models it, to scale and with its symbols, and the motion below it.
+
+    Corner O is that of positive rotations; the ground's acceleration counts to the right. Of a block that is known by
+    slenderness and frequency alone, the rectangle of that p is drawn; of an asymmetric one the parallelogram with its
+    corners and its centre of mass.
+
+    **Arguments:**
+
+    - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars; `motion`: any motion; None leaves it out.
+    - `axis`: matplotlib axis; None makes a figure.
+    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it.
+    - `rotation`: at which the block is drawn [rad], in [-pi/2, pi/2].
+    - `bending`: displacement of the top of a flexible block by bending, in its first clamped mode [m].
+
+    **Returns:** the axis.
+
+    **Raises:** ValueError for arguments outside their ranges, arrays where scalars are wanted, and `bending` of a block
+    that does not bend.
+
+    **Source:** Voyagaki et al. (2012), figure 2.1; Dimitrakopoulos & DeJong (2012), figure 1; Diamantopoulos &
+    Fragiadakis (2017), figures 1, 2, 4, 6, 8 and 10.
+    """
+    import matplotlib.pyplot as plt
+
+    rotation = float(scalar("rotation", _turn("rotation", rotation)))
+    bent = float(scalar("bending", strength("bending", bending)))
+    if bent and not isinstance(block, FlexibleBlock):
+        raise ValueError(f"Argument `bending` must be zero for a {type(block).__name__}, which does not bend.")
+    body = Body.of(block, model)
+    if axis is None:
+        _, axis = plt.subplots(figsize=(5, 5 if motion is None else 6.5), layout="constrained")
+    column = None
+    if bent:
+        shape = unit_column(block.masses).shapes[:, 0]
+        column = bent * np.concatenate([[0.0], shape / shape[-1]])
+    shapes = body.pose(rotation, column)
+    draw_ground(axis, body)
+    draw(axis, body, shapes)
+    if isinstance(block, AsymmetricBlock):
+        _sides(axis, body, rotation)
+    else:
+        _symbols(axis, body, rotation, isinstance(model, Spring) or isinstance(block, FlexibleBlock))
+    every = np.concatenate([shapes.outline, shapes.column, [body.right, body.left]])
+    room = 0.2 * body.size
+    axis.set(xlim=(every[:, 0].min() - 1.6 * room, every[:, 0].max() + 1.6 * room))
+    axis.set(ylim=(-1.35 * room, every[:, 1].max() + room), aspect="equal")
+    axis.set_axis_off()
+    if motion is not None:
+        _motion(axis.inset_axes((0.1, -0.36, 0.8, 0.28)), motion)
+    return axis
+
+
+def draw_ground(axis, body: Body) -> None:
+    """The ground with its hatching, and the arrow of its acceleration."""
+    from matplotlib.patches import Polygon
+
+    size, (right, left) = body.size, (body.right, body.left)
+    surface = [[-3 * size, left[1]], left, right, [3 * size, right[1]]]
+    depth = -0.06 * size
+    axis.add_patch(Polygon([*surface, [3 * size, depth], [-3 * size, depth]], facecolor="white", edgecolor=GREY,
+                           hatch="////", linewidth=0))  # fmt: skip
+    axis.plot(*np.transpose(surface), **_INK)
+
+
+def draw(axis, body: Body, shapes) -> tuple:
+    """The block and its column, as artists that can be moved: outline, column, masses, spring."""
+    from matplotlib.patches import Polygon
+
+    modelled = bool(body.heights.size)
+    look = {"facecolor": "#f7f2e6", "edgecolor": GREY, "linestyle": "--"} if modelled else {"facecolor": _PAPER}
+    outline = Polygon(shapes.outline, **({"edgecolor": "black", "linewidth": 1.0} | look))
+    axis.add_patch(outline)
+    (column,) = axis.plot(*shapes.column.T, color=BLUE, linewidth=2.5, solid_capstyle="round")
+    (masses,) = axis.plot(*shapes.masses.T, "o", color="black", markersize=6)
+    if modelled:
+        turns = np.linspace(0, 4 * np.pi, 120)
+        spiral = 0.05 * body.size * turns / turns[-1]
+        axis.plot(spiral * np.cos(turns), spiral * np.sin(turns), color=RED, linewidth=1.0, zorder=4)
+    return outline, column, masses
+
+
+def _between(axis, start, end, label: str, offset=(0.0, 0.0)) -> None:
+    """A measure: an arrow with two heads and its symbol."""
+    axis.annotate("", start, end, arrowprops={"arrowstyle": "<->", "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0})
+    axis.text(*((np.add(start, end)) / 2 + offset), label, ha="center", va="center", fontsize=11)
+
+
+def _arc(axis, centre, radius: float, first: float, last: float, label: str) -> None:
+    """An angle between two directions [rad, counterclockwise from the right], and its symbol."""
+    angle = np.linspace(first, last, 40)
+    axis.plot(centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), color=RED, linewidth=1.0)
+    middle = (first + last) / 2
+    place = centre + 1.16 * radius * np.array([np.cos(middle), np.sin(middle)])
+    axis.text(*place, label, color=RED, ha="center", va="center", fontsize=11)
+
+
+def _acceleration(axis, body: Body) -> None:
+    reach, level = 0.28 * body.size, -0.21 * body.size
+    axis.annotate("", (reach, level), (-reach, level), arrowprops={"arrowstyle": "->", "color": BLUE, "linewidth": 1.4})
+    axis.text(1.15 * reach, level, r"$\ddot u_g$", color=BLUE, va="center", fontsize=12)
+
+
+def _symbols(axis, body: Body, rotation: float, modelled: bool) -> None:
+    """Of a block with two equal sides."""
+    side, size = (1 if rotation >= 0 else -1), body.size
+    pivot, top = (body.right if side > 0 else body.left), body.outline[:, 1].max()
+
+    def at(*place):
+        return turned(np.array(place), pivot, rotation)
+
+    b, gap = body.right[0], 0.08 * size
+    _acceleration(axis, body)
+    _between(axis, at(-b, top + gap), at(b, top + gap), "$2b$", at(0, top + 1.7 * gap) - at(0, top + gap))
+    _between(axis, at(-side * (b + gap), 0), at(-side * (b + gap), top), "$2h$", at(-side * 0.8 * gap, 0) - at(0, 0))
+    for corner, name in ((body.right, "$O$"), (body.left, "$O'$")):
+        axis.text(corner[0] + np.sign(corner[0]) * 0.9 * gap, -0.9 * gap, name, ha="center", va="top", fontsize=11)
+    upright = np.pi / 2 - rotation
+    if abs(rotation) > 1e-9:
+        axis.plot([pivot[0]] * 2, [0, 0.95 * top], color=GREY, linewidth=0.7, linestyle=":")
+        _arc(axis, pivot, 0.8 * top, np.pi / 2, upright, r"$\theta$")
+    if modelled:
+        length, names = body.heights[-1], {True: "$2R$", False: "$R$"}
+        longer = length > 1.5 * np.hypot(*body.centre)
+        name = names[longer] if length > body.centre[1] * (1 + 1e-9) else r"$R\cos\alpha$"
+        foot, head = (turned(np.array([side * 0.5 * gap, y]), np.zeros(2), rotation) for y in (0, length))
+        _between(axis, foot, head, name, (side * (0.7 if len(name) < 5 else 1.7) * gap, 0))
+        return
+    centre = at(*body.centre)
+    axis.plot(*np.transpose([pivot, centre]), **_INK)
+    axis.plot(*centre, "o", color="black", markersize=4)
+    axis.text(*(pivot + 0.62 * (centre - pivot) - [side * 0.5 * gap, 0]), "$R$", ha="center", va="center", fontsize=11)
+    axis.text(*(centre + [0, 0.6 * gap]), "$m$", ha="center", va="center", fontsize=11)
+    alpha = float(np.arctan2(body.right[0], body.centre[1]))
+    _arc(axis, pivot, 0.45 * np.hypot(*body.centre), upright, upright + side * alpha, r"$\alpha$")
+
+
+def _sides(axis, body: Body, rotation: float) -> None:
+    """Of a block whose sides differ."""
+    pivot, gap = (body.right if rotation >= 0 else body.left), 0.08 * body.size
+    _acceleration(axis, body)
+    centre = turned(body.centre, pivot, rotation)
+    axis.plot(*centre, "o", color="black", markersize=4)
+    for corner, side, number in ((body.right, 1, 1), (body.left, -1, 2)):
+        at, upright = turned(corner, pivot, rotation), np.pi / 2 - rotation
+        alpha = float(np.arctan2(side * (corner - body.centre)[0], body.centre[1] - corner[1]))
+        reach = np.hypot(*(centre - at))
+        axis.plot(*np.transpose([at, centre]), **_INK)
+        axis.plot(*np.transpose([at, turned(corner + [0, 0.8 * reach], pivot, rotation)]), color=GREY, linewidth=0.7,
+                  linestyle=":")  # fmt: skip
+        axis.text(*(at + 0.55 * (centre - at) + [side * 0.9 * gap, 0]), f"$R_{number}$", ha="center", fontsize=11)
+        _arc(axis, at, 0.7 * reach, upright, upright + side * alpha, rf"$\alpha_{number}$")
+        axis.text(corner[0] + side * 0.9 * gap, corner[1] - 0.9 * gap, "$O$" if side > 0 else "$O'$", ha="center",
+                  va="top", fontsize=11)  # fmt: skip
+
+
+def _motion(axis, motion: AbstractMotion) -> None:
+    """Ground acceleration against time, with the symbols of a pulse."""
+    end = float(motion.end)
+    time = np.linspace(-0.05 * end, 1.1 * end, 1501)
+    values = np.where(time < 0, 0.0, acceleration_of(motion, np.maximum(time, 0.0)))
+    axis.plot(time, values, color=BLUE, linewidth=1)
+    axis.axhline(0, color=GREY, linewidth=0.5)
+    axis.set(xlabel="time [s]", ylabel=r"$\ddot u_g$ [g]", xlim=(time[0], time[-1]))
+    axis.spines[["top", "right"]].set_visible(False)
+    peak = values[np.argmax(np.abs(values))]
+    axis.axhline(peak, color=SAND, linewidth=0.8, linestyle="--")
+    axis.text(time[-1], peak, r" $a_g$", va="center", fontsize=10)
+    names = list(declared(type(motion))) if isinstance(motion, AbstractPulse) else []
+    symbol = {"duration": "$t_d$", "period": "$T_p$"}.get(names[1]) if len(names) > 1 else None
+    if symbol:
+        extent = float(getattr(motion, names[1]))
+        low = min(values.min(), 0.0) - 0.22 * np.ptp(values)
+        start = (end - extent) / 2
+        axis.annotate("", (start, low), (start + extent, low),
+                      arrowprops={"arrowstyle": "<->", "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+        axis.text(start + extent / 2, low, symbol, ha="center", va="bottom", fontsize=10)
+        axis.set_ylim(bottom=low - 0.1 * np.ptp(values))

@@ -1,0 +1,256 @@
+"""Exact borders of overturning maps: regions between curves on which a block just stands, islands and gaps included.
+
+Along every column of a map, one frequency of the pulse, all ends of the overturning intervals are found as critical
+amplitudes are. Intervals of neighbouring columns that belong together make a region. Where they do not fit, because a
+region begins, ends, forks or bends there, columns are put between, down to a ten-millionth of the width. Slow pulses
+have islands without number, ever lower: those that cannot be seen in the map are drawn as far as they were found.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrock._arguments import arguments
+from jaxrock.status import Status
+from jaxrock.studies.ends import brackets_of, roots_of
+from jaxrock.studies.spectra import OverturningMap, under_pulse
+from jaxrock.sweeps.sweep import surface
+
+_FIRST = 256  # intervals of the first sampling of a column
+_BEND = 1e-3  # of the ranges: the error of a straight line between two columns that is let pass
+_CLOSE = 1e-7  # of the range of frequencies: columns are put no closer
+_SPECK = 1e-6  # of the area of a map: what may be drawn wrongly where intervals do not fit
+_MOST = 600  # columns
+
+
+class Region(NamedTuple):
+    """Overturned blocks between two borders.
+
+    - `impacts`: before overturning, at the lower border; 0 in regions without.
+    - `frequency_ratio`: (n,) rising [-].
+    - `lower`, `upper`: (n,) intensities [-], exact to rounding at each of them. At the edge of a map they are its own.
+    """
+
+    impacts: int
+    frequency_ratio: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+class Borders(NamedTuple):
+    """What `overturning_borders` finds.
+
+    - `regions`: a list of `Region`s.
+    - `crowded`: (n, 2) ranges of frequency ratios in which there are too many islands to be told apart.
+    """
+
+    regions: list[Region]
+    crowded: np.ndarray
+
+
+class _Interval(NamedTuple):
+    lower: float
+    upper: float
+    impacts: int
+    kind: tuple[int, ...]  # impacts at either end: equal of intervals that belong together
+
+
+@arguments
+def overturning_borders(result: OverturningMap, *, progress: bool | None = False) -> Borders:
+    """The regions of an overturning map in which blocks overturn, between their exact borders.
+
+    **Arguments:**
+
+    - `result`: from `overturning_map`, without further axes; its grid only says where to look.
+    - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
+
+    **Returns:** `Borders`. Intervals of intensities that are much narrower than a hundredth of the range and
+    give no sign of themselves beside them may be missed; a safe gap between different numbers of impacts is not.
+
+    **Raises:** ValueError for a map with further axes, of one column or one row, or that was not computed by
+    `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(result)):
+        raise TypeError(
+            "Borders are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap)."
+        )
+    ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
+    if result.parameters or result.scene is None or min(ratio.size, intensity.size) < 2 or ratio.ndim > 1:
+        raise ValueError(
+            "Argument `result` must be a map of two axes, with two values or more each, from `overturning_map`."
+        )
+    search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress)
+    columns = {x: column for x, column in zip(np.unique(ratio), search.columns(np.unique(ratio)))}
+    width = float(np.ptp(ratio))
+    while True:
+        places = sorted(columns)
+        between, crowded = _wanted(places, columns, width, search.high - search.low)
+        if not between or len(columns) > _MOST:
+            break
+        columns |= zip(between, search.columns(np.array(between)))
+    return Borders(_regions(places, columns), np.array(crowded).reshape(-1, 2))
+
+
+class _Search(NamedTuple):
+    """What is asked of a column."""
+
+    scene: tuple
+    low: float
+    high: float
+    progress: bool | None
+
+    def at(self, z: np.ndarray, ratio: np.ndarray) -> tuple:
+        """Margin, its slope and impacts at logarithms of intensities, and frequency ratios beside them."""
+        return tuple(map(np.asarray, surface(_point, (z, ratio), self.scene, "borders", self.progress, outer=False)))
+
+    def columns(self, ratio: np.ndarray) -> list[list[_Interval]]:
+        """The overturning intervals of every column."""
+        steps = self.low + (self.high - self.low) * np.geomspace(1e-4, 1.0, _FIRST)
+        grid = np.broadcast_to(np.log([self.low, *steps]), (ratio.size, _FIRST + 1))
+
+        def at(z, index):
+            return self.at(z, ratio[index])
+
+        ends = roots_of(at, brackets_of(at, grid)[0])
+        first, last = (self.at(np.full(ratio.size, edge), ratio) for edge in (grid[0, 0], grid[0, -1]))
+        found = [self._ends(grid[0], first, last, ends, k) for k in range(ratio.size)]
+        cuts = self._cuts([(*pair, x) for x, pairs in zip(ratio, found) for pair in pairs])
+        return [[part for pair in pairs for part in _parts(pair, cuts)] for pairs in found]
+
+    @staticmethod
+    def _ends(grid, first: tuple, last: tuple, ends: dict, k: int) -> list[tuple]:
+        """Both ends of each interval of column k: logarithm of the intensity, impacts."""
+        mine = np.flatnonzero(ends["index"] == k)
+        mine = mine[np.argsort(ends["z"][mine])]
+        lower = [(ends["z"][i], int(ends["impacts"][i])) for i in mine if ends["rising"][i]]
+        upper = [(ends["z"][i], int(ends["impacts"][i])) for i in mine if not ends["rising"][i]]
+        if first[0][k] < 0:
+            lower = [(grid[0], int(first[2][k])), *lower]
+        if last[0][k] < 0:
+            upper = [*upper, (grid[-1], int(last[2][k]))]
+        return list(zip(lower, upper))
+
+    def _cuts(self, found: list[tuple]) -> dict[tuple, float]:
+        """Where blocks overturn after impacts below and, without a safe gap between, without any above; or conversely.
+
+        By the ends of the interval."""
+        mixed = [row for row in found if _is_mixed(row[0], row[1])]
+        if not mixed:
+            return {}
+        low, high, ratio = (np.array(x) for x in zip(*((first[0], last[0], x) for first, last, x in mixed)))
+        without = np.array([first[1] == 0 for first, *_ in mixed])
+        for _ in range(50):
+            middle = (low + high) / 2
+            same = (self.at(middle, ratio)[2] == 0) == without
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        return {row[:2]: float(cut) for row, cut in zip(mixed, (low + high) / 2)}
+
+
+def _is_mixed(lower: tuple, upper: tuple) -> bool:
+    return (lower[1] == 0) != (upper[1] == 0)
+
+
+def _parts(pair: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
+    """The interval between two ends, in two where the one part is without impacts."""
+    (low, first), (high, last) = pair
+    if not _is_mixed(*pair):
+        return [_Interval(math.exp(low), math.exp(high), first, (first, last))]
+    cut = math.exp(cuts[pair])
+    return [_Interval(math.exp(low), cut, first, (first, -1)), _Interval(cut, math.exp(high), last, (-1, last))]
+
+
+def _point(z, ratio, scene):
+    """Margin, its slope by z and impacts of a block under a pulse of intensity e^z."""
+
+    def margin(z):
+        result, _ = under_pulse(jnp.exp(z), ratio, scene)
+        return result.margin, result
+
+    margin, slope, result = jax.jvp(margin, (z,), (jnp.ones_like(z),), has_aux=True)
+    decided = (result.status == Status.successful) | (result.status == Status.undecided)
+    return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
+
+
+def _pairs(here: list[_Interval], there: list[_Interval], strict: bool) -> list[tuple[int, int]]:
+    """Which intervals of two columns belong together: they overlap, and no other one of their kind does.
+
+    `strict`: only those after as many impacts; otherwise, of what is left then, also after other numbers of them.
+    """
+    overlap = [
+        (i, j)
+        for i, a in enumerate(here)
+        for j, b in enumerate(there)
+        if max(a.lower, b.lower) <= min(a.upper, b.upper)
+    ]
+    found = _only([(i, j) for i, j in overlap if here[i].kind == there[j].kind])
+    if strict:
+        return found
+    left, right = {i for i, _ in found}, {j for _, j in found}
+    rest = [(i, j) for i, j in overlap if i not in left and j not in right]
+    return sorted(found + _only([(i, j) for i, j in rest if (here[i].impacts == 0) == (there[j].impacts == 0)]))
+
+
+def _only(fits: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    return [(i, j) for i, j in fits if sum(i == k for k, _ in fits) == 1 == sum(j == k for _, k in fits)]
+
+
+def _seen(count: int) -> float:
+    """How high one of so many intervals has to be, of the range, for columns to be put between; more, in a crowd."""
+    return 2e-4 * max(1.0, count / 8) ** 2
+
+
+def _wanted(places: list, columns: dict, width: float, height: float) -> tuple[list[float], list[tuple]]:
+    """Where columns have to be put between; and between which it is left, although intervals do not fit."""
+    wanted, crowded, pairs = set(), [], []
+    for left, right in zip(places, places[1:]):
+        found = _pairs(columns[left], columns[right], strict=True)
+        pairs.append(found)
+        lonely, seen = 0.0, 1.0
+        for side, place in enumerate((left, right)):
+            paired = {pair[side] for pair in found}
+            alone = [each.upper - each.lower for k, each in enumerate(columns[place]) if k not in paired]
+            lonely = max(lonely, *alone, 0.0)
+            seen = min(seen, _seen(len(columns[place])))
+        if right - left > _CLOSE * width and lonely > seen * height:
+            wanted.add((left + right) / 2)
+        elif (right - left) * lonely > _SPECK * width * height:
+            crowded.append((left, right))
+    return sorted(wanted | _bends(places, columns, pairs, width, height)), crowded
+
+
+def _bends(places: list, columns: dict, pairs: list, width: float, height: float) -> set[float]:
+    """Where columns have to be put between, because a border is not straight."""
+    wanted = set()
+    for (left, here, right), (before, after) in zip(zip(places, places[1:], places[2:]), zip(pairs, pairs[1:])):
+        if max(here - left, right - here) <= _CLOSE * width:
+            continue
+        share, onward = (here - left) / (right - left), dict(after)
+        for i, j in before:
+            if j not in onward:
+                continue
+            a, b, c = columns[left][i], columns[here][j], columns[right][onward[j]]
+            if any(abs(y - (x + share * (z - x))) > _BEND * height for x, y, z in zip(a[:2], b[:2], c[:2])):
+                wanted |= {(left + here) / 2, (here + right) / 2}
+    return wanted
+
+
+def _regions(places: list, columns: dict) -> list[Region]:
+    """Intervals that belong together, column after column."""
+    open_, regions = {}, []
+    for k, place in enumerate(places):
+        now = columns[place]
+        onward = {j: i for i, j in _pairs(columns[places[k - 1]], now, strict=False)} if k else {}
+        chains = {j: open_.pop(onward[j], []) if j in onward else [] for j in range(len(now))}
+        regions += open_.values()
+        open_ = {j: [*chain, (place, now[j])] for j, chain in chains.items()}
+    regions += open_.values()
+    return [_region(chain) for chain in regions]
+
+
+def _region(chain: list[tuple[float, _Interval]]) -> Region:
+    ratio = np.array([place for place, _ in chain])
+    lower, upper = (np.array([interval[k] for _, interval in chain]) for k in (0, 1))
+    return Region(chain[0][1].impacts, ratio, lower, upper)

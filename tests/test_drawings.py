@@ -1,0 +1,169 @@
+"""Drawings are to scale, at any rotation; films show the response and its verdict."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.patches import Polygon
+
+import jaxrock as rk
+
+BLOCK = rk.Block.from_dimensions(0.6, 1.8)
+ROCK = rk.AsymmetricBlock.from_corners([0.3, 0.0], [-0.2, 0.0], [0.0, 0.9], 0.5)
+COLUMN = rk.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, masses=4)
+
+
+@pytest.fixture(autouse=True)
+def closed_afterwards():
+    yield
+    plt.close("all")
+
+
+def drawn(axis):
+    """Vertices of the block, which is drawn after the ground; and its column and masses."""
+    outline = [patch for patch in axis.patches if isinstance(patch, Polygon)][1].get_xy()[:-1]
+    column, masses = (line.get_xydata() for line in axis.lines[1:3])
+    return outline, column, masses
+
+
+def words(axis):
+    return {text.get_text() for text in axis.texts}
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.2, -0.2, np.pi / 2])
+def test_a_block_turns_about_its_corner(rotation):
+    outline, _, _ = drawn(rk.plot.scene(BLOCK, rotation=rotation))
+    corner = np.array([0.3 if rotation >= 0 else -0.3, 0.0])
+    assert np.min(np.hypot(*(outline - corner).T)) < 1e-12
+    assert outline[:, 1].min() > -1e-9  # on the ground
+    centre = (outline.max(0) + outline.min(0)) / 2
+    np.testing.assert_allclose(np.hypot(*(centre - corner)), BLOCK.half_diagonal)
+    lean = np.arctan2(*(centre - corner)) + np.sign(corner[0]) * float(BLOCK.alpha)
+    np.testing.assert_allclose(lean, rotation, atol=1e-12)  # to the right, if positive
+
+
+SPRINGS = {
+    "SM1": (rk.Spring("SM1"), [1.0]),
+    "SM2": (rk.Spring("SM2"), [0.0]),
+    "SM3": (rk.Spring("SM3"), [np.cos(np.arctan(1 / 3))]),
+    "mmSM": (rk.Spring("mmSM", masses=3), [0.0, 1.0, 2.0]),
+}
+
+
+@pytest.mark.parametrize("name", SPRINGS)
+def test_masses_of_springs(name):
+    """In units of R, along the column."""
+    model, heights = SPRINGS[name]
+    _, column, masses = drawn(rk.plot.scene(BLOCK, model=model, rotation=0.3))
+    np.testing.assert_allclose(np.hypot(*masses.T) / BLOCK.half_diagonal, heights, atol=1e-12)
+    np.testing.assert_allclose(np.arctan2(*column[-1]), 0.3)
+
+
+def test_a_column_bends():
+    _, column, masses = drawn(rk.plot.scene(COLUMN, bending=1.0))
+    np.testing.assert_array_equal(column, masses)
+    np.testing.assert_allclose(column[-1], [1.0, COLUMN.length])
+    assert (np.diff(column[:, 0], n=2) > 0).all() and column[0, 0] == 0  # clamped below, the more bent above
+
+
+def test_an_asymmetric_block_keeps_its_corners_and_its_centre():
+    outline, _, _ = drawn(rk.plot.scene(ROCK))
+    np.testing.assert_allclose(outline[1] - outline[0], [0.5, 0.0], atol=1e-12)  # right corner, left corner
+    np.testing.assert_allclose(outline.mean(0) - outline[1], [-0.3, 0.9], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("block", "model", "symbols"),
+    [
+        (BLOCK, rk.Housner(), {"$R$", "$2b$", "$2h$", r"$\alpha$", r"$\theta$", "$O$", "$O'$", "$m$", r"$\ddot u_g$"}),
+        (ROCK, rk.Housner(), {"$R_1$", "$R_2$", r"$\alpha_1$", r"$\alpha_2$", "$O$", "$O'$"}),
+        (BLOCK, rk.Spring("SM3"), {r"$R\cos\alpha$", "$2b$"}),
+        (COLUMN, rk.Housner(), {"$2R$", "$2h$"}),
+    ],
+)
+def test_symbols(block, model, symbols):
+    assert symbols <= words(rk.plot.scene(block, model=model, rotation=0.1))
+
+
+@pytest.mark.parametrize(
+    ("motion", "symbol"), [(rk.SinePulse(0.5, 1.0), "$T_p$"), (rk.ExponentialPulse(0.5, 1.0, 0.5), "$t_d$")]
+)
+def test_the_motion_is_drawn_below(motion, symbol):
+    axis = rk.plot.scene(BLOCK, motion)
+    (below,) = axis.child_axes
+    time, values = below.lines[0].get_xydata().T
+    during = (time > 0) & (time < 1)
+    np.testing.assert_allclose(values[during], motion.acceleration(time[during]))
+    assert {" $a_g$", symbol} <= words(below)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rk.plot.scene(BLOCK, rotation=2.0), r"Argument `rotation` must be in \[-pi/2, pi/2\]"),
+        (lambda: rk.plot.scene(BLOCK, bending=1.0), "Argument `bending` must be zero for a Block"),
+        (lambda: rk.plot.scene(rk.Block(np.array([0.1, 0.2]), 2.0)), "Argument `block` must hold one scene"),
+    ],
+)
+def test_what_cannot_be_drawn(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+PULSE = rk.SinePulse(0.5, 1.0)
+
+
+def started(film):
+    """A film that has drawn: matplotlib warns of others."""
+    film._init_draw()
+    return film
+
+
+@pytest.fixture(scope="module")
+def response():
+    return rk.simulate(BLOCK, PULSE, rk.Linear(), duration=3.0)
+
+
+def test_a_film_follows_the_response(response):
+    film = started(rk.plot.animate(response, fps=10, speed=1.0))
+    axis = film._fig.axes[0]
+    for number in (4, 12, 30):
+        film._func(number)
+        outline, _, _ = drawn(axis)
+        rotation = float(response(number / 10)[0])
+        edge = outline[24] - outline[0]  # the right side
+        np.testing.assert_allclose(np.arctan2(*edge), rotation, atol=1e-9)
+    assert axis.get_title().endswith("overturns" if response.overturned else "stands")
+    assert f"{int(response.impact_count)} impact" in axis.get_title()
+
+
+def test_a_film_of_a_column():
+    response = rk.simulate(COLUMN, rk.SinePulse(0.4, 1.6), duration=4.0)
+    np.testing.assert_allclose(response.column(1.3)[-1], response(1.3)[1])
+    film = started(rk.plot.animate(response, fps=10))
+    film._func(13)
+    _, column, _ = drawn(film._fig.axes[0])
+    rotation, top, bending = (float(x) for x in response(1.3))
+    across = column[-1, 0] * np.cos(rotation) - column[-1, 1] * np.sin(rotation)
+    np.testing.assert_allclose(across, bending, atol=1e-9)
+
+
+def test_the_shape_of_an_asymmetric_block_must_be_given():
+    response = rk.simulate(ROCK, PULSE, duration=1.0)
+    with pytest.raises(ValueError, match="Argument `block` must be given for the response of an asymmetric block"):
+        rk.plot.animate(response)
+    started(rk.plot.animate(response, ROCK))
+
+
+@pytest.mark.parametrize("kind", ["gif", "html"])
+def test_films_are_written(kind, response, tmp_path):
+    film = rk.plot.animate(response, fps=2, speed=3.0)
+    path = tmp_path / f"film.{kind}"
+    rk.plot.save_animation(film, path, dpi=30)
+    start = path.read_bytes()[:15]
+    assert start.startswith(b"GIF89a") if kind == "gif" else start == b"<!DOCTYPE html>"
+
+
+def test_other_endings_are_refused(response, tmp_path):
+    film = started(rk.plot.animate(response, fps=2))
+    with pytest.raises(ValueError, match="Argument `path` must end with .gif, .html or .mp4"):
+        rk.plot.save_animation(film, tmp_path / "film.avi")
