@@ -12,6 +12,7 @@ import inspect
 import json
 import re
 import sys
+import types
 import warnings
 from collections.abc import Callable
 from decimal import Decimal
@@ -50,6 +51,14 @@ def block():
 
 def pulse():
     return rk.SinePulse(0.5, 1.0)
+
+
+def record():
+    return rk.Record(np.sin(TIMES), 0.01)
+
+
+def trace():
+    return types.SimpleNamespace(data=np.sin(TIMES), stats=types.SimpleNamespace(delta=0.01))
 
 
 def simulated():
@@ -124,6 +133,7 @@ QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 SCENE = {"block": block(), "motion": pulse(), **QUICK}
 PULSE = {"amplitude": 0.5, "duration": 1.0}
 CYCLE = {"amplitude": 0.5, "period": 1.0}
+OSCILLATOR = {"motion": pulse(), "period": [0.5, 1.0], "damping": 0.05}
 RANGES = {"frequency_ratio": [1.0], "intensity": [2.0], **QUICK, "progress": False}
 RIGID = {"alpha1": 0.2, "alpha2": 0.3}
 
@@ -191,7 +201,9 @@ CALLS: dict[str, Call] = {
     "CosinePulse": Call(rk.CosinePulse, CYCLE),
     "RickerPulse": Call(rk.RickerPulse, {**CYCLE, "kind": "symmetric", "center": 1.0}),
     "MavroeidisPapageorgiouPulse": Call(rk.MavroeidisPapageorgiouPulse, {**CYCLE, "oscillations": 2.0, "phase": 0.5}),
-    "Record": Call(rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a"}),
+    "Record": Call(rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a", "origin": rk.Origin()}),
+    "Components": Call(rk.Components, {"first": record(), "second": record(), "vertical": record()}),
+    "Components.along": Call(rk.Components(record(), record()).along, {"angle": 0.3}),
     "WithVertical": Call(rk.WithVertical, {"horizontal": pulse(), "vertical": pulse()}),
     "AbstractMotion.with_vertical": Call(pulse().with_vertical, {"vertical": pulse()}),
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
@@ -200,6 +212,35 @@ CALLS: dict[str, Call] = {
     "Suite": Call(rk.Suite, {"motions": [pulse()], "names": ["a"]}),
     "peak_acceleration": Call(rk.peak_acceleration, {"motion": pulse()}),
     "peak_velocity": Call(rk.peak_velocity, {"motion": pulse()}),
+    "intensity.peak_displacement": Call(rk.intensity.peak_displacement, {"motion": pulse()}),
+    "intensity.velocity_to_acceleration": Call(rk.intensity.velocity_to_acceleration, {"motion": pulse()}),
+    "intensity.arias": Call(rk.intensity.arias, {"motion": pulse()}),
+    "intensity.cumulative_absolute_velocity": Call(rk.intensity.cumulative_absolute_velocity, {"motion": pulse()}),
+    "intensity.significant_duration": Call(
+        rk.intensity.significant_duration, {"motion": pulse(), "begin": 0.05, "end": 0.95}
+    ),
+    "intensity.mean_period": Call(rk.intensity.mean_period, {"motion": pulse()}),
+    "intensity.spectral_acceleration": Call(rk.intensity.spectral_acceleration, OSCILLATOR),
+    "intensity.spectral_velocity": Call(rk.intensity.spectral_velocity, {**OSCILLATOR, "pseudo": True}),
+    "intensity.average_spectral_acceleration": Call(rk.intensity.average_spectral_acceleration, OSCILLATOR),
+    "intensity.uplift_ratio": Call(rk.intensity.uplift_ratio, {"motion": pulse(), "block": block()}),
+    "intensity.velocity_ratio": Call(rk.intensity.velocity_ratio, {"motion": pulse(), "block": block()}),
+    "processing.from_displacement": Call(
+        rk.processing.from_displacement,
+        {"displacement": TIMES**2, "dt": 0.1, "unit": "m", "corner": 2.0, "order": 4, "name": "a"},
+    ),
+    "processing.from_velocity": Call(
+        rk.processing.from_velocity,
+        {"velocity": TIMES, "dt": 0.1, "unit": "cm", "corner": 2.0, "order": 4, "name": "a"},
+    ),
+    "processing.baseline_corrected": Call(rk.processing.baseline_corrected, {"record": record(), "degree": 2}),
+    "processing.tapered": Call(rk.processing.tapered, {"record": record(), "seconds": 0.01}),
+    "processing.filtered": Call(
+        rk.processing.filtered, {"record": record(), "low": 1.0, "high": 5.0, "order": 4, "zero_phase": True}
+    ),
+    "processing.resampled": Call(rk.processing.resampled, {"record": record(), "dt": 0.005}),
+    "processing.cut": Call(rk.processing.cut, {"record": record(), "begin": 0.0, "end": 0.1}),
+    "processing.scaled": Call(rk.processing.scaled, {"record": record(), "factor": 2.0}),
     # Models and engines
     "Spring": Call(rk.Spring, {"kind": "SM1", "law": "linear"}),
     "Equation": Call(
@@ -456,6 +497,12 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "read_observations": Call(rk.read_observations, {"path": "/nowhere/a.csv"}),
+    "read_components": Call(
+        rk.read_components, {"paths": ["/nowhere/a", "/nowhere/b"], "columns": None, "dt": 0.01, "unit": "g"}
+    ),
+    "record_of_trace": Call(rk.record_of_trace, {"trace": trace(), "unit": "g"}),
+    "write_at2": Call(rk.write_at2, {"record": record(), "path": "/nowhere/a.at2"}),
+    "write_csv": Call(rk.write_csv, {"record": record(), "path": "/nowhere/a.csv", "unit": "g"}),
     "read_record": Call(
         rk.read_record, {"path": "/nowhere/a.at2", "format": "at2", "dt": 0.01, "unit": "g", "column": 0}
     ),
@@ -500,16 +547,15 @@ NOT_CALLED = {
     "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome", "OverturningMap", "Posterior",
     "PosteriorStatus", "Response", "Sensitivity", "SensitivityMap", "SimulatedFragility", "SimulatedSurface",
     "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms", "Unexceeded", "example_record", "keep_compiled",
-    "closed_form", "restitution", "similarity", "plot",
+    "Origin", "closed_form", "restitution", "similarity", "plot",
 }  # fmt: skip
 
 
 def public_names() -> set[str]:
     """All that `import jaxrock` offers."""
     names = {name for name in vars(rk) if not name.startswith("_")} - {"TYPE_CHECKING"} | {"Diffrax", "plot"}
-    return {name for name in names if not inspect.ismodule(getattr(rk, name))} | {
-        name for name in names if name in ("closed_form", "restitution", "similarity", "plot")
-    }
+    spaces = {"closed_form", "intensity", "plot", "processing", "restitution", "similarity"}
+    return {name for name in names if not inspect.ismodule(getattr(rk, name))} | (names | {"processing"}) & spaces
 
 
 # What nobody means.
@@ -602,7 +648,7 @@ def verdict(name: str, given: dict[str, Any]) -> str | None:
             return None  # what a user's function raises is its own
         return _of_refusal(error)
     except OSError as error:
-        return None if name.startswith("read_") else f"{type(error).__name__}: {error}"
+        return None if name.startswith(("read_", "write_")) else f"{type(error).__name__}: {error}"
     except call.raises:
         return None
     except Exception as error:

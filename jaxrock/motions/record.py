@@ -1,6 +1,7 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,6 +45,24 @@ class _Straight(AbstractMotion):
         return [left[piece] + slope * local, slope * unit][: order + 1]
 
 
+class Origin(NamedTuple):
+    """What a file says of a record, in its words; empty where it says nothing.
+
+    - `event`, `station`, `component`: the earthquake, the station's name, the direction of the sensor.
+    - `start`: when the first sample was taken; `code`: of the station.
+    - `format`, `unit`: of the file, before the samples were brought to g; `file`: its name.
+    """
+
+    event: str = ""
+    station: str = ""
+    component: str = ""
+    start: str = ""
+    code: str = ""
+    format: str = ""
+    unit: str = ""
+    file: str = ""
+
+
 class Record(_Straight):
     """An accelerogram: straight lines between equally spaced samples.
 
@@ -52,6 +71,7 @@ class Record(_Straight):
     - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1.
     - `dt`: time between samples [s], positive.
     - `name`: where it comes from; shown in tables and figures.
+    - `origin`: an `Origin`, what a file says of it; None: nothing.
 
     **Raises:** ValueError for samples that are not a finite one-dimensional array, or dt <= 0.
 
@@ -63,18 +83,23 @@ class Record(_Straight):
     label: Label = eqx.field(static=True)
 
     @arguments
-    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
+    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None):
         samples = strength("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
         self.samples = samples
         self.dt = size("dt", dt)
-        self.label = Label(name)
+        self.label = Label((name, origin or Origin()))
 
     @property
     def name(self) -> str:
         """Where the record comes from."""
-        return self.label.value
+        return self.label.value[0]
+
+    @property
+    def origin(self) -> Origin:
+        """What its file says of it."""
+        return self.label.value[1]
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
