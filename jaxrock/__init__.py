@@ -37,11 +37,14 @@ from jaxrock.hazard.fragility import (
     TabulatedFragility as TabulatedFragility,
     fit_fragility as fit_fragility,
 )
+from jaxrock.hazard.nrml import write_nrml as write_nrml
 from jaxrock.hazard.openquake import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.hazard.probit import ProbitFit as ProbitFit, fit_probit as fit_probit
 from jaxrock.hazard.simulated_fragility import (
     SimulatedFragility as SimulatedFragility,
     simulated_fragility as simulated_fragility,
 )
+from jaxrock.hazard.suite_outcomes import SuiteOutcomes as SuiteOutcomes, suite_outcomes as suite_outcomes
 from jaxrock.hazard.surfaces import (
     SimulatedSurface as SimulatedSurface,
     SurfaceFit as SurfaceFit,
@@ -49,6 +52,11 @@ from jaxrock.hazard.surfaces import (
     fit_surface as fit_surface,
     simulated_surface as simulated_surface,
     surface_of as surface_of,
+)
+from jaxrock.inverse.block_calibration import (
+    BlockCalibration as BlockCalibration,
+    CalibrationStatus as CalibrationStatus,
+    calibrate_block as calibrate_block,
 )
 from jaxrock.inverse.estimate import (
     Estimate as Estimate,

@@ -112,6 +112,19 @@ def verdicts():
     return rk.SimulatedFragility(jnp.asarray(LEVELS), table, *peaks, ("a", "b"), "PGA")
 
 
+def many():
+    """Outcomes of a suite, put together by hand."""
+    verdict, rotation = np.array([0, 1], np.int8).reshape(1, 2, 1, 1), np.array([0.5, INF]).reshape(1, 2, 1, 1)
+    blocks = rk.Block(np.array([0.2]), np.array([2.0]))
+    return rk.SuiteOutcomes(rk.Suite([pulse()]), blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation)
+
+
+def line():
+    """A probit fit, put together by hand."""
+    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0)
+    return rk.ProbitFit(("PGA",), *numbers, rk.FitStatus.successful)
+
+
 def surface():
     """A simulated surface, put together by hand."""
     return rk.SimulatedSurface(jnp.asarray(LEVELS), jnp.asarray([0.1, 0.2]), np.zeros((1, 3, 2, 1), np.int8))
@@ -347,6 +360,39 @@ CALLS: dict[str, Call] = {
     ),
     "SimulatedFragility.fit": Call(verdicts().fit, {"bound": "lower"}, may_be="lowest_toppled"),
     "SimulatedFragility.tabulated": Call(verdicts().tabulated, {"bound": "lower"}),
+    "suite_outcomes": Call(
+        rk.suite_outcomes,
+        {"block": block(), "motions": [pulse()], "scale": [0.5, 1.0], **QUICK, "facing": "both", "progress": False},
+        True,
+        "capacity|rotation|margin",
+    ),
+    "SuiteOutcomes.reaches": Call(many().reaches, {"state": [0.1, 1.0]}),
+    "SuiteOutcomes.table": Call(
+        lambda **given: {name: x for name, x in many().table(**given).items() if name != "motion"},
+        {"measures": {"Arias": rk.intensity.arias}},
+        may_be=".*",
+    ),
+    "fit_probit": Call(
+        rk.fit_probit,
+        {
+            "measures": {"PGA": [0.1, 0.2, 0.3, 0.4, 0.5], "PGV": [0.1, 0.3, 0.1, 0.2, 0.1]},
+            "toppled": [0, 1, 0, 1, 1],
+            "trials": 1,
+            "clusters": [0, 0, 1, 1, 2],
+            "errors": "clusters",
+        },
+    ),
+    "ProbitFit.__call__": Call(line().__call__, {"PGA": [0.1, 0.2]}),
+    "write_nrml": Call(
+        rk.write_nrml,
+        {
+            "fragilities": {"falls": fragility()},
+            "path": "/nowhere/a.xml",
+            "measure": "PGA",
+            "taxonomy": "a",
+            "description": "b",
+        },
+    ),
     "surface_of": Call(rk.surface_of, {"found": verdicts(), "bound": "lower"}),
     "fit_surface": Call(
         rk.fit_surface,
@@ -478,6 +524,27 @@ CALLS: dict[str, Call] = {
         True,
         ".*",
     ),
+    "calibrate_block": Call(
+        rk.calibrate_block,
+        {
+            "block": lambda alpha: rk.Block(alpha, 2.0),
+            "motions": [pulse(), rk.SinePulse(0.7, 1.0)],
+            "toppled": [0, 1],
+            "unknowns": {"alpha": rk.Unknown(0.1, 0.4)},
+            "scatter": {"alpha": 0.2},
+            **QUICK,
+            "rotation": None,
+            "rotation_sd": 0.3,
+            "facing": 0,
+            "cells": 8,
+            "lapse": 0.01,
+            "groups": None,
+            "folds": 0,
+            "progress": False,
+        },
+        True,
+        ".*",
+    ),
     "fit_history": Call(
         rk.fit_history,
         {
@@ -542,6 +609,7 @@ for _module in ("pushover", "restitution", "sine_pulse", "single_lobe"):
 
 # Public names that nobody calls with arguments, and what is tried elsewhere.
 NOT_CALLED = {
+    "BlockCalibration", "CalibrationStatus", "ProbitFit", "SuiteOutcomes",
     "AbstractEquation", "AbstractFragility", "AbstractMotion", "Coefficients", "Contact", "Critical", "Estimate",
     "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FragilityFit", "Grid",
     "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome", "OverturningMap", "Posterior",

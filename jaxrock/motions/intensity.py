@@ -17,7 +17,7 @@ from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.oscillator import peaks_of_oscillator
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, with_room
 from jaxrock.motions.straight import Straight, straight
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
@@ -65,8 +65,13 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     return peak
 
 
-@jax.jit
 def _peaks(motion: AbstractMotion):
+    """As `_peaks_of`, by a few programs for records of any lengths."""
+    return _peaks_of(with_room(motion))
+
+
+@jax.jit
+def _peaks_of(motion: AbstractMotion):
     """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
 
     Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration

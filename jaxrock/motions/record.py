@@ -129,6 +129,19 @@ def padded(motion: AbstractMotion) -> AbstractMotion:
     return jax.tree.map(_padded, motion, is_leaf=lambda part: type(part) is Record)
 
 
+def with_room(motion: AbstractMotion) -> AbstractMotion:
+    """The same motion, with room in its records for as many samples as the next power of two, 1024 at least: so that a
+    few programs serve a suite of any lengths."""
+    return jax.tree.map(_doubled, motion, is_leaf=lambda part: type(part) is Record)
+
+
+def _doubled(part):
+    if type(part) is not Record:
+        return part
+    count = part.samples.shape[-1]
+    return _Padded(*_with_room(part.samples, part.dt, max(1024, 1 << (count - 1).bit_length()) - count))
+
+
 def _padded(part):
     if type(part) is not Record or part.samples.shape[-1] <= _SHORT:
         return part

@@ -1,13 +1,15 @@
 """A known motion as straight lines, in NumPy: what measures of intensity are sums over."""
 
+import functools
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.motions.record import Record
 
 _PARTS = 16384  # of a motion of few smooth pieces
@@ -51,24 +53,23 @@ def straight(motion: AbstractMotion) -> Straight:
     if isinstance(motion, Record):
         samples = GRAVITY * np.asarray(motion.samples, float)
         return Straight(samples[:-1], samples[1:], np.full(samples.size - 1, float(motion.dt)))
+    if isinstance(motion, Scaled):
+        inner, factor = straight(motion.motion), float(motion.factor)
+        return Straight(factor * inner.begin, factor * inner.end, inner.length)
     lengths = np.asarray(motion.lengths, float)
     # Pieces of no length, at the room of longer records, say nothing.
     pieces = np.flatnonzero(lengths > 0)
     parts = max(1, -(-_PARTS // max(pieces.size, 1)))
-    values = GRAVITY * _values(motion, parts, pieces)
+    values = GRAVITY * np.asarray(_values(motion, parts, pieces), float)
     return Straight(values[:, :-1].ravel(), values[:, 1:].ravel(), np.repeat(lengths[pieces] / parts, parts))
 
 
-def _values(motion: AbstractMotion, parts: int, pieces: np.ndarray) -> np.ndarray:
+@functools.partial(jax.jit, static_argnums=1)
+def _values(motion: AbstractMotion, parts: int, pieces):
     """Acceleration [g] at the ends of all parts of each piece, from within it."""
-    shares = np.arange(parts + 1) / parts
-    lengths = motion.lengths
+    lengths, shares = motion.lengths, jnp.arange(parts + 1) / parts
 
-    @jax.jit
-    def within(motion, pieces):
-        def at(piece, share):
-            return motion.series(piece, share * lengths[piece], 1.0 + 0 * lengths[piece], 0)[0]
+    def at(piece, share):
+        return motion.series(piece, share * lengths[piece], jnp.ones_like(lengths[piece]), 0)[0]
 
-        return jax.vmap(lambda piece: jax.vmap(lambda share: at(piece, share))(shares))(pieces)
-
-    return np.asarray(within(motion, pieces), float)
+    return jax.vmap(lambda piece: jax.vmap(lambda share: at(piece, share))(shares))(pieces)
