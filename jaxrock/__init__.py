@@ -13,6 +13,7 @@ from jaxrock._parameters import parameter as parameter
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
+from jaxrock.blocks.mesh import Rock as Rock
 from jaxrock.blocks.random import draw_blocks as draw_blocks
 from jaxrock.blocks.rigid import Block as Block
 from jaxrock.engines.taylor.careful import Series as Series

@@ -1,15 +1,16 @@
 """Asymmetric blocks: two corners, each with a slenderness, a frequency parameter and a restitution of its own."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._arguments import arguments, pair
+from jaxrock._arguments import arguments, pair, word_of
 from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock.blocks.mesh import section_of
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, Side
@@ -201,6 +202,35 @@ class AsymmetricBlock(eqx.Module):
         shape.check_rolling(right, 1, float(block.alpha1))
         shape.check_rolling(left, -1, float(block.alpha2))
         return block
+
+    @classmethod
+    @arguments
+    def from_mesh(
+        cls,
+        mesh: Any,
+        azimuth: ArrayLike,
+        *,
+        base: Annotated[str, word_of("narrow", "wide")] = "narrow",
+        unit: Annotated[str, word_of("m", "cm", "mm")] = "m",
+        tolerance: ArrayLike | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "AsymmetricBlock":
+        """Build the block that a rock is in the vertical plane of an azimuth, from the mesh of its surface.
+
+        **Arguments:**
+
+        - `mesh`: a `Rock`, or what `Rock.from_mesh` takes, with `unit` and `tolerance` as there (of a `Rock` they are
+          known).
+        - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
+        - `base`: "narrow" or "wide", as in `Rock.section`: where they differ the base is rounded, and it warns.
+        - `restitution`, `gravity`: as in `from_radii`.
+
+        **Returns:** an `AsymmetricBlock`: rocking in the plane alone, without twisting, rolling sideways, or sliding.
+
+        **Raises:** as `Rock.from_mesh`, and ValueError for arguments outside their ranges.
+        """
+        return cls.from_corners(*section_of(mesh, azimuth, base, unit, tolerance)[:4], restitution, gravity)
 
     @property
     def radius_ratio(self) -> Real:

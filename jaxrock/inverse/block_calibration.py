@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxrock._arguments import arguments, at_least, known, list_of
 from jaxrock._checks import Values, as_real, below_one, share, shown
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.calibration_grid import Axis, Table, weighed
+from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -190,8 +190,9 @@ def calibrate_block(
       deviation of the logarithm (of the parameter itself where its `Unknown` is not `log`), a number or an `Unknown`.
       At least one parameter must have it.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
-    - `rotation`: (tests,) peak rotation over slenderness that was seen of a block that stood, NaN where it was not;
-      `rotation_sd`: standard deviation of its logarithm, by what was measured and what the model leaves out.
+    - `rotation`: (tests,) peak rotation over slenderness of a block that stood, 0 if it was not seen to move (below
+      0.01), NaN where only the verdict is known.
+    - `rotation_sd`: standard deviation of its logarithm, by what was measured and what the model leaves out.
     - `facing`: 1 if motion and block have the same positive direction in a test, -1 if not, 0 not known: one number or
       (tests,). Of a symmetric block it changes nothing.
     - `cells`: of the grid over every parameter, or by its name; the scenes are their product. The grid goes 2.5 of the
@@ -249,8 +250,8 @@ def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarra
     if rotation is None:
         return seen, ways, None
     told = np.asarray(rotation, float)
-    if told.shape != (count,) or not (np.isnan(told) | (told > 0)).all():
-        raise ValueError(f"Argument `rotation` must hold a positive number or NaN for each of {count} tests.")
+    if told.shape != (count,) or not (np.isnan(told) | (told == 0) | (told >= STILL)).all():
+        raise ValueError(f"Argument `rotation` must hold 0, {STILL} or more, or NaN for each of {count} tests.")
     if (np.isfinite(told) & (seen == 1)).any():
         raise ValueError("Argument `rotation` must be NaN for tests that toppled.")
     return seen, ways, told

@@ -11,6 +11,7 @@ from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
 
 # What the usual parameters can be (wider blocks than that have no restitution of Housner's).
 _LIMITS = dict.fromkeys(("alpha", "alpha1", "alpha2"), (1e-3, 0.9)) | {"restitution": (0.0, 1.0)}
+STILL = 0.01  # peak rotation over slenderness that is not seen
 _BEYOND = 2.5  # standard deviations for which the grid goes beyond the range of a median
 
 
@@ -102,7 +103,8 @@ class Table(eqx.Module):
             with np.errstate(all="ignore"):
                 off = (np.log(told)[:, None, None] - np.log(found.rotation)) / deviation
                 density = np.exp(-(off**2) / 2) / (deviation * np.sqrt(2 * np.pi))
-            density = mean(np.nan_to_num(density))
+            still = found.rotation < STILL
+            density = mean(np.where((told == 0)[:, None, None], still, np.where(still, 0.0, np.nan_to_num(density))))
         return cls(jnp.asarray(seen), (lower + upper) / 2, lower, upper, density, has)
 
 
