@@ -13,6 +13,7 @@ from jaxrock._parameters import parameter as parameter
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
+from jaxrock.blocks.mesh import Rock as Rock
 from jaxrock.blocks.random import draw_blocks as draw_blocks
 from jaxrock.blocks.rigid import Block as Block
 from jaxrock.engines.taylor.careful import Series as Series
@@ -37,11 +38,14 @@ from jaxrock.hazard.fragility import (
     TabulatedFragility as TabulatedFragility,
     fit_fragility as fit_fragility,
 )
+from jaxrock.hazard.nrml import write_nrml as write_nrml
 from jaxrock.hazard.openquake import HazardCurves as HazardCurves, read_hazard_curves as read_hazard_curves
+from jaxrock.hazard.probit import ProbitFit as ProbitFit, fit_probit as fit_probit
 from jaxrock.hazard.simulated_fragility import (
     SimulatedFragility as SimulatedFragility,
     simulated_fragility as simulated_fragility,
 )
+from jaxrock.hazard.suite_outcomes import SuiteOutcomes as SuiteOutcomes, suite_outcomes as suite_outcomes
 from jaxrock.hazard.surfaces import (
     SimulatedSurface as SimulatedSurface,
     SurfaceFit as SurfaceFit,
@@ -49,6 +53,11 @@ from jaxrock.hazard.surfaces import (
     fit_surface as fit_surface,
     simulated_surface as simulated_surface,
     surface_of as surface_of,
+)
+from jaxrock.inverse.block_calibration import (
+    BlockCalibration as BlockCalibration,
+    CalibrationStatus as CalibrationStatus,
+    calibrate_block as calibrate_block,
 )
 from jaxrock.inverse.estimate import (
     Estimate as Estimate,
@@ -87,8 +96,12 @@ from jaxrock.models.equation import AbstractEquation as AbstractEquation
 from jaxrock.models.rigid import Housner as Housner, Linear as Linear
 from jaxrock.models.spring import Spring as Spring
 from jaxrock.models.user_equation import Equation as Equation
+from jaxrock.motions import intensity as intensity
+from jaxrock.motions.components import Components as Components, read_components as read_components
 from jaxrock.motions.files.example import example_record as example_record
 from jaxrock.motions.files.reading import read_record as read_record
+from jaxrock.motions.files.traces import record_of_trace as record_of_trace
+from jaxrock.motions.files.writing import write_at2 as write_at2, write_csv as write_csv
 from jaxrock.motions.intensity import peak_acceleration as peak_acceleration, peak_velocity as peak_velocity
 from jaxrock.motions.motion import AbstractMotion as AbstractMotion, WithVertical as WithVertical
 from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)
@@ -104,7 +117,7 @@ from jaxrock.motions.pulses.sinusoidal import (
     HalfSinePulse as HalfSinePulse,
     SinePulse as SinePulse,
 )
-from jaxrock.motions.record import Record as Record
+from jaxrock.motions.record import Origin as Origin, Record as Record
 from jaxrock.motions.suite import Suite as Suite
 from jaxrock.responses.contact import Contact as Contact, contact_forces as contact_forces
 from jaxrock.responses.history import Response as Response, simulate as simulate
@@ -144,14 +157,18 @@ from jaxrock.sweeps.sweep import sweep as sweep
 if _typing.TYPE_CHECKING:
     from jaxrock import plot as plot
     from jaxrock.engines.diffrax.arcs import Diffrax as Diffrax
+    from jaxrock.motions import processing as processing
 
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str):
-    # Few programs that compute draw figures, or solve by Diffrax: both are imported when they are first used.
+    # Few programs that compute draw figures, or solve by Diffrax: both are imported when they are
+    # first used, and so is SciPy's processing of signals.
     if name == "plot":
         return _importlib.import_module("jaxrock.plot")
+    if name == "processing":
+        return _importlib.import_module("jaxrock.motions.processing")
     if name == "Diffrax":
         return _importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
     raise AttributeError(f"module 'jaxrock' has no attribute {name!r}")

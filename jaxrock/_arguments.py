@@ -169,9 +169,17 @@ def word_of(*words: str) -> Check:
 
 def path_of(name: str, value: Any) -> Path:
     """The path of a file."""
-    if not isinstance(value, (str, os.PathLike)) or "\0" in os.fsdecode(value):
+    if not isinstance(value, (str, os.PathLike)) or "\0" in os.fsdecode(value) or not _can_be_named(value):
         raise ValueError(f"Argument `{name}` must be the path of a file, but is {shown(value)}.")
     return Path(os.fsdecode(value))
+
+
+def _can_be_named(value: Any) -> bool:
+    try:
+        os.fsencode(value)
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def pair(name: str, value: Any) -> tuple:

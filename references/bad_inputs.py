@@ -8,10 +8,13 @@ or swaps two. It runs in a process of its own, without the checks of annotations
 """
 
 import collections
+import contextlib
 import inspect
 import json
 import re
 import sys
+import tempfile
+import types
 import warnings
 from collections.abc import Callable
 from decimal import Decimal
@@ -50,6 +53,14 @@ def block():
 
 def pulse():
     return rk.SinePulse(0.5, 1.0)
+
+
+def record():
+    return rk.Record(np.sin(TIMES), 0.01)
+
+
+def trace():
+    return types.SimpleNamespace(data=np.sin(TIMES), stats=types.SimpleNamespace(delta=0.01))
 
 
 def simulated():
@@ -103,6 +114,26 @@ def verdicts():
     return rk.SimulatedFragility(jnp.asarray(LEVELS), table, *peaks, ("a", "b"), "PGA")
 
 
+def stone():
+    """A box, put together by hand."""
+    corners = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.2, 0.2) for z in (0.0, 2.0)])
+    inertia = np.diag([0.16 + 4.0, 0.36 + 4.0, 0.36 + 0.16]) / 12
+    return rk.Rock(0.48, np.array([0.0, 0.0, 1.0]), inertia, corners, corners[corners[:, 2] == 0], 0.02)
+
+
+def many():
+    """Outcomes of a suite, put together by hand."""
+    verdict, rotation = np.array([0, 1], np.int8).reshape(1, 2, 1, 1), np.array([0.5, INF]).reshape(1, 2, 1, 1)
+    blocks = rk.Block(np.array([0.2]), np.array([2.0]))
+    return rk.SuiteOutcomes(rk.Suite([pulse()]), blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation)
+
+
+def line():
+    """A probit fit, put together by hand."""
+    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0)
+    return rk.ProbitFit(("PGA",), *numbers, rk.FitStatus.successful)
+
+
 def surface():
     """A simulated surface, put together by hand."""
     return rk.SimulatedSurface(jnp.asarray(LEVELS), jnp.asarray([0.1, 0.2]), np.zeros((1, 3, 2, 1), np.int8))
@@ -124,6 +155,7 @@ QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 SCENE = {"block": block(), "motion": pulse(), **QUICK}
 PULSE = {"amplitude": 0.5, "duration": 1.0}
 CYCLE = {"amplitude": 0.5, "period": 1.0}
+OSCILLATOR = {"motion": pulse(), "period": [0.5, 1.0], "damping": 0.05}
 RANGES = {"frequency_ratio": [1.0], "intensity": [2.0], **QUICK, "progress": False}
 RIGID = {"alpha1": 0.2, "alpha2": 0.3}
 
@@ -160,6 +192,13 @@ CALLS: dict[str, Call] = {
             "gravity": 9.81,
         },
     ),
+    "AsymmetricBlock.from_mesh": Call(
+        rk.AsymmetricBlock.from_mesh,
+        {"mesh": stone(), "azimuth": 0.3, "base": "wide", "unit": "m", "tolerance": 0.01, "gravity": 9.81},
+    ),
+    "Rock.from_mesh": Call(rk.Rock.from_mesh, {"mesh": "/nowhere/a.stl", "unit": "m", "tolerance": 0.01}),
+    "Rock.section": Call(stone().section, {"azimuth": 0.3, "base": "wide"}),
+    "Rock.slenderness": Call(stone().slenderness, {"azimuth": [0.3, 0.4]}),
     "FlexibleBlock": Call(
         rk.FlexibleBlock,
         {
@@ -191,7 +230,9 @@ CALLS: dict[str, Call] = {
     "CosinePulse": Call(rk.CosinePulse, CYCLE),
     "RickerPulse": Call(rk.RickerPulse, {**CYCLE, "kind": "symmetric", "center": 1.0}),
     "MavroeidisPapageorgiouPulse": Call(rk.MavroeidisPapageorgiouPulse, {**CYCLE, "oscillations": 2.0, "phase": 0.5}),
-    "Record": Call(rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a"}),
+    "Record": Call(rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a", "origin": rk.Origin()}),
+    "Components": Call(rk.Components, {"first": record(), "second": record(), "vertical": record()}),
+    "Components.along": Call(rk.Components(record(), record()).along, {"angle": 0.3}),
     "WithVertical": Call(rk.WithVertical, {"horizontal": pulse(), "vertical": pulse()}),
     "AbstractMotion.with_vertical": Call(pulse().with_vertical, {"vertical": pulse()}),
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
@@ -200,6 +241,35 @@ CALLS: dict[str, Call] = {
     "Suite": Call(rk.Suite, {"motions": [pulse()], "names": ["a"]}),
     "peak_acceleration": Call(rk.peak_acceleration, {"motion": pulse()}),
     "peak_velocity": Call(rk.peak_velocity, {"motion": pulse()}),
+    "intensity.peak_displacement": Call(rk.intensity.peak_displacement, {"motion": pulse()}),
+    "intensity.velocity_to_acceleration": Call(rk.intensity.velocity_to_acceleration, {"motion": pulse()}),
+    "intensity.arias": Call(rk.intensity.arias, {"motion": pulse()}),
+    "intensity.cumulative_absolute_velocity": Call(rk.intensity.cumulative_absolute_velocity, {"motion": pulse()}),
+    "intensity.significant_duration": Call(
+        rk.intensity.significant_duration, {"motion": pulse(), "begin": 0.05, "end": 0.95}
+    ),
+    "intensity.mean_period": Call(rk.intensity.mean_period, {"motion": pulse()}),
+    "intensity.spectral_acceleration": Call(rk.intensity.spectral_acceleration, OSCILLATOR),
+    "intensity.spectral_velocity": Call(rk.intensity.spectral_velocity, {**OSCILLATOR, "pseudo": True}),
+    "intensity.average_spectral_acceleration": Call(rk.intensity.average_spectral_acceleration, OSCILLATOR),
+    "intensity.uplift_ratio": Call(rk.intensity.uplift_ratio, {"motion": pulse(), "block": block()}),
+    "intensity.velocity_ratio": Call(rk.intensity.velocity_ratio, {"motion": pulse(), "block": block()}),
+    "processing.from_displacement": Call(
+        rk.processing.from_displacement,
+        {"displacement": TIMES**2, "dt": 0.1, "unit": "m", "corner": 2.0, "order": 4, "name": "a"},
+    ),
+    "processing.from_velocity": Call(
+        rk.processing.from_velocity,
+        {"velocity": TIMES, "dt": 0.1, "unit": "cm", "corner": 2.0, "order": 4, "name": "a"},
+    ),
+    "processing.baseline_corrected": Call(rk.processing.baseline_corrected, {"record": record(), "degree": 2}),
+    "processing.tapered": Call(rk.processing.tapered, {"record": record(), "seconds": 0.01}),
+    "processing.filtered": Call(
+        rk.processing.filtered, {"record": record(), "low": 1.0, "high": 5.0, "order": 4, "zero_phase": True}
+    ),
+    "processing.resampled": Call(rk.processing.resampled, {"record": record(), "dt": 0.005}),
+    "processing.cut": Call(rk.processing.cut, {"record": record(), "begin": 0.0, "end": 0.1}),
+    "processing.scaled": Call(rk.processing.scaled, {"record": record(), "factor": 2.0}),
     # Models and engines
     "Spring": Call(rk.Spring, {"kind": "SM1", "law": "linear"}),
     "Equation": Call(
@@ -306,6 +376,39 @@ CALLS: dict[str, Call] = {
     ),
     "SimulatedFragility.fit": Call(verdicts().fit, {"bound": "lower"}, may_be="lowest_toppled"),
     "SimulatedFragility.tabulated": Call(verdicts().tabulated, {"bound": "lower"}),
+    "suite_outcomes": Call(
+        rk.suite_outcomes,
+        {"block": block(), "motions": [pulse()], "scale": [0.5, 1.0], **QUICK, "facing": "both", "progress": False},
+        True,
+        "capacity|rotation|margin",
+    ),
+    "SuiteOutcomes.reaches": Call(many().reaches, {"state": [0.1, 1.0]}),
+    "SuiteOutcomes.table": Call(
+        lambda **given: {name: x for name, x in many().table(**given).items() if name != "motion"},
+        {"measures": {"Arias": rk.intensity.arias}},
+        may_be=".*",
+    ),
+    "fit_probit": Call(
+        rk.fit_probit,
+        {
+            "measures": {"PGA": [0.1, 0.2, 0.3, 0.4, 0.5], "PGV": [0.1, 0.3, 0.1, 0.2, 0.1]},
+            "toppled": [0, 1, 0, 1, 1],
+            "trials": 1,
+            "clusters": [0, 0, 1, 1, 2],
+            "errors": "clusters",
+        },
+    ),
+    "ProbitFit.__call__": Call(line().__call__, {"PGA": [0.1, 0.2]}),
+    "write_nrml": Call(
+        rk.write_nrml,
+        {
+            "fragilities": {"falls": fragility()},
+            "path": "/nowhere/a.xml",
+            "measure": "PGA",
+            "taxonomy": "a",
+            "description": "b",
+        },
+    ),
     "surface_of": Call(rk.surface_of, {"found": verdicts(), "bound": "lower"}),
     "fit_surface": Call(
         rk.fit_surface,
@@ -458,6 +561,27 @@ CALLS: dict[str, Call] = {
         True,
         ".*",
     ),
+    "calibrate_block": Call(
+        rk.calibrate_block,
+        {
+            "block": lambda alpha: rk.Block(alpha, 2.0),
+            "motions": [pulse(), rk.SinePulse(0.7, 1.0)],
+            "toppled": [0, 1],
+            "unknowns": {"alpha": rk.Unknown(0.1, 0.4)},
+            "scatter": {"alpha": 0.2},
+            **QUICK,
+            "rotation": None,
+            "rotation_sd": 0.3,
+            "facing": 0,
+            "cells": 8,
+            "lapse": 0.01,
+            "groups": None,
+            "folds": 0,
+            "progress": False,
+        },
+        True,
+        ".*",
+    ),
     "fit_history": Call(
         rk.fit_history,
         {
@@ -477,6 +601,12 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "read_observations": Call(rk.read_observations, {"path": "/nowhere/a.csv"}),
+    "read_components": Call(
+        rk.read_components, {"paths": ["/nowhere/a", "/nowhere/b"], "columns": None, "dt": 0.01, "unit": "g"}
+    ),
+    "record_of_trace": Call(rk.record_of_trace, {"trace": trace(), "unit": "g"}),
+    "write_at2": Call(rk.write_at2, {"record": record(), "path": "/nowhere/a.at2"}),
+    "write_csv": Call(rk.write_csv, {"record": record(), "path": "/nowhere/a.csv", "unit": "g"}),
     "read_record": Call(
         rk.read_record, {"path": "/nowhere/a.at2", "format": "at2", "dt": 0.01, "unit": "g", "column": 0}
     ),
@@ -516,6 +646,7 @@ for _module in ("pushover", "restitution", "sine_pulse", "single_lobe"):
 
 # Public names that nobody calls with arguments, and what is tried elsewhere.
 NOT_CALLED = {
+    "BlockCalibration", "CalibrationStatus", "ProbitFit", "SuiteOutcomes",
     "AbstractEquation", "AbstractFragility", "AbstractMotion", "Coefficients", "Contact", "Critical", "Estimate",
     "EstimateStatus", "FeasibleRegion", "FitStatus", "FlexibleOutcome", "FlexibleResponse", "FoundRecord",
     "FragilityFit", "Grid", "HazardCurves", "HistoryFit", "HistoryStatus", "Housner", "Linear", "Outcome",
@@ -523,15 +654,15 @@ NOT_CALLED = {
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
     "Borders", "Region", "overturning_borders",
+    "Origin",
 }  # fmt: skip
 
 
 def public_names() -> set[str]:
     """All that `import jaxrock` offers."""
     names = {name for name in vars(rk) if not name.startswith("_")} - {"TYPE_CHECKING"} | {"Diffrax", "plot"}
-    return {name for name in names if not inspect.ismodule(getattr(rk, name))} | {
-        name for name in names if name in ("closed_form", "restitution", "similarity", "plot")
-    }
+    spaces = {"closed_form", "intensity", "plot", "processing", "restitution", "similarity"}
+    return {name for name in names if not inspect.ismodule(getattr(rk, name))} | (names | {"processing"}) & spaces
 
 
 # What nobody means.
@@ -624,7 +755,9 @@ def verdict(name: str, given: dict[str, Any]) -> str | None:
             return None  # what a user's function raises is its own
         return _of_refusal(error)
     except OSError as error:
-        return None if name.startswith("read_") else f"{type(error).__name__}: {error}"
+        return (
+            None if name.startswith(("read_", "write_")) or "from_mesh" in name else f"{type(error).__name__}: {error}"
+        )
     except call.raises:
         return None
     except Exception as error:
@@ -698,7 +831,9 @@ def attack(count: int, seed: int, names: list[str]) -> tuple[int, dict[str, list
             shown = ", ".join(f"{k}={' '.join(repr(v).split())[:80]}" for k, v in changed.items())
             found[f"{name}: {said}"].append(shown)
 
-    once()
+    # Paths are attacked, too: what is written goes nowhere else.
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        once()
     return sum(tried.values()), dict(found)
 
 

@@ -55,6 +55,37 @@ def _esm() -> str:
     return "".join(f"{key}: {value}\n" for key, value in head.items()) + "".join(f"{x:.6f}\n" for x in values)
 
 
+def _cosmos() -> str:
+    values, peak = SAMPLES * 980.665, np.abs(SAMPLES * 980.665).max()
+    reals = np.full(100, -999.0)
+    reals[61], reals[63] = 5.0, peak
+    head = "Corrected acceleration    (Format v01.20 with 13 text lines)\n 100 Real-header values follow on  20 lines, "
+    head += "Format= (5F15.6)\n" + _lines(reals, "%15.6f", 5)
+    announced = f"{values.size:8d} acceleration pts, approx    0 secs, units=cm/sec2(04),Format=(1E15.6)\n"
+    return head + announced + _lines(values, "%15.6e", 1) + "End-of-data for ChanBNZ acceleration\n"
+
+
+def _smc() -> str:
+    values, whole, real = SAMPLES * 980.665, np.full(48, -32768), np.full(50, 1.7e38)
+    whole[15], whole[16], real[1], real[29] = 1, SAMPLES.size, 200.0, np.abs(SAMPLES * 980.665).max()
+    head = "2 CORRECTED ACCELEROGRAM\n*\nSAF0A\n     1989  10  18    0004 Loma Prieta, CA\n*\n"
+    head += "station = San Francisco, 1295 Shafter, F component=    360\n" + "*\n" * 5
+    body = _lines(whole, "%10d", 8) + _lines(real, "%15.7E", 5) + "|\n"
+    printed = [f"{x:10.4E}".replace("E+0", "E+").replace("E-0", "E-").rjust(10) for x in values]
+    return head + body + "".join("".join(printed[k : k + 8]) + "\n" for k in range(0, len(printed), 8))
+
+
+def _knet() -> str:
+    counts = np.random.default_rng(6).integers(-99999, 99999, 24)
+    peak = np.abs(counts - counts.mean()).max() * 3920 / 6182761
+    head = {
+        "Origin Time": "2011/03/11 14:46:00", "Mag.": "9.0", "Station Code": "MYG004",
+        "Record Time": "2011/03/11 14:46:36", "Sampling Freq(Hz)": "100Hz", "Duration Time(s)": "0.24", "Dir.": "N-S",
+        "Scale Factor": "3920(gal)/6182761", "Max. Acc. (gal)": f"{peak:.6f}", "Memo.": "",
+    }  # fmt: skip
+    return "".join(f"{key:<18}{value}\n" for key, value in head.items()) + _lines(counts, " %8d", 8)
+
+
 def _pairs(form: str, separator: str) -> str:
     return "time,acceleration\n".replace(",", separator) + "".join(
         f"{0.02 * k:.2f}{separator}{form % x}\n" for k, x in enumerate(SAMPLES.tolist())
@@ -122,6 +153,9 @@ FILES = {
     "AT2 of free form": _record(_at2("\n".join(map(repr, SAMPLES.tolist())) + "\n"), ".AT2"),
     "V2": _record(_v2(), ".V2"),
     "ESM": _record(_esm(), ".ASC"),
+    "COSMOS": _record(_cosmos(), ".V2c"),
+    "SMC": _record(_smc(), ".smc"),
+    "K-NET": _record(_knet(), ".NS"),
     "CSV": _record(_pairs("%.5f", ","), ".csv", unit="g"),
     "columns of free form": _record(_pairs("%r", "\t"), ".txt", unit="g"),
     "one column": _record("".join(f"{x!r}\n" for x in SAMPLES.tolist()), ".txt", unit="g", dt=0.01),

@@ -140,6 +140,23 @@ def test_run_that_cannot_be_completed(command, at2):
     assert re.fullmatch(r"jaxrock: these are not results: The step budget was used up .*\n", errors)
 
 
+def test_fragility(command, at2, column, tmp_path):
+    """Of two records, one twice; the table is that of the library."""
+    words = ["--unit", "cm/s2", "--dt", "0.02", "--levels", "0.2", "6", "--points", "12", "--model", "linear"]
+    words += ["--scatter", "0.4", "--draws", "6", "--width", "0.4", "--height", "1.2"]
+    status, table, errors = command("fragility", column, column, *words)
+    levels = np.geomspace(0.2, 6.0, 12)
+    blocks = rk.draw_blocks(rk.Block.from_dimensions(0.4, 1.2), 6, alpha=0.4)
+    found = rk.simulated_fragility(blocks, [rk.Record(SAMPLES, 0.02)] * 2, levels, rk.Linear())
+    _, rows = table_of(tmp_path / "out" / "fragility.csv")
+    np.testing.assert_allclose(rows[:, 1], found.lower)
+    assert (tmp_path / "out" / "stripes.csv").read_text().count("\n") == 25
+    assert is_figure(tmp_path / "out" / "fragility.png")
+    fit = found.fit("upper")
+    assert (status == 0) == (fit.status == rk.FitStatus.successful) == (tmp_path / "out" / "fragility.xml").exists()
+    assert status == 0 and f"{float(fit.fragility.median):.4f}" in table["median PGA"]
+
+
 def test_spectrum(command, column, tmp_path):
     described = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9", "--model", "linear")
     status, table, errors = command("spectrum", column, *described, "--shortest", 1, "--longest", 4, "--points", 5)
@@ -252,7 +269,7 @@ def test_as_a_program(tmp_path):
 @pytest.mark.parametrize(
     "words, mentioned",
     [
-        ([], ["run", "spectrum", "map", "examples:"]),
+        ([], ["run", "spectrum", "map", "fragility", "examples:"]),
         (["run"], ["--width", "--height", "--duration", "--dt", "--unit", "--column", "--scale", "--restitution"]),
         (["spectrum"], ["--slenderness", "--shortest", "--longest", "--points", "--model", "--out"]),
         (
@@ -305,6 +322,9 @@ BAD = {
     "restitution 2": (["run", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
     "duration 0": (["run", "--duration", "0"], "Argument `duration` must be positive and finite, .*, but is 0.0"),
     "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, .*, but is nan"),
+    "fragility, missing file": (["fragility", "missing.AT2"], "No such file or directory"),
+    "fragility, levels": (["fragility", "a", "--levels", "2", "1"], "`--levels` must be positive, finite and in order"),
+    "fragility, points 2": (["fragility", "a", "--points", "2"], "Argument `--points` must be at least 3, but is 2"),
     "spectrum, missing file": (["spectrum", "missing.AT2"], "No such file or directory"),
     "spectrum, points 0": (["spectrum", "--points", "0"], "Argument `--points` must be at least 1, but is 0"),
     "spectrum, slenderness 0": (

@@ -1,16 +1,17 @@
 """Asymmetric blocks: two corners, each with a slenderness, a frequency parameter and a restitution of its own."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._arguments import arguments, pair
+from jaxrock._arguments import arguments, pair, word_of
 from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock.blocks.mesh import section_of
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, Side
@@ -38,10 +39,8 @@ class AsymmetricBlock(eqx.Module):
     - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2; or a law of
       restitution for both. None: by angular momentum about the new corner, zero at least.
 
-    All may be arrays of one shape, for use under `jax.vmap`.
-
-    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the
-    energy that two impacts keep, exceeds 1. (One of them may: about corners of unequal height it often does.)
+    All may be arrays of one shape, for use under `jax.vmap`. **Raises:** ValueError for a value outside its range; where
+    the product of given restitutions, the energy that two impacts keep, exceeds 1. (One may: about unequal corners.)
 
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
@@ -202,20 +201,44 @@ class AsymmetricBlock(eqx.Module):
         that face, and not rock about the corner.
         """
         shape = Outline.of(outline)
-        right, left = shape.flat_base() if supports is None else (shape.at(position) for position in supports)
-        centre = shape.centre if centre is None else centre
-        gyration = shape.gyration_radius if gyration_radius is None else gyration_radius
-        block = cls.from_corners(right, left, centre, gyration, restitution, gravity)
+        right, left, *rest = shape.standing(supports, centre, gyration_radius)
+        block = cls.from_corners(right, left, *rest, restitution, gravity)
         shape.check_rolling(right, 1, float(block.alpha1))
         shape.check_rolling(left, -1, float(block.alpha2))
         return block
 
+    @classmethod
+    @arguments
+    @with_throw
+    def from_mesh(
+        cls,
+        mesh: Any,
+        azimuth: ArrayLike,
+        *,
+        base: Annotated[str, word_of("narrow", "wide")] = "narrow",
+        unit: Annotated[str, word_of("m", "cm", "mm")] = "m",
+        tolerance: ArrayLike | None = None,
+        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        gravity: ArrayLike = GRAVITY,
+    ) -> "AsymmetricBlock":
+        """Build the block that a rock is in the vertical plane of an azimuth, from the mesh of its surface.
+
+        **Arguments:**
+
+        - `mesh`, `unit`, `tolerance`: a `Rock`, or what `Rock.from_mesh` takes.
+        - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
+        - `base`: "narrow" or "wide", as in `Rock.section`: where they differ the base is rounded, and it warns.
+        - `restitution`, `gravity`: as in `from_radii`.
+
+        **Returns:** an `AsymmetricBlock`, which rocks in the plane alone. **Raises:** as `Rock.from_mesh`.
+        """
+        return cls.from_corners(*section_of(mesh, azimuth, base, unit, tolerance)[:4], restitution, gravity)
+
     @property
     def radius_ratio(self) -> Real:
         """R2/R1: given, or that of a flat base."""
-        if self.given_radius_ratio is None:
-            return sine_cosine(self.alpha1)[1] / sine_cosine(self.alpha2)[1]
-        return self.given_radius_ratio
+        given = self.given_radius_ratio
+        return sine_cosine(self.alpha1)[1] / sine_cosine(self.alpha2)[1] if given is None else given
 
     @property
     def inertia_ratio2(self) -> Real:
@@ -235,7 +258,7 @@ class AsymmetricBlock(eqx.Module):
 
     @property
     def restitution2(self) -> Real:
-        """The same for an impact that ends the stay on side 2."""
+        """The same on side 2."""
         return self.law.ratio(self.corners[1], jnp.zeros_like(self.p1))
 
     @property

@@ -46,6 +46,12 @@ class Outline(NamedTuple):
         position = whole("supports", position, -len(self.order), len(self.order) - 1)
         return self.vertices[np.flatnonzero(self.order == position % len(self.order))[0]]
 
+    def standing(self, supports, centre, gyration_radius) -> tuple:
+        """Right and left corner, centre of mass and radius of gyration: given, or the outline's own."""
+        right, left = self.flat_base() if supports is None else (self.at(position) for position in supports)
+        centre = self.centre if centre is None else centre
+        return right, left, centre, self.gyration_radius if gyration_radius is None else gyration_radius
+
     def flat_base(self) -> tuple[np.ndarray, np.ndarray]:
         """Right and left corner: the outermost of the lowest vertices."""
         height = self.vertices[:, 1]

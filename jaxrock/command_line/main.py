@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 
 from jaxrock.command_line.cache import CACHE
+from jaxrock.command_line.fragility import FRAGILITY
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
 from jaxrock.command_line.run import RUN
@@ -17,7 +18,7 @@ from jaxrock.keeping.compiled import keep_compiled
 from jaxrock.sweeps.devices import use_cpu_devices
 
 # Another command is a module like `run`, and its entry here.
-_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, INVERT, CACHE)}
+_COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, FRAGILITY, INVERT, CACHE)}
 
 _EPILOG = """examples:
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
@@ -26,6 +27,7 @@ _EPILOG = """examples:
   jaxrock run --animate                           and a film of it, animation.gif
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
+  jaxrock fragility motions/*.AT2 --width 0.5     how probable it is that a block topples
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
 """

@@ -31,12 +31,19 @@ def add_restitution(parser: argparse.ArgumentParser) -> None:
 def add_record(parser: argparse.ArgumentParser) -> None:
     """A record, and options for files that do not say all."""
     parser.add_argument(
-        "record", nargs="?", help="PEER AT2, CSMIP V2, ESM, CSV or text file (default: the built-in record)"
+        "record",
+        nargs="?",
+        help="PEER AT2, CSMIP V2, COSMOS, ESM, SMC, K-NET, CSV or text file (default: the built-in record)",
     )
+    add_description(parser)
+    parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")
+
+
+def add_description(parser: argparse.ArgumentParser) -> None:
+    """Options for files that do not say all."""
     parser.add_argument("--dt", type=number, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
     parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
-    parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")
 
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:
@@ -48,7 +55,7 @@ def record_of(arguments: argparse.Namespace) -> rk.Record:
         record = rk.example_record()
     else:
         record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
-    return rk.Record(record.samples * arguments.scale, record.dt, record.name)
+    return rk.Record(record.samples * arguments.scale, record.dt, record.name, record.origin)
 
 
 def extent_of(pulse: type[AbstractPulse]) -> str:

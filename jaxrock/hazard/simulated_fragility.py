@@ -16,20 +16,14 @@ from jaxtyping import Array, Bool, Float, Int8
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, one_of
-from jaxrock._parameters import one_of_many
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising_list
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.motions.motion import AbstractMotion, Scaled
-from jaxrock.motions.suite import Suite, size_of
-from jaxrock.responses.current_model import current_model
-from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
-from jaxrock.sweeps.sweep import surface
-
-STOOD, TOPPLED, UNDECIDED = 0, 1, -1
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.suite import Suite
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
 
 
 def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
@@ -196,49 +190,11 @@ def simulated_fragility(
     levels = rising_list("levels", levels)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
     factors = _factors(levels, suite.peak_acceleration, suite.peak_velocity, measure)
-    blocks = stacked(block)
-    parts, begin = [], 0
-    for group in suite.groups:
-        size = size_of(group)
-        parts.append(verdicts(blocks, group, factors[begin : begin + size], model, engine, progress))
-        begin += size
-    return SimulatedFragility(
-        levels, np.concatenate(parts), suite.peak_acceleration, suite.peak_velocity, suite.names, measure
-    )
+    verdict = scenes(stacked(block), suite, factors, model, engine, progress).verdict
+    return SimulatedFragility(levels, verdict, suite.peak_acceleration, suite.peak_velocity, suite.names, measure)
 
 
 def _factors(levels, accelerations, velocities, measure: str) -> np.ndarray:
     """By how much every motion is scaled at every level."""
     peaks = accelerations if measure == "PGA" else velocities
     return np.asarray(levels)[None, :] / np.asarray(peaks)[:, None]
-
-
-def stacked(block: Block) -> Block:
-    """A block with parameters of shape (draws,)."""
-    shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for leaf in jax.tree.leaves(block)))
-    if len(shape) > 1:
-        raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), block)
-
-
-def verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, engine, progress) -> np.ndarray:
-    """(motions, levels, draws) of a stack of motions, scaled by factors (motions, levels)."""
-    draws = jax.tree.leaves(blocks)[0].shape[0]
-    motions, levels = factors.shape
-    index, draw = np.arange(motions), np.arange(draws)
-    # Neighbours differ by the level: they move alike.
-    points = (
-        np.repeat(index, draws * levels),
-        np.tile(np.repeat(draw, levels), motions),
-        np.repeat(factors[:, None, :], draws, axis=1).ravel(),
-    )
-    scene = blocks, group, current_model(model, blocks, group, factors), engine
-    table = surface(_verdict, points, scene, "fragility", progress, outer=False)
-    return np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2)
-
-
-def _verdict(index, draw, factor, scene):
-    blocks, group, model, engine = scene
-    result = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
-    verdict = jnp.where(result.overturned, TOPPLED, STOOD)
-    return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -26,6 +26,7 @@ from jaxrock._checks import (
     scalar,
     together,
 )
+from jaxrock._parameters import one_of_many
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
@@ -38,11 +39,16 @@ from jaxrock.hazard.fragility import (
     probit_line,
     rising_list,
 )
-from jaxrock.hazard.simulated_fragility import STOOD, TOPPLED, UNDECIDED, SimulatedFragility, counts, stacked, verdicts
+from jaxrock.hazard.simulated_fragility import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.responses.current_model import current_model
+from jaxrock.responses.outcome import outcome
+from jaxrock.status import Status
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, stacked
+from jaxrock.sweeps.sweep import surface
 
 
 class SurfaceFragility(eqx.Module):
@@ -282,5 +288,28 @@ def simulated_surface(
         period = ratio * GRAVITY * peak / speed
         group = jax.vmap(lambda t, pulse=pulse: pulse(jnp.ones_like(t), t))(period)
         factors = np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size))
-        parts.append(verdicts(blocks, group, factors, model, engine, progress).swapaxes(0, 1))
+        parts.append(_verdicts(blocks, group, factors, model, engine, progress).swapaxes(0, 1))
     return SimulatedSurface(acceleration, ratio, np.stack(parts))
+
+
+def _verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, engine, progress) -> np.ndarray:
+    """(motions, levels, draws) of a stack of motions, scaled by factors (motions, levels)."""
+    draws = jax.tree.leaves(blocks)[0].shape[0]
+    motions, levels = factors.shape
+    index, draw = np.arange(motions), np.arange(draws)
+    # Neighbours differ by the level: they move alike.
+    points = (
+        np.repeat(index, draws * levels),
+        np.tile(np.repeat(draw, levels), motions),
+        np.repeat(factors[:, None, :], draws, axis=1).ravel(),
+    )
+    scene = blocks, group, current_model(model, blocks, group, factors), engine
+    table = surface(_verdict, points, scene, "fragility", progress, outer=False)
+    return np.asarray(table).reshape(motions, draws, levels).swapaxes(1, 2)
+
+
+def _verdict(index, draw, factor, scene):
+    blocks, group, model, engine = scene
+    result = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
+    verdict = jnp.where(result.overturned, TOPPLED, STOOD)
+    return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -1,18 +1,30 @@
-"""Intensity measures of ground motions: peak acceleration and peak velocity."""
+"""Intensity measures of ground motions: peaks, what is summed over time, response spectra, rocking's own.
+
+`peak_acceleration` and `peak_velocity` are functions of JAX. The others are of known motions, in NumPy and SciPy: exact
+for records (straight lines between samples), to about 1e-7 for pulses. g is 9.81 m/s^2.
+"""
+
+import warnings
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from jaxrock._arguments import arguments
+from jaxrock._checks import Values, checked, scalar
 from jaxrock._parameters import check_single
-from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.oscillator import peaks_of_oscillator
+from jaxrock.motions.record import Record, with_room
+from jaxrock.motions.straight import Straight, straight
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 _NODES, _WEIGHTS = gauss_legendre(6)
 _PARTS = 256  # of every smooth piece, where there are few
 _FEW = 32
+_LONG = 100  # samples of a record that is more than a pulse
 
 
 @arguments
@@ -37,15 +49,30 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
 
     - `motion`: as in `peak_acceleration`; a record should have been corrected so that its velocity ends near zero.
 
-    **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses.
+    **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses. It warns
+    of a record of 100 samples or more whose ground moves on at its end faster than a quarter of that: its baseline
+    drifts.
     """
     check_single(motion=motion)
-    return _peaks(motion)[1]
+    peak, last = _peaks(motion)[1:]
+    known = not isinstance(peak, jax.core.Tracer)
+    if known and isinstance(motion, Record) and motion.samples.size >= _LONG and abs(float(last)) > float(peak) / 4:
+        warnings.warn(
+            f"The ground of {motion.name or 'a record'} ends with {abs(float(last)):.3g} m/s, its peak is "
+            f"{float(peak):.3g} m/s: its baseline drifts. See `jaxrock.processing`.",
+            stacklevel=3,
+        )
+    return peak
+
+
+def _peaks(motion: AbstractMotion):
+    """As `_peaks_of`, by a few programs for records of any lengths."""
+    return _peaks_of(with_room(motion))
 
 
 @jax.jit
-def _peaks(motion: AbstractMotion):
-    """Peaks of acceleration [g] and velocity [m/s].
+def _peaks_of(motion: AbstractMotion):
+    """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
 
     Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
     passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
@@ -93,4 +120,234 @@ def _peaks(motion: AbstractMotion):
     velocity = jnp.cumsum(gains.ravel())
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings.ravel())))
-    return jnp.max(peaks), fastest * GRAVITY
+    return jnp.max(peaks), fastest * GRAVITY, velocity[-1] * GRAVITY
+
+
+@arguments
+def peak_displacement(motion: AbstractMotion) -> float:
+    """Peak ground displacement (PGD) [m], of a ground that is at rest at first.
+
+    **Arguments:**
+
+    - `motion`: one known motion; a record should have been corrected so that its displacement is meant.
+
+    **Returns:** the largest |displacement|, also between samples.
+    """
+    lines = straight(motion)
+    velocity, places = lines.velocity[:-1], lines.displacement
+    largest = np.abs(places).max(initial=0.0)
+    # Where the velocity v + a t + j t^2/2 passes zero within a line.
+    slope = (lines.end - lines.begin) / lines.length
+    root = np.sqrt(np.maximum(lines.begin**2 - 2 * slope * velocity, 0.0))
+    for lead in (lines.begin + root, lines.begin - root):
+        with np.errstate(all="ignore"):
+            time = -2 * velocity / lead
+        time = np.where((time > 0) & (time < lines.length), time, 0.0)
+        there = places[:-1] + velocity * time + lines.begin * time**2 / 2 + slope * time**3 / 6
+        largest = max(largest, np.abs(there).max(initial=0.0))
+    return float(largest)
+
+
+@arguments
+def velocity_to_acceleration(motion: AbstractMotion) -> float:
+    """PGV/PGA [s]: for how long the ground pushes.
+
+    **Arguments:** as `peak_displacement`.
+
+    **Raises:** ValueError for a motion that does not move.
+    """
+    acceleration = float(peak_acceleration(motion))
+    if not acceleration > 0:
+        raise ValueError("Argument `motion` must move, but does not.")
+    return float(_peaks(motion)[1]) / (GRAVITY * acceleration)
+
+
+@arguments
+def arias(motion: AbstractMotion) -> float:
+    """Arias intensity [m/s]: pi/(2 g) times the integral of the squared acceleration.
+
+    **Arguments:** as `peak_displacement`.
+
+    **Source:** Arias (1970).
+    """
+    return float(np.pi / (2 * GRAVITY) * _squares(straight(motion)).sum())
+
+
+@arguments
+def cumulative_absolute_velocity(motion: AbstractMotion) -> float:
+    """Cumulative absolute velocity (CAV) [m/s]: the integral of the absolute acceleration.
+
+    **Arguments:** as `peak_displacement`.
+
+    **Source:** EPRI (1988).
+    """
+    a, b, length = straight(motion)
+    size = np.abs(a) + np.abs(b)
+    crossing = (a * a + b * b) / np.where(size > 0, size, 1.0)
+    return float(np.sum(length * np.where(a * b < 0, crossing, size)) / 2)
+
+
+@arguments
+def significant_duration(motion: AbstractMotion, begin: ArrayLike = 0.05, end: ArrayLike = 0.95) -> float:
+    """Time between two shares of the Arias intensity [s].
+
+    **Arguments:**
+
+    - `motion`: as in `peak_displacement`.
+    - `begin`, `end`: the shares, in (0, 1), rising: 0.05 and 0.95 for D5-95, 0.75 for D5-75.
+
+    **Raises:** ValueError for other shares, or a motion that does not move.
+
+    **Source:** Trifunac & Brady (1975).
+    """
+    begin, end = (float(scalar(n, checked(n, x, "be in (0, 1)", _inside))) for n, x in (("begin", begin), ("end", end)))
+    if begin >= end:
+        raise ValueError(f"Argument `end` must be above `begin`, {begin}, but is {end}.")
+    lines = straight(motion)
+    sums = np.concatenate([[0.0], np.cumsum(_squares(lines))])
+    if not sums[-1] > 0:
+        raise ValueError("Argument `motion` must move, but does not.")
+    return _time_of(lines, sums, end * sums[-1]) - _time_of(lines, sums, begin * sums[-1])
+
+
+def _inside(x):
+    return (x > 0) & (x < 1)
+
+
+def _squares(lines: Straight) -> np.ndarray:
+    """Integral of the squared acceleration over each line."""
+    a, b, length = lines
+    return length * (a * a + a * b + b * b) / 3
+
+
+def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
+    """When the integral of the squared acceleration has come to a value: halved down to rounding within a line."""
+    row = min(int(np.searchsorted(sums, wanted, side="right")) - 1, lines.length.size - 1)
+    a, b, length = (float(part[row]) for part in lines)
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        share = (low + high) / 2
+        c = a + (b - a) * share
+        below = sums[row] + share * length * (a * a + a * c + c * c) / 3 < wanted
+        low, high = (share, high) if below else (low, share)
+    return float(lines.times[row] + low * length)
+
+
+@arguments
+def mean_period(motion: AbstractMotion) -> float:
+    """Mean period [s]: periods from 0.05 to 4 s, weighted with the squared Fourier amplitude.
+
+    **Arguments:** as `peak_displacement`; a record that is longer than its motion says no more.
+
+    **Returns:** sum(C^2/f)/sum(C^2) over 0.25 to 20 Hz, frequencies 0.0125 Hz apart or less.
+
+    **Raises:** ValueError for a motion without any amplitude there.
+
+    **Source:** Rathje, Abrahamson & Bray (1998).
+    """
+    lines = straight(motion)
+    step = lines.length.min()
+    time = step * np.arange(int(np.floor(lines.times[-1] / step * (1 + 1e-12))) + 1)
+    knots = np.stack([lines.times[:-1], lines.times[1:] - 1e-9 * step], axis=1).ravel()
+    samples = np.interp(time, knots, np.stack([lines.begin, lines.end], axis=1).ravel())
+    count = 1 << int(np.ceil(np.log2(max(samples.size, 80 / step))))
+    power = np.abs(np.fft.rfft(samples, count)) ** 2
+    frequency = np.fft.rfftfreq(count, step)
+    inside = (frequency >= 0.25) & (frequency <= 20)
+    if not power[inside].sum() > 0:
+        raise ValueError("Argument `motion` must move between 0.25 and 20 Hz, but does not.")
+    return float((power[inside] / frequency[inside]).sum() / power[inside].sum())
+
+
+@arguments
+def spectral_acceleration(
+    motion: AbstractMotion, period: Values, damping: ArrayLike = 0.05
+) -> Float[np.ndarray, "..."]:
+    """Pseudo-spectral acceleration [g]: omega^2 times the peak displacement of an oscillator.
+
+    **Arguments:**
+
+    - `motion`: as in `peak_displacement`.
+    - `period`: of any shape [s], from 0.001 to 10,000.
+    - `damping`: over critical, in [0, 1).
+
+    **Returns:** of the shape of `period`. The oscillator is followed for a period after the motion, exactly over
+    straight lines; peaks between their ends are found to fourth order.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Nigam & Jennings (1969).
+    """
+    period, damping = _oscillators(period, damping)
+    lines = straight(motion)
+    found = [
+        peaks_of_oscillator(lines, float(each), damping)[0] * (2 * np.pi / each) ** 2 / GRAVITY for each in period.flat
+    ]
+    return np.reshape(found, period.shape)
+
+
+@arguments
+def spectral_velocity(
+    motion: AbstractMotion, period: Values, damping: ArrayLike = 0.05, pseudo: bool = True
+) -> Float[np.ndarray, "..."]:
+    """Spectral velocity of an oscillator [m/s].
+
+    **Arguments:**
+
+    - `motion`, `period`, `damping`: as in `spectral_acceleration`.
+    - `pseudo`: omega times the peak displacement; False: the peak of the velocity relative to the ground.
+
+    **Returns:** of the shape of `period`.
+
+    **Raises:** as `spectral_acceleration`.
+    """
+    period, damping = _oscillators(period, damping)
+    lines = straight(motion)
+    found = [peaks_of_oscillator(lines, float(each), damping) for each in period.flat]
+    found = [peaks[0] * 2 * np.pi / each if pseudo else peaks[1] for peaks, each in zip(found, period.flat)]
+    return np.reshape(found, period.shape)
+
+
+@arguments
+def average_spectral_acceleration(motion: AbstractMotion, period: Values, damping: ArrayLike = 0.05) -> float:
+    """Average spectral acceleration (AvgSA) [g]: the geometric mean over periods.
+
+    **Arguments:** as `spectral_acceleration`; often periods from 0.2 to 2 times one of interest.
+
+    **Source:** Baker & Cornell (2006).
+    """
+    with np.errstate(divide="ignore"):
+        return float(np.exp(np.mean(np.log(spectral_acceleration(motion, period, damping)))))
+
+
+@arguments
+def uplift_ratio(motion: AbstractMotion, block: Block) -> float:
+    """PGA/(g tan alpha) [-]: above 1 the block uplifts.
+
+    **Arguments:**
+
+    - `motion`: a motion of scalar parameters.
+    - `block`: one `Block`.
+    """
+    check_single(block=block)
+    return float(peak_acceleration(motion)) / float(np.tan(block.alpha))
+
+
+@arguments
+def velocity_ratio(motion: AbstractMotion, block: Block) -> float:
+    """p PGV/(g tan alpha) [-]: the ground's velocity against the one that overturns the block in an instant.
+
+    **Arguments:** as `uplift_ratio`.
+
+    **Source:** Dimitrakopoulos & Paraskeva (2015), the measure.
+    """
+    check_single(block=block)
+    return float(_peaks(motion)[1]) * float(block.p) / (GRAVITY * float(np.tan(block.alpha)))
+
+
+def _oscillators(period: Values, damping: ArrayLike) -> tuple[np.ndarray, float]:
+    damping = checked("damping", damping, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+    period = checked("period", period, "be from 0.001 to 10,000 s", lambda x: (x >= 1e-3) & (x <= 1e4))
+    if period.size == 0:
+        raise ValueError("Argument `period` must hold at least one period, but is empty.")
+    return np.asarray(period, float), float(scalar("damping", damping))

@@ -1,6 +1,7 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,6 +45,24 @@ class _Straight(AbstractMotion):
         return [left[piece] + slope * local, slope * unit][: order + 1]
 
 
+class Origin(NamedTuple):
+    """What a file says of a record, in its words; empty where it says nothing.
+
+    - `event`, `station`, `component`: the earthquake, the station's name, the direction of the sensor.
+    - `start`: when the first sample was taken; `code`: of the station.
+    - `format`, `unit`: of the file, before the samples were brought to g; `file`: its name.
+    """
+
+    event: str = ""
+    station: str = ""
+    component: str = ""
+    start: str = ""
+    code: str = ""
+    format: str = ""
+    unit: str = ""
+    file: str = ""
+
+
 class Record(_Straight):
     """An accelerogram: straight lines between equally spaced samples.
 
@@ -52,6 +71,7 @@ class Record(_Straight):
     - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1.
     - `dt`: time between samples [s], positive.
     - `name`: where it comes from; shown in tables and figures.
+    - `origin`: an `Origin`, what a file says of it; None: nothing.
 
     **Raises:** ValueError for samples that are not a finite one-dimensional array, or dt <= 0.
 
@@ -64,18 +84,23 @@ class Record(_Straight):
 
     @with_throw
     @arguments
-    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = ""):
+    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None):
         samples = strength("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
         self.samples = samples
         self.dt = size("dt", dt)
-        self.label = Label(name)
+        self.label = Label((name, origin or Origin()))
 
     @property
     def name(self) -> str:
         """Where the record comes from."""
-        return self.label.value
+        return self.label.value[0]
+
+    @property
+    def origin(self) -> Origin:
+        """What its file says of it."""
+        return self.label.value[1]
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -103,6 +128,19 @@ def padded(motion: AbstractMotion) -> AbstractMotion:
     There is room for a quarter more samples at most. Its pieces beyond the end have no length.
     """
     return jax.tree.map(_padded, motion, is_leaf=lambda part: type(part) is Record)
+
+
+def with_room(motion: AbstractMotion) -> AbstractMotion:
+    """The same motion, with room in its records for as many samples as the next power of two, 1024 at least: so that a
+    few programs serve a suite of any lengths."""
+    return jax.tree.map(_doubled, motion, is_leaf=lambda part: type(part) is Record)
+
+
+def _doubled(part):
+    if type(part) is not Record:
+        return part
+    count = part.samples.shape[-1]
+    return _Padded(*_with_room(part.samples, part.dt, max(1024, 1 << (count - 1).bit_length()) - count))
 
 
 def _padded(part):

@@ -1,6 +1,6 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxrock._arguments import arguments, list_of
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
@@ -23,8 +23,7 @@ class Suite(eqx.Module):
 
     **Arguments:**
 
-    - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Records are
-      brought to one length by zeros; one that does not end at zero comes to it within one more sample.
+    - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n.
     - `names`: of the motions; None: those of records, or the kind, with numbers.
 
     `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,).
@@ -45,8 +44,7 @@ class Suite(eqx.Module):
     ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
-        lengths = [m.samples.shape[-1] for m in motions if isinstance(m, Record)]
-        self.groups = tuple(_ensemble(_padded(m, max(lengths, default=0))) for m in motions)
+        self.groups = tuple(map(_ensemble, motions))
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
         self.names = tuple(own if names is None else names)
         if len(self.names) != len(own):
@@ -60,13 +58,11 @@ class Suite(eqx.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-
-def _padded(motion: AbstractMotion, length: int) -> AbstractMotion:
-    """A record of a given length; any other motion as it is."""
-    if not isinstance(motion, Record):
-        return motion
-    missing = length - motion.samples.shape[-1]
-    return Record(jnp.pad(motion.samples, (0, missing)), motion.dt) if missing else motion
+    def motions(self) -> Iterator[AbstractMotion]:
+        """Its motions, one by one."""
+        for group in self.groups:
+            for index in range(size_of(group)):
+                yield one_of_many(group, index)
 
 
 def _ensemble(motion: AbstractMotion) -> AbstractMotion:
@@ -92,4 +88,7 @@ def _names(motion: AbstractMotion, size: int) -> list[str]:
 
 
 def _each(measure: Callable, group: AbstractMotion):
+    group = with_room(group)  # and who draws up a suite is not warned of every record's baseline
+    if size_of(group) == 1:  # of what is traced for one motion, there are programs already
+        return jnp.reshape(measure(one_of_many(group, 0)), (1,))
     return jax.vmap(lambda index: measure(one_of_many(group, index)))(jnp.arange(size_of(group)))

@@ -4,7 +4,16 @@ import re
 
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, to_float
+from jaxrock.motions.files.parsing import (
+    NUMBER,
+    agreed_step,
+    agreed_unit,
+    announced_samples,
+    no_column,
+    plain_numbers,
+    to_float,
+)
+from jaxrock.motions.record import Origin
 
 _UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)", re.IGNORECASE)
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
@@ -27,9 +36,7 @@ class AT2(AbstractFormat):
         return any(_counts(line) for line in lines if not line.lstrip().startswith("#"))
 
     def read(self, name, lines, dt, unit, column):
-        if column is not None:
-            one = f"AT2 file `{name}` has one record"
-            raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+        no_column(name, column, "AT2")
         last = next((number for number, line in enumerate(lines) if _counts(line)), None)
         if last is None:
             raise file_error(name, "no header line states NPTS and DT, as an AT2 file must.")
@@ -37,11 +44,18 @@ class AT2(AbstractFormat):
         dt = agreed_step(name, dt, step)
         at = next((number for number in range(last + 1) if _UNIT.search(lines[number])), None)
         unit = agreed_unit(name, (at or 0) + 1, unit, "" if at is None else _UNIT.search(lines[at])[1])
-        samples = announced_samples(name, lines, last + 1, count, _numbers)
+        samples = announced_samples(name, lines, last + 1, count, _numbers, plain_numbers)
         check_end(name, lines, _printed(lines[last + 1 :]), by_program=True)
         # Event, station and component stand above the unit; the first line only names the database.
         title = " ".join(lines[at - 1].split()) if at is not None and at >= 2 else ""
-        return Accelerogram(samples, dt, unit, title)
+        return Accelerogram(samples, dt, unit, title, _origin(title))
+
+
+def _origin(title: str) -> Origin:
+    """Event, station and component: the first, the middle and the last of what stands between commas."""
+    event, *station, component = [part.strip() for part in title.split(",")] if title.count(",") > 1 else (title, "")
+    station = [part for part in station if not re.fullmatch(r"[\d/:. -]+", part)]
+    return Origin(event, ", ".join(station), (component.split() or [""])[0])
 
 
 def _counts(line: str) -> tuple[int, float] | None:

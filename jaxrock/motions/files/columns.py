@@ -1,6 +1,7 @@
 """Columns of text, separated by commas, semicolons, tabs or blanks, with or without times and lines of a header."""
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -58,8 +59,11 @@ def _fields(line: str) -> list[str]:
     return fields[:-1] if not fields[-1] else fields
 
 
-def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str]]:
-    """The numbers in columns of text, the line number of each row, and its first field as written."""
+def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list[str]]:
+    """The numbers in columns of text, the line number of each row, and some first fields as written."""
+    found = _table_at_once(name, lines)
+    if found is not None:
+        return found
     rows, numbers, first, last = [], [], [], []
     for number, line in enumerate(lines, 1):
         line = line.split("#")[0].strip()
@@ -88,6 +92,33 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, list[int], list[str
     return np.array(rows), numbers, first
 
 
+_MARKS = re.compile(r"[^-+.0-9EeDd \t\n,]")
+_SOME = 200  # rows that tell how numbers are printed
+
+
+def _table_at_once(name: str, lines: list[str]) -> tuple[np.ndarray, range, list[str]] | None:
+    """The same of many rows of nothing else; None where lines have to be looked at one by one."""
+    if len(lines) < _SOME:
+        return None
+    end = len(lines) - next((k for k, line in enumerate(reversed(lines)) if line.strip()), 0)
+    start = next((k for k, line in enumerate(lines) if line.strip() and not _MARKS.search(line)), end)
+    text = "\n".join(lines[start:end])
+    if start == end or _MARKS.search(text) or any(LIKE_DATA.match(line) for line in lines[:start]):
+        return None
+    commas = lines[start].count(",")
+    text = text.upper().replace("D", "E")
+    try:
+        table = np.loadtxt(text.split("\n"), delimiter="," if commas else None, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    if len(table) != end - start or not np.isfinite(table).all():
+        return None
+    ends = [*lines[start : start + _SOME], *lines[max(start + _SOME, end - _SOME) : end]]
+    fields = [_fields(line) for line in ends]
+    check_end(name, lines, [each[-1] for each in fields])
+    return table, range(start + 1, end + 1), [each[0] for each in fields]
+
+
 def _rounding(times: np.ndarray, printed: list[str]) -> float:
     """By how much times may be off through rounding: one in the last digit, and single precision [s]."""
     digits = max(len(re.sub(r"[ED].*|[-+.]", "", text.upper()).lstrip("0")) for text in printed)
@@ -95,7 +126,7 @@ def _rounding(times: np.ndarray, printed: list[str]) -> float:
     return 10.0 ** (np.floor(np.log10(largest)) + 1 - digits) + 1e-7 * largest
 
 
-def _step(name: str, times: np.ndarray, numbers: list[int], printed: list[str]) -> float:
+def _step(name: str, times: np.ndarray, numbers: Sequence[int], printed: list[str]) -> float:
     """The time step of equally spaced times [s]."""
     if times.size < 2:
         raise file_error(name, "has one row only, so its times give no time step.")

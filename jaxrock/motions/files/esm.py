@@ -6,7 +6,17 @@ import numpy as np
 
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import NUMBER, agreed_step, agreed_unit, announced_samples, check_peak, to_float
+from jaxrock.motions.files.parsing import (
+    NUMBER,
+    agreed_step,
+    agreed_unit,
+    announced_samples,
+    check_peak,
+    no_column,
+    plain_numbers,
+    to_float,
+)
+from jaxrock.motions.record import Origin
 
 _KEY = re.compile(r"([A-Z][A-Z0-9_/^]*):\s*(.*)")
 _STEP, _COUNT, _KIND, _UNIT, _PEAK = "SAMPLING_INTERVAL_S", "NDATA", "DATA_TYPE", "UNITS", "PGA_CM/S^2"
@@ -21,9 +31,7 @@ class ESM(AbstractFormat):
         return {_STEP, _COUNT} <= set(_header(lines))
 
     def read(self, name, lines, dt, unit, column):
-        if column is not None:
-            one = f"ESM file `{name}` has one record"
-            raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+        no_column(name, column, "ESM")
         header = _header(lines)
         step, count = (_stated(name, header, key) for key in (_STEP, _COUNT))
         kind = header.get(_KIND, (0, ""))[1].upper()
@@ -32,11 +40,13 @@ class ESM(AbstractFormat):
         at, written = header.get(_UNIT, (0, ""))
         dt, unit = agreed_step(name, dt, step), agreed_unit(name, at, unit, written)
         start = max(line for line, _ in header.values())
-        samples = announced_samples(name, lines, start, int(count), _number)
-        check_end(name, lines, [line.strip() for line in lines if _number(line) is not None], by_program=True)
+        samples = announced_samples(name, lines, start, int(count), _number, plain_numbers)
+        printed = [line.strip() for line in (*lines[start : start + 60], *lines[max(start + 60, len(lines) - 60) :])]
+        check_end(name, lines, [line for line in printed if _number(line) is not None], by_program=True)
         _check_peak(name, header, samples, unit)
-        told = (header.get(key, (0, ""))[1] for key in ("EVENT_NAME", "STATION_NAME", "STREAM"))
-        return Accelerogram(samples, dt, unit, ", ".join(word for word in told if word))
+        keys = "EVENT_NAME", "STATION_NAME", "STREAM", "DATE_TIME_FIRST_SAMPLE_YYYYMMDD_HHMMSS", "STATION_CODE"
+        told = [header.get(key, (0, ""))[1] for key in keys]
+        return Accelerogram(samples, dt, unit, ", ".join(filter(None, told[:3])), Origin(*told))
 
 
 def _header(lines: list[str]) -> dict[str, tuple[int, str]]:

@@ -6,14 +6,18 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxrock.motions.record import Origin
+
 
 class Accelerogram(NamedTuple):
-    """What a file holds of one accelerogram: samples in `unit`, one of `parsing.PER_G`, and a title, perhaps empty."""
+    """What a file holds of one accelerogram: samples in `unit`, one of `parsing.PER_G`, a title, perhaps empty, and
+    what the file says of where it comes from."""
 
     samples: Float[np.ndarray, " n"]
     dt: float
     unit: str
     title: str
+    origin: Origin = Origin()
 
 
 class AbstractFormat(abc.ABC):

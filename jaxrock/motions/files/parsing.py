@@ -51,13 +51,84 @@ def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
     return stated
 
 
+_PLAIN = re.compile(r"[-+.0-9EeDd \t\n]*")
+_NOT_PLAIN = re.compile(r"[^-+.0-9EeDd \t]")
+_TOUCHING = re.compile(r"(?<=[0-9.])(?=[-+])")
+
+
+def plain_numbers(lines: list[str]) -> np.ndarray | None:
+    """All numbers in lines that hold nothing else, at once; None where they have to be looked at one by one.
+
+    As numbers are read over and over, this is quick; what it does not take is no error yet.
+    """
+    text = "\n".join(lines)
+    if not _PLAIN.fullmatch(text):
+        return None
+    if _TOUCHING.search(text):  # numbers may touch before a sign
+        text = _TOUCHING.sub(" ", text)
+    words = text.upper().replace("D", "E").split()
+    try:
+        values = np.array(words, dtype=np.bytes_).astype(float) if words else np.zeros(0)
+    except ValueError:
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def numbers_of_width(lines: list[str], width: int) -> np.ndarray | None:
+    """The same for lines of fields of one width, which may touch."""
+    lines = [line.rstrip() for line in lines if line.strip()]
+    text = "".join(lines)
+    if not text or "\t" in text or any(len(line) % width for line in lines) or not _PLAIN.fullmatch(text):
+        return None
+    data = text.upper().replace("D", "E").encode()
+    written = np.frombuffer(data, np.uint8).reshape(-1, width) != ord(" ")
+    if not (np.sum(written[:, 1:] > written[:, :-1], axis=1) + written[:, 0] == 1).all():
+        return None  # a field that is empty, or two in one
+    try:
+        values = np.frombuffer(data, f"S{width}").astype(float)
+    except ValueError:
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def data_lines(lines: list[str], start: int) -> list[str]:
+    """The lines from number `start` on that look like data: up to one that holds a word."""
+    for number in range(start, len(lines)):
+        if _NOT_PLAIN.search(lines[number]):
+            return lines[start:number]
+    return lines[start:]
+
+
+_ENDS = re.compile(r"POINTS OF|^\s*/&|^\s*End-of-data", re.IGNORECASE)  # what comes after the samples
+
+
 def announced_samples(
-    name: str, lines: list[str], start: int, count: int, parse: Callable[[str], list[float] | None]
+    name: str,
+    lines: list[str],
+    start: int,
+    count: int,
+    parse: Callable[[str], list[float] | None],
+    at_once: Callable[[list[str]], np.ndarray | None] = lambda lines: None,
 ) -> np.ndarray:
     """The `count` samples that must follow line number `start`, and nothing more.
 
-    `parse(line)`: the numbers in a line, or None if it holds anything else.
+    `parse(line)`: the numbers in a line, or None if it holds anything else. `at_once(lines)`: those of all, or None
+    where lines have to be looked at one by one.
     """
+    block = data_lines(lines, start)
+    rest = lines[start + len(block) :]
+    if not rest or _ENDS.search(rest[0]):
+        values = at_once(block)
+        if values is not None and len(values) == count > 0:
+            return values
+    values = _one_by_one(name, lines, start, count, parse)
+    if len(values) != count or count == 0:
+        raise file_error(name, f"header announces {count} samples, but {len(values)} follow.")
+    return np.array(values)
+
+
+def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Callable) -> list[float]:
+    """The numbers line by line, and what is wrong with them."""
     values = []
     for number, line in enumerate(lines[start:], start + 1):
         if not line.strip():
@@ -67,19 +138,37 @@ def announced_samples(
             if not np.isfinite(row).all():
                 raise file_error(name, f"line {number} holds a number that is not finite: {line.strip()[:60]!r}.")
             values += row
-        elif re.search(r"POINTS OF|^\s*/&", line, re.IGNORECASE):
+        elif _ENDS.search(line):
             break
         elif LIKE_DATA.match(line) or 0 < len(values) < count:
             raise file_error(name, f"line {number} should hold samples, but is {line.strip()[:60]!r}.")
         elif values:
             break
-    if len(values) != count or count == 0:
-        raise file_error(name, f"header announces {count} samples, but {len(values)} follow.")
-    return np.array(values)
+    return values
 
 
-def check_peak(name: str, line: int, stated: float, samples: np.ndarray) -> None:
+def fixed_numbers(line: str, width: int) -> list[float] | None:
+    """The numbers in a line of columns `width` wide, which may touch, or None if it holds anything else."""
+    line = line.rstrip()
+    if len(line) % width:
+        return None
+    fields = [line[start : start + width].strip() for start in range(0, len(line), width)]
+    if not all(re.fullmatch(NUMBER, field) for field in fields):
+        return None
+    return [to_float(field) for field in fields]
+
+
+def no_column(name: str, column: int | None, kind: str) -> None:
+    """Raise ValueError where a column is asked for of a file that has one record."""
+    if column is not None:
+        one = f"{kind} file `{name}` has one record"
+        raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
+
+
+def check_peak(name: str, line: int, stated: float, samples: np.ndarray, where: str = "") -> None:
     """The largest sample is the peak that a header states in a line [cm/s2]."""
     stated, largest = abs(stated), float(np.abs(samples).max())
     if abs(largest - stated) > 1e-3 * stated + 1e-6:
-        raise file_error(name, f"line {line} states a peak of {stated:g} cm/s2, but the largest sample is {largest:g}.")
+        raise file_error(
+            name, f"{where or f'line {line}'} states a peak of {stated:g} cm/s2, but the largest sample is {largest:g}."
+        )

@@ -5,6 +5,8 @@ and where a header announces a count, a unit or a time step, contradictions rais
 """
 
 import os
+import re
+from pathlib import Path
 from typing import Annotated
 
 from jaxtyping import ArrayLike
@@ -14,10 +16,13 @@ from jaxrock._checks import one_of, scalar, size
 from jaxrock._text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
+from jaxrock.motions.files.cosmos import COSMOS
 from jaxrock.motions.files.csmip import CSMIP
 from jaxrock.motions.files.esm import ESM
-from jaxrock.motions.files.format import AbstractFormat
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.knet import KNET
 from jaxrock.motions.files.parsing import PER_G
+from jaxrock.motions.files.smc import SMC
 from jaxrock.motions.record import Record
 
 # Formats that headers tell; another one is a line here. Each is asked before those above it: a V2 file may hold a
@@ -26,7 +31,13 @@ _WITH_HEADERS = (
     AT2(),
     CSMIP(),
     ESM(),
+    COSMOS(),
+    SMC(),
+    KNET(),
 )
+
+_HEADER = 400  # lines in which headers of fixed places end
+_WORDS = re.compile(r"[A-CF-Za-cf-z]")
 
 _COLUMNS = Columns(_WITH_HEADERS)
 FORMATS = {each.name: each for each in (*_WITH_HEADERS, _COLUMNS)}
@@ -50,19 +61,19 @@ def read_record(
     **Arguments:**
 
     - `path`: the file.
-    - `format`: "at2" (PEER), "v2" (CSMIP, also USC: corrected acceleration), "esm" (ASCII of the
-      Engineering Strong-Motion database), or "csv" (columns of text separated by commas, semicolons, tabs or blanks).
-      None recognises it from the content, then from the suffix.
+    - `format`: "at2" (PEER), "v2" (CSMIP, also USC), "esm" (ASCII of the Engineering Strong-Motion database), "cosmos"
+      (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset), or "csv" (columns of text separated
+      by commas, semicolons, tabs or blanks). None recognises it from the content, then from the suffix.
     - `dt`: time between samples [s], positive. Needed for text without times; elsewhere it must agree
       with the file to 1e-3.
     - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls.
-      V2: the channel (None: the first). Not for AT2 and ESM.
+      V2: the channel (None: the first). The others hold one record.
 
-    **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file). Its first
-    sample is at time 0, whatever the times in the file.
+    **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
+    the file says of it. Its first sample is at time 0, whatever the times in the file.
 
     **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is
     empty, binary or damaged; ValueError for an argument that is missing, not allowed, of no use for
@@ -72,14 +83,20 @@ def read_record(
     path = path_of("path", path)
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[format]
-    accelerogram = chosen.read(path.name, lines, dt, unit, column)
-    samples = accelerogram.samples / PER_G[accelerogram.unit]
-    return Record(samples, accelerogram.dt, accelerogram.title or path.stem)
+    return _record(path, chosen, chosen.read(path.name, lines, dt, unit, column))
+
+
+def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
+    samples = found.samples / PER_G[found.unit]
+    origin = found.origin._replace(format=kind.name, unit=found.unit, file=path.name)
+    return Record(samples, found.dt, found.title or path.stem, origin)
 
 
 def _format_of(lines: list[str], suffix: str) -> AbstractFormat:
     """The format of a file: by its content, else by its suffix, else columns."""
+    # Most lines of a long file hold numbers only, and are none of a header.
+    worded = lines[:_HEADER] + [line for line in lines[_HEADER:] if _WORDS.search(line)]
     for each in reversed(FORMATS.values()):
-        if each.recognises(lines):
+        if each.recognises(worded):
             return each
     return next((each for each in FORMATS.values() if suffix.lower() in each.suffixes), _COLUMNS)

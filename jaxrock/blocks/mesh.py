@@ -1,0 +1,190 @@
+"""A rock from the mesh of its surface: volume, mass, the ground it stands on, and its plane section in any direction.
+
+Known numbers only, in NumPy. Meshes are read and integrated by trimesh, which is asked for when one is.
+"""
+
+import os
+import warnings
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from jaxrock._arguments import arguments, path_of, word_of
+from jaxrock._checks import Values, finite, positive, scalar, shown
+
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_SHARE = 0.01  # of the height, within which vertices stand on the ground
+
+
+class Section(NamedTuple):
+    """A rock seen along the ground, at right angles to an azimuth; lengths in m, the centre of mass at width 0.
+
+    - `right`, `left`: (2,) width and height of the points about which it rocks; `centre`: (2,).
+    - `gyration_radius`: sqrt(I/m) about the horizontal axis through the centre of mass.
+    - `rolls`: (2,) whether the base is so round that, on that side, the rock rolls on before it is in balance.
+    """
+
+    right: Float[np.ndarray, "2"]
+    left: Float[np.ndarray, "2"]
+    centre: Float[np.ndarray, "2"]
+    gyration_radius: float
+    rolls: tuple[bool, bool]
+
+    @property
+    def slenderness(self) -> tuple[float, float]:
+        """Angles of the centre of mass over the right and the left point [rad]."""
+        away = (self.right - self.centre, self.left - self.centre)
+        return tuple(float(np.arctan2(abs(each[0]), -each[1])) for each in away)
+
+
+class Rock(NamedTuple):
+    """A rock of even density; the third axis points up, lengths in m. `Rock.from_mesh(...)` makes one.
+
+    - `volume` [m^3]; `centre`: (3,) of mass; `inertia`: (3, 3) about it, over the mass [m^2].
+    - `vertices`: (n, 3); `base`: (k, 3) those within `tolerance` of the lowest, on which it stands.
+    """
+
+    volume: float
+    centre: Float[np.ndarray, "3"]
+    inertia: Float[np.ndarray, "3 3"]
+    vertices: Float[np.ndarray, "n 3"]
+    base: Float[np.ndarray, "k 3"]
+    tolerance: float
+
+    @classmethod
+    @arguments
+    def from_mesh(
+        cls, mesh: Any, *, unit: Annotated[str, word_of(*_UNITS)] = "m", tolerance: ArrayLike | None = None
+    ) -> "Rock":
+        """Build a rock from a closed surface.
+
+        **Arguments:**
+
+        - `mesh`: a `trimesh.Trimesh`, or the path of a file that trimesh reads (STL, PLY, OBJ, ...); its third axis
+          points up, and it stands as it does in the field. Needs `pip install "jaxrock[mesh]"`.
+        - `unit`: of its coordinates: "m", "cm" or "mm".
+        - `tolerance`: vertices up to so much above the lowest stand on the ground [m], positive; None: a hundredth of
+          the height. As good as the mesh is: too small a one leaves a rock on a needle.
+
+        **Returns:** a `Rock`.
+
+        **Raises:** ValueError for a surface that is not closed, a base that is no area, or a centre of mass that is not
+        above it; OSError if the file cannot be opened; ImportError without trimesh.
+        """
+        mesh = _surface(mesh)
+        if not bool(mesh.is_volume):
+            raise ValueError("Argument `mesh` must be closed and turned outward, but is not: repair it first.")
+        factor = _UNITS[unit]
+        vertices, volume = factor * np.asarray(mesh.vertices, float), factor**3 * float(mesh.volume)
+        # trimesh's own density is 1 in its units.
+        inertia = factor**2 * np.asarray(mesh.moment_inertia, float) / float(mesh.volume) / float(mesh.density)
+        height = np.ptp(vertices[:, 2])
+        tolerance = (
+            _SHARE * height if tolerance is None else float(scalar("tolerance", positive("tolerance", tolerance)))
+        )
+        base = vertices[vertices[:, 2] <= vertices[:, 2].min() + tolerance]
+        rock = cls(volume, factor * np.asarray(mesh.center_mass, float), inertia, vertices, base, tolerance)
+        for azimuth in np.linspace(0, np.pi, 180, endpoint=False):
+            section = rock._between(azimuth)
+            if not section.left[0] < 0 < section.right[0]:
+                within = f"of {len(base)} vertices within {tolerance:.3g} m of the lowest"
+                raise ValueError(
+                    f"Argument `mesh` must stand, but its centre of mass is not above its base ({within}) at azimuth "
+                    f"{azimuth:.3g} rad."
+                )
+        return rock
+
+    @arguments
+    def section(self, azimuth: ArrayLike, base: Annotated[str, word_of("narrow", "wide")] = "narrow") -> Section:
+        """The rock as it rocks in the plane of an azimuth.
+
+        **Arguments:**
+
+        - `azimuth`: from the first axis towards the second [rad]; its direction is to the right.
+        - `base`: of a rounded base. "narrow": it rocks about the outermost points on the ground, and no vertex beyond
+          is in the way. "wide": about those to which it has rolled when it is in balance. The moment that rights a rock
+          which stands on its base and then rolls lies between those of the two at every rotation. So the two bound how
+          it resists; that one topples and it does not is still possible, because toppling is not ordered. For a flat
+          base both are the same.
+
+        **Returns:** a `Section`: the projection of all vertices to the plane.
+
+        **Raises:** ValueError for an azimuth that is not finite.
+        """
+        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
+        narrow = self._between(azimuth)
+        points = np.stack([(self.vertices - self.centre)[:, :2] @ _direction(azimuth), self.vertices[:, 2]], axis=1)
+        last = [_rolled(points * [side, 1], corner * [side, 1], self.centre[2]) * [side, 1]
+                for side, corner in ((1, narrow.right), (-1, narrow.left))]  # fmt: skip
+        rolls = tuple(not np.allclose(end, corner) for end, corner in zip(last, (narrow.right, narrow.left)))
+        found = narrow._replace(rolls=rolls)
+        return found._replace(right=last[0], left=last[1]) if base == "wide" else found
+
+    @arguments
+    def slenderness(self, azimuth: Values) -> Float[np.ndarray, "azimuths"]:
+        """Angle of the centre of mass over the point on which it rocks towards each azimuth [rad], (azimuths,)."""
+        azimuths = np.asarray(finite("azimuth", azimuth), float)
+        if azimuths.ndim != 1:
+            raise ValueError(f"Argument `azimuth` must be a list, but has shape {azimuths.shape}.")
+        return np.array([self._between(each).slenderness[0] for each in azimuths])
+
+    def _between(self, azimuth: float) -> Section:
+        """The section by the points on the ground alone."""
+        along = _direction(azimuth)
+        places = (self.base[:, :2] - self.centre[:2]) @ along
+        ends = [np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin())]
+        axis = np.array([-along[1], along[0], 0.0])
+        return Section(
+            *ends, np.array([0.0, self.centre[2]]), float(np.sqrt(axis @ self.inertia @ axis)), (False, False)
+        )
+
+
+def section_of(mesh: Any, azimuth: ArrayLike, base: str, unit: str, tolerance: ArrayLike | None) -> Section:
+    """The section of a rock or a mesh; it warns of a base that rolls."""
+    rock = mesh if isinstance(mesh, Rock) else Rock.from_mesh(mesh, unit=unit, tolerance=tolerance)
+    found = rock.section(azimuth, base)
+    if any(found.rolls):
+        ends = [max(rock.section(azimuth, each).slenderness) for each in ("narrow", "wide")]
+        warnings.warn(
+            f"The base is rounded: the rock rolls on before it is in balance, at {ends[0]:.3g} rad if it rocked about "
+            f"the ground it stands on, at {ends[1]:.3g} rad if about where it rolls to. See both, with `base`.",
+            stacklevel=4,
+        )
+    return found
+
+
+def _surface(mesh: Any):
+    """A mesh of trimesh."""
+    if isinstance(mesh, (str, os.PathLike)):
+        path = path_of("mesh", mesh)
+        try:
+            import trimesh
+        except ImportError as error:
+            raise ImportError('Reading a mesh needs trimesh: pip install "jaxrock[mesh]".') from error
+        with path.open("rb"):  # said as for any file
+            pass
+        try:
+            return trimesh.load(path, force="mesh")
+        except Exception as error:
+            raise ValueError(
+                f"File `{path.name}`: trimesh does not read it ({type(error).__name__}: {error})."
+            ) from error
+    if not all(hasattr(mesh, name) for name in ("is_volume", "vertices", "moment_inertia", "center_mass")):
+        raise ValueError(f"Argument `mesh` must be a mesh of trimesh, or the path of a file, but is {shown(mesh)}.")
+    return mesh
+
+
+def _direction(azimuth: float) -> np.ndarray:
+    return np.array([np.cos(azimuth), np.sin(azimuth)])
+
+
+def _rolled(points: np.ndarray, corner: np.ndarray, height: float) -> np.ndarray:
+    """Where it stands when it has rolled to the right until it is in balance: from vertex to vertex of the hull."""
+    for _ in range(len(points)):
+        beyond = points[points[:, 0] > corner[0] + 1e-9 * np.ptp(points[:, 0])]
+        slopes = np.arctan2(beyond[:, 1] - corner[1], beyond[:, 0] - corner[0])
+        if slopes.size == 0 or slopes.min() >= np.arctan2(corner[0], height - corner[1]):
+            break
+        corner = beyond[slopes.argmin()]
+    return corner

@@ -1,0 +1,79 @@
+"""Fragilities as NRML, the natural hazards' risk markup language that the OpenQuake engine reads."""
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxrock._arguments import arguments, path_of
+from jaxrock._aside import written_aside
+from jaxrock._checks import shown
+from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility
+
+_SPACE = "http://openquake.org/xmlns/nrml/0.5"
+
+
+@arguments
+def write_nrml(
+    fragilities: Mapping[str, LogNormalFragility | TabulatedFragility],
+    path: str | os.PathLike,
+    measure: str = "PGA",
+    *,
+    taxonomy: str = "block",
+    description: str = "Rocking block",
+) -> None:
+    """Write the fragilities of one object for OpenQuake: NRML 0.5, a `fragilityModel`.
+
+    **Arguments:**
+
+    - `fragilities`: by the names of their limit states, from slight to severe: all `LogNormalFragility`, or all
+      `TabulatedFragility` of the same levels.
+    - `path`: the file; one that is there is replaced.
+    - `measure`: as OpenQuake calls it, such as "PGA" [g], "PGV" or "SA(0.5)".
+    - `taxonomy`, `description`: of the object.
+
+    **Raises:** ValueError for fragilities that do not go together; OSError if the file cannot be written.
+    """
+    good = isinstance(fragilities, Mapping) and fragilities and all(isinstance(name, str) for name in fragilities)
+    kinds = {type(each) for each in fragilities.values()} if good else set()
+    if kinds not in ({LogNormalFragility}, {TabulatedFragility}):
+        raise ValueError(
+            f"Argument `fragilities` must hold lognormal or tabulated ones by name, but is {shown(fragilities)}."
+        )
+    root = ElementTree.Element("nrml", xmlns=_SPACE)
+    model = ElementTree.SubElement(
+        root, "fragilityModel", id="jaxrock", assetCategory="contents", lossCategory="contents"
+    )
+    ElementTree.SubElement(model, "description").text = description
+    ElementTree.SubElement(model, "limitStates").text = " ".join(name.replace(" ", "_") for name in fragilities)
+    (_continuous if kinds == {LogNormalFragility} else _discrete)(model, fragilities, measure, taxonomy)
+    ElementTree.indent(root)
+    with written_aside(path_of("path", path), replace=True) as aside:
+        ElementTree.ElementTree(root).write(aside, encoding="utf-8", xml_declaration=True)
+
+
+def _continuous(model, fragilities: Mapping, measure: str, taxonomy: str) -> None:
+    function = ElementTree.SubElement(model, "fragilityFunction", id=taxonomy, format="continuous", shape="logncdf")
+    ends = [np.ravel([each.knots[0], each.knots[-1]]) for each in fragilities.values()]
+    low, high = (f"{end:.10g}" for end in (np.min(ends), np.max(ends)))
+    ElementTree.SubElement(function, "imls", imt=measure, noDamageLimit=low, minIML=low, maxIML=high)
+    for name, each in fragilities.items():
+        median, dispersion = (float(np.reshape(x, ())) for x in (each.median, each.dispersion))
+        mean = median * np.exp(dispersion**2 / 2)  # NRML states moments of the intensity, not of its logarithm
+        spread = mean * np.sqrt(np.expm1(dispersion**2))
+        ElementTree.SubElement(
+            function, "params", ls=name.replace(" ", "_"), mean=f"{mean:.12g}", stddev=f"{spread:.12g}"
+        )
+
+
+def _discrete(model, fragilities: Mapping, measure: str, taxonomy: str) -> None:
+    levels = [np.asarray(each.levels) for each in fragilities.values()]
+    if any(each.ndim > 1 or not np.array_equal(each, levels[0]) for each in levels):
+        raise ValueError("Argument `fragilities` must hold tables of the same levels.")
+    function = ElementTree.SubElement(model, "fragilityFunction", id=taxonomy, format="discrete")
+    limits = ElementTree.SubElement(function, "imls", imt=measure, noDamageLimit=f"{levels[0][0]:.10g}")
+    limits.text = " ".join(f"{level:.10g}" for level in levels[0])
+    for name, each in fragilities.items():
+        shares = ElementTree.SubElement(function, "poes", ls=name.replace(" ", "_"))
+        shares.text = " ".join(f"{share:.10g}" for share in np.asarray(each.probabilities))

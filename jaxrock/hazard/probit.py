@@ -1,0 +1,140 @@
+"""Probit fits of outcomes to the logarithms of any number of intensity measures, with errors of few motions, too."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Float
+
+from jaxrock._arguments import arguments, word_of
+from jaxrock._checks import Values, not_negative, positive, shown
+from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line
+
+
+class ProbitFit(eqx.Module):
+    """What `fit_probit` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
+
+    P = Phi(intercept + sum of slopes times ln measure).
+
+    - `names`: of the measures; `intercept`; `slopes`: (measures,).
+    - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes.
+    - `log_likelihood`: at the maximum, without the binomial coefficients.
+    - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    intercept: Float[Array, ""]
+    slopes: Float[Array, " measures"]
+    covariance: Float[Array, "terms terms"]
+    log_likelihood: Float[Array, ""]
+    status: FitStatus
+
+    @property
+    def standard_errors(self) -> Float[Array, " terms"]:
+        """Of the intercept and the slopes."""
+        return jnp.sqrt(jnp.diag(self.covariance))
+
+    def __call__(self, **measures: Values) -> Float[Array, "..."]:
+        """Probability to topple at measures by name, positive, which broadcast.
+
+        **Raises:** ValueError for other names, or numbers that are not positive.
+        """
+        if set(measures) != set(self.names):
+            raise ValueError(f"The arguments must be `{'`, `'.join(self.names)}`, but are {sorted(measures)}.")
+        logarithms = [jnp.log(positive(name, measures[name])) for name in self.names]
+        return ndtr(self.intercept + sum(slope * x for slope, x in zip(self.slopes, logarithms)))
+
+    @property
+    def fragility(self) -> LogNormalFragility:
+        """The lognormal fragility of a single measure.
+
+        **Raises:** ValueError for more measures than one, and for a fit that failed or does not grow.
+        """
+        if len(self.names) != 1 or not self.slopes[0] > 0:
+            raise ValueError("A lognormal fragility must have one measure, with which the probability grows.")
+        return LogNormalFragility(jnp.exp(-self.intercept / self.slopes[0]), 1 / self.slopes[0])
+
+
+@arguments
+def fit_probit(
+    measures: Mapping[str, Values],
+    toppled: Values,
+    trials: Values = 1,
+    *,
+    clusters: Sequence | np.ndarray | None = None,
+    errors: Annotated[str, word_of("information", "clusters", "jackknife")] | None = None,
+) -> ProbitFit:
+    """The probit line in the logarithms of measures under which outcomes are most probable.
+
+    **Arguments:**
+
+    - `measures`: (n,) positive values by name, one measure or more.
+    - `toppled`, `trials`: as in `fit_fragility`.
+    - `clusters`: (n,) labels; outcomes of one label are not independent (those of one motion, say).
+    - `errors`: what the covariance is. "information": the inverse of the observed information, for independent
+      outcomes (the default without clusters). "clusters": a sandwich of clusters times C/(C - 1) (the default with
+      them), which is too narrow for few. "jackknife": every cluster (without clusters, every row) left out once, which
+      for few, 10 to 40, is the safer one: somewhat too wide rather than too narrow.
+
+    **Returns:** a `ProbitFit`.
+
+    **Raises:** ValueError for arguments outside their ranges, or of other shapes, and for fewer than two clusters.
+
+    **Source:** Liang & Zeger (1986), clusters; Bell & McCaffrey (2002), the jackknife.
+    """
+    if not isinstance(measures, Mapping) or not measures or not all(isinstance(name, str) for name in measures):
+        raise ValueError(f"Argument `measures` must hold lists by name, but is {shown(measures)}.")
+    lists = [positive(name, values) for name, values in measures.items()]
+    first = lists[0]
+    if first.ndim != 1 or first.size < 2 or any(each.shape != first.shape for each in lists):
+        raise ValueError(f"Argument `measures` must hold lists of one length, but of {[x.shape for x in lists]}.")
+    trials = jnp.broadcast_to(not_negative("trials", trials), first.shape)
+    toppled = outcomes(toppled, first, trials)
+    if errors is None:
+        errors = "information" if clusters is None else "clusters"
+    labels = np.arange(first.size) if clusters is None else np.unique(np.asarray(clusters), return_inverse=True)[1]
+    if labels.shape != first.shape:
+        raise ValueError(f"Argument `clusters` must have shape {first.shape}, but has shape {labels.shape}.")
+    if errors != "information" and labels.max() < 1:
+        raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
+    logarithms = jnp.log(jnp.stack(lists))
+    numbers = _fit(logarithms, toppled, trials - toppled, jnp.asarray(labels), int(labels.max()) + 1, errors)
+    return ProbitFit(tuple(measures), *numbers)
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
+    centre, size = jnp.mean(logarithms, 1), jnp.std(logarithms, 1)
+    known = jnp.all(size > 1e-9)
+    size = jnp.where(size > 1e-9, size, 1.0)
+    abscissas = (logarithms - centre[:, None]) / size[:, None]
+    line, converged = probit_line(abscissas, toppled, survived)
+    rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
+    likelihood, by_z, curvature = probit(line @ rows, toppled, survived)
+    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
+    if errors == "clusters":
+        scores = jnp.zeros((count, len(rows))).at[labels].add((rows * by_z).T)
+        covariance = covariance @ (scores.T @ scores * count / (count - 1)) @ covariance
+    elif errors == "jackknife":
+
+        def without(left_out):
+            kept = (labels != left_out).astype(toppled.dtype)
+            return probit_line(abscissas, toppled * kept, survived * kept)
+
+        lines, found = jax.lax.map(without, jnp.arange(count), batch_size=64)
+        off = lines - line
+        covariance = jnp.where(jnp.all(found), (count - 1) / count * off.T @ off, jnp.nan)
+    # In the logarithms themselves: intercept = line[0] - sum(line[k] centre[k]/size[k]).
+    back = jnp.diag(jnp.concatenate([jnp.ones(1), 1 / size])).at[0, 1:].set(-centre / size)
+    # Where outcomes can be parted, probabilities come to 0 or 1 and the line goes on for ever.
+    converged &= known & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
+    converged &= likelihood < -1e-6
+    status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
+    status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
+    numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood
+    return *(jnp.where(converged, x, jnp.nan) for x in numbers), status

@@ -1,0 +1,165 @@
+"""Outcomes of a suite: as recorded, or at many scales (incremental dynamic analysis), both ways round, on many blocks.
+
+Overturning does not grow with the scale: a block may topple at one and stand at a higher one. Curves are kept as they
+are, and what is undecided bounds every share from both sides.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int8
+
+from jaxrock._arguments import arguments, list_of, word_of
+from jaxrock._checks import Values, checked, positive, shown
+from jaxrock._parameters import leaves_of
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.suite import Suite
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
+
+_FACINGS = {"one": (1,), "both": (1, -1)}
+
+
+class SuiteOutcomes(eqx.Module):
+    """What became of blocks under the motions of a suite.
+
+    - `suite`, `blocks` (with parameters of shape (blocks,)), `scale`: (scales,); `facing`: (facings,) 1 as recorded, -1
+      the other way round.
+    - `verdict`: (motions, scales, facings, blocks) 1 toppled, 0 stood, -1 undecided.
+    - `rotation`: the same shape, peak rotation over slenderness (of an asymmetric block over the smaller one); infinite
+      if it toppled, NaN where undecided.
+    - `margin`: the same, as in `Outcome`; NaN where undecided.
+    """
+
+    suite: Suite
+    blocks: Block | AsymmetricBlock
+    scale: Float[np.ndarray, " scales"]
+    facing: tuple[int, ...] = eqx.field(static=True)
+    verdict: Int8[np.ndarray, "motions scales facings blocks"]
+    rotation: Float[np.ndarray, "motions scales facings blocks"]
+    margin: Float[np.ndarray, "motions scales facings blocks"]
+
+    @property
+    def undecided(self) -> int:
+        """Number of scenes without a verdict."""
+        return int(np.sum(self.verdict == UNDECIDED))
+
+    def reaches(self, state: Values) -> tuple[np.ndarray, np.ndarray]:
+        """Shares of blocks, both ways round, that come to damage states, for every motion and scale.
+
+        **Arguments:**
+
+        - `state`: (states,) peak rotations over slenderness, positive; one that toppled has reached all.
+
+        **Returns:** bounds (motions, scales, states): of what is undecided nothing, or all.
+
+        **Raises:** ValueError for states that are not a list of positive numbers.
+        """
+        states = np.asarray(positive("state", state), float)
+        if states.ndim != 1 or states.size == 0:
+            raise ValueError(f"Argument `state` must be a list of states, but has shape {states.shape}.")
+        found = self.rotation[..., None] >= states  # not where it is not a number
+        bounds = found, found | (self.verdict == UNDECIDED)[..., None]
+        return tuple(each.mean(axis=(2, 3)) for each in bounds)
+
+    @property
+    def capacity(self) -> Float[np.ndarray, "motions facings blocks 2"]:
+        """Between which scales every block first topples: (below, above), 0 and infinite where that is not known.
+
+        Above the upper scale it may stand again. An undecided scale may have been the first: it widens the bracket.
+        """
+        scales, count = np.concatenate([[0.0], self.scale, [np.inf]]), self.scale.size
+        toppled, stood = self.verdict == TOPPLED, self.verdict == STOOD
+        first = np.where(toppled.any(axis=1), toppled.argmax(axis=1), count)
+        safe = np.where(stood.all(axis=1), count, (~stood).argmax(axis=1))
+        return np.stack([scales[safe], scales[first + 1]], axis=-1)
+
+    @property
+    def comes_back(self) -> np.ndarray:
+        """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
+        return np.any(np.maximum.accumulate(self.verdict == TOPPLED, axis=1) & (self.verdict == STOOD), axis=1)
+
+    def table(self, measures: Mapping[str, Callable[[AbstractMotion], float]] | None = None) -> dict[str, np.ndarray]:
+        """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
+
+        **Arguments:**
+
+        - `measures`: functions of a motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each
+          is taken of the motion as it was scaled. None: none beside the peaks.
+
+        **Returns:** motion, scale, facing, block, the block's parameters, PGA [g], PGV [m/s], the measures,
+        rotation_over_alpha, margin, verdict (1 toppled, 0 stood, -1 undecided).
+
+        **Raises:** ValueError for measures that are no functions.
+        """
+        measures = {} if measures is None else measures
+        if not isinstance(measures, Mapping) or not all(map(callable, measures.values())):
+            raise ValueError(f"Argument `measures` must hold functions by name, but is {shown(measures)}.")
+        shape = self.verdict.shape
+        motion, scale, facing, block = (places.ravel() for places in np.indices(shape))
+        strength = self.scale[scale]
+        columns = {"motion": np.array(self.suite.names)[motion], "scale": strength,
+                   "facing": np.array(self.facing)[facing], "block": block}  # fmt: skip
+        columns |= {leaf.name: np.asarray(leaf.value)[block] for leaf in leaves_of(self.blocks)}
+        peaks = {"PGA": self.suite.peak_acceleration, "PGV": self.suite.peak_velocity}
+        columns |= {name: np.asarray(peak)[motion] * strength for name, peak in peaks.items()}
+        for name, measure in measures.items():
+            cells = np.array([[float(measure(s * m)) for s in self.scale] for m in self.suite.motions()])
+            columns[name] = cells[motion, scale]
+        results = {"rotation_over_alpha": self.rotation, "margin": self.margin, "verdict": self.verdict}
+        return columns | {name: each.ravel() for name, each in results.items()}
+
+
+@arguments
+def suite_outcomes(
+    block: Block | AsymmetricBlock,
+    motions: Suite | Annotated[Sequence[AbstractMotion], list_of(AbstractMotion, "motions")],
+    scale: Values = 1.0,
+    model: AbstractEquation = Housner(),
+    *,
+    facing: Annotated[str, word_of(*_FACINGS)] = "one",
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> SuiteOutcomes:
+    """What becomes of blocks under the motions of a suite, as recorded or at many scales.
+
+    **Arguments:**
+
+    - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (blocks,) many.
+    - `motions`: a `Suite`, or what makes one.
+    - `scale`: factors on all motions, a number (1: as recorded) or a list, positive and rising.
+    - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block is a mirror image.
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+
+    **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Vamvatsikos & Cornell (2002), incremental dynamic analysis.
+    """
+    scales = np.atleast_1d(np.asarray(checked("scale", scale, "be positive and finite", _is_positive), float))
+    if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
+        raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
+    suite = motions if isinstance(motions, Suite) else Suite(motions)
+    blocks, ways = stacked(block), _FACINGS[facing]
+    symmetric = isinstance(block, Block)
+    factors = np.concatenate([way * scales for way in (ways[:1] if symmetric else ways)])
+    found = scenes(blocks, suite, factors, model, engine, progress)
+    draws = jax.tree.leaves(blocks)[0].shape[0]
+
+    def by_facing(values):
+        values = values.reshape(len(suite), -1, scales.size, draws).swapaxes(1, 2)
+        return np.repeat(values, len(ways), axis=2) if symmetric else values
+
+    return SuiteOutcomes(suite, blocks, scales, ways, *map(by_facing, found))
+
+
+def _is_positive(x):
+    return (x > 0) & (x < np.inf)

@@ -1,0 +1,352 @@
+"""Blocks from verdicts under known motions: slenderness, size, restitution and their scatter.
+
+The verdict of a single scene jumps, and its margin has slopes up to 1e15 after a long record. What is fitted is the
+share of a parameter's distribution that topples: scenes are followed once, on a grid over the parameters, and every
+cell of it weighs as much as the distribution has in it. That is smooth in the distribution's median and scatter.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxrock._arguments import arguments, at_least, known, list_of
+from jaxrock._checks import Values, as_real, below_one, share, shown
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
+from jaxrock.inverse.unknowns import Unknown
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.suite import Suite
+from jaxrock.studies.suite_scenes import scenes
+
+_STARTS = 6  # points of a net from which the likelihood is climbed
+
+
+class CalibrationStatus(eqx.Enumeration):
+    """What became of a calibration; `CalibrationStatus[found.status]` is the message."""
+
+    successful = "The likelihood has a maximum within the ranges, and it was found."
+    at_an_end = "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."
+    not_converged = "The maximum of the likelihood was not found, or is flat: some parameter is not told by the tests."
+
+
+class BlockCalibration(eqx.Module):
+    """What `calibrate_block` finds.
+
+    - `values`: the most probable ones by name; of a parameter with scatter its median, and `name_sd`.
+    - `covariance`: of the places of all in this order: logarithms where an `Unknown` is one, else themselves; the
+      inverse of the observed information. `standard_errors` by name, of the same.
+    - `log_likelihood`: at the maximum; with priors, without their constants.
+    - `probability`: (tests,) to topple, of every test. `bounds`: (2, tests) if all undecided scenes stood, or toppled.
+    - `held_out`: (tests,) the same of fits to the tests of other motions; NaN where `folds` was 0.
+    - `status`: a `CalibrationStatus`.
+    """
+
+    values: dict[str, Float[Array, ""]]
+    covariance: Float[Array, "terms terms"]
+    log_likelihood: Float[Array, ""]
+    probability: Float[Array, " tests"]
+    bounds: Float[Array, "2 tests"]
+    held_out: Float[Array, " tests"]
+    toppled: Float[Array, " tests"]
+    status: CalibrationStatus
+    problem: "_Problem"
+
+    @property
+    def standard_errors(self) -> dict[str, Float[Array, ""]]:
+        """Of the places, by name."""
+        return dict(zip(self.values, jnp.sqrt(jnp.diag(self.covariance))))
+
+    def log_density(self, values: Mapping[str, ArrayLike]) -> Float[Array, ""]:
+        """Log-likelihood and log-prior at values by name: a smooth function for optimisers and samplers of JAX.
+
+        **Raises:** ValueError for other names.
+        """
+        if not isinstance(values, Mapping) or set(values) != set(self.problem.unknowns):
+            raise ValueError(f"Argument `values` must have the names {sorted(self.problem.unknowns)}.")
+        places = [self.problem.place(name, as_real(name, values[name])) for name in self.problem.unknowns]
+        return self.problem.log_density(jnp.stack(places))
+
+    def auc(self, held_out: bool = False) -> float:
+        """Share of pairs of a test that toppled and one that stood of which the first has the higher probability."""
+        chosen = np.asarray(self.held_out if held_out else self.probability)
+        fell, stood = chosen[np.asarray(self.toppled) == 1], chosen[np.asarray(self.toppled) == 0]
+        if not fell.size or not stood.size:
+            return float("nan")
+        places = np.searchsorted(np.sort(stood), fell, side="left"), np.searchsorted(np.sort(stood), fell, side="right")
+        return float(np.mean(places[0] + places[1]) / (2 * stood.size))
+
+    @arguments
+    def curve(self, bins: Annotated[int, at_least(2, 1000)] = 10, held_out: bool = False) -> dict[str, np.ndarray]:
+        """The calibration curve: tests in bins of about as many each, in the order of their probability.
+
+        **Arguments:**
+
+        - `bins`: how many; `held_out`: whether by fits to other motions.
+
+        **Returns:** columns tests, probability (their mean), toppled (their share).
+        """
+        chosen = np.asarray(self.held_out if held_out else self.probability)
+        known = np.flatnonzero(np.isfinite(chosen) & (np.asarray(self.toppled) >= 0))
+        parts = [part for part in np.array_split(known[np.argsort(chosen[known])], bins) if part.size]
+        toppled = np.asarray(self.toppled)
+        return {
+            "tests": np.array([part.size for part in parts]),
+            "probability": np.array([chosen[part].mean() for part in parts]),
+            "toppled": np.array([toppled[part].mean() for part in parts]),
+        }
+
+    @arguments
+    def disagreeing(self, probability: ArrayLike = 0.05, held_out: bool = False) -> np.ndarray:
+        """Indices of tests that ended in a way which had less than this probability, the least probable first.
+
+        **Raises:** ValueError for a probability outside [0, 1].
+        """
+        most = float(share("probability", probability))
+        chosen, toppled = np.asarray(self.held_out if held_out else self.probability), np.asarray(self.toppled)
+        as_it_was = np.where(toppled == 1, chosen, 1 - chosen)
+        order = np.argsort(as_it_was)
+        return order[(as_it_was[order] < most) & (toppled[order] >= 0)]
+
+
+class _Problem(eqx.Module):
+    """The likelihood over places: what is unknown, and what the scenes of the grid tell."""
+
+    unknowns: dict[str, Unknown]
+    axes: dict[str, Axis]
+    table: Table
+    lapse: float = eqx.field(static=True)
+
+    @property
+    def ends(self):
+        return jnp.stack([unknown.ends for unknown in self.unknowns.values()])
+
+    def place(self, name: str, value):
+        return jnp.log(value) if self.unknowns[name].log else value
+
+    def values(self, places) -> dict:
+        named = zip(self.unknowns.items(), places)
+        return {name: jnp.exp(x) if unknown.log else x for (name, unknown), x in named}
+
+    def probabilities(self, places, shares):
+        """Of toppling, of every test; `shares` (tests, cells...) that topple."""
+        values = self.values(places)
+        found = weighed(shares, [axis.weights(values, name) for name, axis in self.axes.items()])
+        return self.lapse / 2 + (1 - self.lapse) * found
+
+    def terms(self, places):
+        """Log-likelihood of every test."""
+        table = self.table
+        p = jnp.clip(self.probabilities(places, table.toppled), 1e-12, 1 - 1e-12)
+        verdicts = jnp.where(table.seen == 1, jnp.log(p), jnp.where(table.seen == 0, jnp.log1p(-p), 0.0))
+        if table.density is None:
+            return verdicts
+        values = self.values(places)
+        density = weighed(table.density, [axis.weights(values, name) for name, axis in self.axes.items()])
+        return jnp.where(table.has_rotation, jnp.log((1 - self.lapse) * density + self.lapse), verdicts)
+
+    def log_density(self, places, weights=None):
+        prior = sum(unknown.log_prior(x) for unknown, x in zip(self.unknowns.values(), places))
+        terms = self.terms(places)
+        return jnp.sum(terms if weights is None else weights * terms) + prior
+
+
+@arguments
+def calibrate_block(
+    block: Callable,
+    motions: Suite | Annotated[Sequence[AbstractMotion], list_of(AbstractMotion, "motions")],
+    toppled: Values,
+    unknowns: Mapping[str, Unknown],
+    scatter: Mapping[str, Unknown | float],
+    model: AbstractEquation = Housner(),
+    *,
+    rotation: Values | None = None,
+    rotation_sd: Annotated[float, known(share)] = 0.3,
+    facing: Values = 0,
+    cells: Mapping[str, int] | Annotated[int, at_least(8, 4096)] = 64,
+    lapse: Annotated[float, known(below_one)] = 0.01,
+    groups: Sequence | None = None,
+    folds: Annotated[int, at_least(0, 1000)] = 0,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> BlockCalibration:
+    """Find slenderness, size or restitution of a block, and their scatter, from what it did under known motions.
+
+    **Arguments:**
+
+    - `block`: makes a `Block` or `AsymmetricBlock` of the unknown parameters by name, such as
+      `lambda alpha: rk.Block(alpha, 3.0)`, or `rk.Block`.
+    - `motions`: (tests,) as they were, scaled: a `Suite`, or what makes one.
+    - `toppled`: (tests,) 1 toppled, 0 stood, -1 not known.
+    - `unknowns`: an `Unknown` for each parameter that `block` takes: its value, or its median over tests.
+    - `scatter`: for parameters that differ from test to test (how a rock was set up, what it stands on): the standard
+      deviation of the logarithm (of the parameter itself where its `Unknown` is not `log`), a number or an `Unknown`.
+      At least one parameter must have it.
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+    - `rotation`: (tests,) peak rotation over slenderness of a block that stood, 0 if it was not seen to move (below
+      0.01), NaN where only the verdict is known.
+    - `rotation_sd`: standard deviation of its logarithm, by what was measured and what the model leaves out.
+    - `facing`: 1 if motion and block have the same positive direction in a test, -1 if not, 0 not known: one number or
+      (tests,). Of a symmetric block it changes nothing.
+    - `cells`: of the grid over every parameter, or by its name; the scenes are their product. The grid goes 2.5 of the
+      largest deviation beyond the ranges; `alpha`, `alpha1` and `alpha2` to 0.9 rad, `restitution` to 0 and 1.
+    - `lapse`: share of tests that end either way, whatever the block is: so that one odd test cannot decide all.
+    - `groups`: (tests,) labels of motions for cross-validation, such as the record that was scaled; None: each test.
+    - `folds`: into how many parts the groups are dealt for it; 0: no cross-validation.
+
+    **Returns:** a `BlockCalibration`.
+
+    **Raises:** ValueError for arguments outside their ranges, or that do not go together.
+
+    **Source:** Purvance, Anooshehpoor & Brune (2008), probabilities of toppling; the mixture is an integral over cells.
+    """
+    suite = motions if isinstance(motions, Suite) else Suite(motions)
+    axes = _axes(unknowns, scatter, cells)
+    places = {**unknowns, **{f"{name}_sd": each for name, each in scatter.items() if isinstance(each, Unknown)}}
+    seen, ways, told = _tests(len(suite), toppled, facing, rotation)
+    lanes = _blocks(block, axes)
+    found = scenes(
+        lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
+    )
+    table = Table.of(found, seen, ways, told, rotation_sd, tuple(axis.count for axis in axes.values()))
+    problem = _Problem(dict(places), axes, table, lapse)
+    return _fitted(problem, _dealt(groups, len(suite), folds))
+
+
+def _axes(unknowns, scatter, cells) -> dict[str, Axis]:
+    if not isinstance(unknowns, Mapping) or not unknowns or not all(isinstance(x, Unknown) for x in unknowns.values()):
+        raise ValueError(f"Argument `unknowns` must hold an `Unknown` by name, but is {shown(unknowns)}.")
+    if not isinstance(scatter, Mapping) or not scatter or not set(scatter) <= set(unknowns):
+        raise ValueError(f"Argument `scatter` must hold one or more of {sorted(unknowns)}, but is {shown(scatter)}.")
+    for name, each in scatter.items():
+        if isinstance(each, bool) or not isinstance(each, (Unknown, int, float)):
+            raise ValueError(f"Argument `scatter` must hold numbers or `Unknown`s, but holds {shown(each)}.")
+        if not (float(each.low) if isinstance(each, Unknown) else each) > 0:
+            raise ValueError(f"Argument `scatter` must be positive, but is {shown(each)} for {name!r}.")
+    if isinstance(cells, Mapping) and not set(cells) <= set(unknowns):
+        raise ValueError(f"Argument `cells` must have some of the names {sorted(unknowns)}, but has {sorted(cells)}.")
+    counts = cells if isinstance(cells, Mapping) else dict.fromkeys(unknowns, cells)
+    return {name: Axis.of(name, each, scatter.get(name), counts.get(name, 64)) for name, each in unknowns.items()}
+
+
+def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """What was seen of every test, how it faced, and rotations, if any was."""
+
+    def of_tests(name, value, allowed):
+        array = np.asarray(as_real(name, np.asarray(value, float) if np.asarray(value).dtype == bool else value), float)
+        if array.shape not in ((), (count,)) or not np.isin(array, allowed).all():
+            said = f"hold {', '.join(map(str, allowed))} for each of {count} tests"
+            raise ValueError(f"Argument `{name}` must {said}, but is {shown(value)}.")
+        return np.broadcast_to(array, (count,))
+
+    seen, ways = of_tests("toppled", toppled, (1, 0, -1)), of_tests("facing", facing, (1, 0, -1))
+    if rotation is None:
+        return seen, ways, None
+    told = np.asarray(rotation, float)
+    if told.shape != (count,) or not (np.isnan(told) | (told == 0) | (told >= STILL)).all():
+        raise ValueError(f"Argument `rotation` must hold 0, {STILL} or more, or NaN for each of {count} tests.")
+    if (np.isfinite(told) & (seen == 1)).any():
+        raise ValueError("Argument `rotation` must be NaN for tests that toppled.")
+    return seen, ways, told
+
+
+def _blocks(block: Callable, axes: dict[str, Axis]):
+    """The blocks of all cells, the last parameter changing fastest."""
+    grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
+    try:
+        return jax.vmap(lambda *each: block(**dict(zip(axes, each))))(*(jnp.asarray(x.ravel()) for x in grid))
+    except TypeError as error:
+        raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
+
+
+def _dealt(groups, count: int, folds: int) -> np.ndarray | None:
+    """In which part every test is left out."""
+    labels = np.arange(count) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
+    if labels.shape != (count,):
+        raise ValueError(f"Argument `groups` must hold a label for each of {count} tests, but has {labels.shape}.")
+    number = int(labels.max()) + 1
+    if folds and (folds < 2 or folds > number):
+        raise ValueError(f"Argument `folds` must be 0, or from 2 to the {number} groups, but is {folds}.")
+    return np.random.default_rng(0).permutation(number)[labels] % folds if folds else None
+
+
+def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
+    """The most probable places, their errors, and what fits to other motions say."""
+    place, converged = climbed(problem, _starts(problem))
+    hessian = _curvature(problem, place)
+    ends = np.asarray(problem.ends)
+    at_end = np.any(
+        (place - ends[:, 0] < 1e-4 * np.ptp(ends, axis=1)) | (ends[:, 1] - place < 1e-4 * np.ptp(ends, axis=1))
+    )
+    good = bool(np.all(np.linalg.eigvalsh(hessian) < 0))
+    covariance = np.linalg.inv(-hessian) if good else np.full_like(hessian, np.nan)
+    status = CalibrationStatus.successful if good and converged else CalibrationStatus.not_converged
+    status = CalibrationStatus.at_an_end if at_end else status
+    table = problem.table
+    held_out = np.full(table.seen.shape, np.nan)
+    if part is not None:
+        for number in range(int(part.max()) + 1):
+            other, _ = climbed(problem, [place], jnp.asarray(part != number, float))
+            held_out[part == number] = np.asarray(_probabilities(problem, other, table.toppled))[part == number]
+    bounds = [_probabilities(problem, place, shares) for shares in (table.lower, table.upper)]
+    return BlockCalibration(
+        problem.values(jnp.asarray(place)), jnp.asarray(covariance), _value(problem, place, None)[0],
+        _probabilities(problem, place, table.toppled), jnp.stack(bounds), jnp.asarray(held_out), table.seen, status,
+        problem,
+    )  # fmt: skip
+
+
+def _starts(problem: _Problem) -> list[np.ndarray]:
+    """The best points of a net over the ranges."""
+    ends = np.asarray(problem.ends)
+    side = max(2, int(600 ** (1 / len(ends))))
+    shares = [(np.arange(min(side, 24)) + 0.5) / min(side, 24)] * len(ends)
+    net = np.stack([x.ravel() for x in np.meshgrid(*shares, indexing="ij")], axis=1)
+    points = ends[:, 0] + net * np.ptp(ends, axis=1)
+    heights = np.asarray(_heights(problem, jnp.asarray(points)))
+    return [points[k] for k in np.argsort(-heights)[:_STARTS]]
+
+
+def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[np.ndarray, bool]:
+    """The highest place that is reached from some, within the ranges."""
+    ends = np.asarray(problem.ends)
+
+    def down(place):
+        value, slope = _value(problem, jnp.asarray(place), weights)
+        return -float(value), -np.asarray(slope)
+
+    settings = {"jac": True, "method": "L-BFGS-B", "bounds": ends, "options": {"ftol": 1e-13, "gtol": 1e-7}}
+    found = [scipy.optimize.minimize(down, start, **settings) for start in starts]
+    best = min(found, key=lambda each: each.fun)
+    return best.x, bool(best.success) or float(np.abs(best.jac).max()) < 1e-3
+
+
+@jax.jit
+def _heights(problem, points):
+    return jax.lax.map(problem.log_density, points)
+
+
+@jax.jit
+def _value(problem, place, weights):
+    return jax.value_and_grad(lambda x: problem.log_density(x, weights))(place)
+
+
+@jax.jit
+def _probabilities(problem, place, shares):
+    return problem.probabilities(place, shares)
+
+
+def _curvature(problem, place) -> np.ndarray:
+    return np.asarray(_hessian(problem, jnp.asarray(place)))
+
+
+@jax.jit
+def _hessian(problem, place):
+    return jax.hessian(problem.log_density)(place)

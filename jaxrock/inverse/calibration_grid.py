@@ -1,0 +1,115 @@
+"""The grid of a calibration: cells over each parameter, what a distribution has in each, and what became of scenes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Float
+
+from jaxrock.inverse.unknowns import Unknown
+from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
+
+# What the usual parameters can be (wider blocks than that have no restitution of Housner's).
+_LIMITS = dict.fromkeys(("alpha", "alpha1", "alpha2"), (1e-3, 0.9)) | {"restitution": (0.0, 1.0)}
+STILL = 0.01  # peak rotation over slenderness that is not seen
+_BEYOND = 2.5  # standard deviations for which the grid goes beyond the range of a median
+
+
+class Axis(eqx.Module):
+    """Cells over one parameter, or over its logarithm.
+
+    - `middles`: (cells,) places; `width` of a cell; `deviation`: of the scatter, None where there is none or it is
+      unknown.
+    """
+
+    middles: Float[np.ndarray, " cells"]
+    width: float
+    deviation: float | None
+    is_scattered: bool = eqx.field(static=True)
+    log: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, name: str, unknown: Unknown, scatter, count: int) -> "Axis":
+        """The cells over a range, and what scatter adds to it."""
+        low, high = (float(x) for x in unknown.ends)
+        widest = 0.0 if scatter is None else float(scatter.high) if isinstance(scatter, Unknown) else float(scatter)
+        low, high = low - _BEYOND * widest, high + _BEYOND * widest
+        # Scatter takes no parameter beyond what it can be, nor a median's range there.
+        ends = [
+            np.log(max(end, 1e-300)) if unknown.log else end
+            for end in _LIMITS.get(name, (0.0, np.inf) if unknown.log else (-np.inf, np.inf))
+        ]
+        low, high = max(low, min(ends[0], float(unknown.ends[0]))), min(high, max(ends[1], float(unknown.ends[1])))
+        width = (high - low) / count
+        known = None if scatter is None or isinstance(scatter, Unknown) else float(scatter)
+        return cls(low + width * (np.arange(count) + 0.5), width, known, scatter is not None, unknown.log)
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return self.middles.size
+
+    @property
+    def values(self) -> np.ndarray:
+        """The parameter in the middle of each cell."""
+        return np.exp(self.middles) if self.log else self.middles
+
+    def weights(self, values: dict, name: str) -> Float[Array, " cells"]:
+        """How much of the distribution lies in each cell; what lies beyond the grid is in the cells at its ends.
+
+        Without scatter: of the cells around the value, by the cubic of Catmull and Rom, which has a slope everywhere.
+        """
+        place = jnp.log(values[name]) if self.log else values[name]
+        if not self.is_scattered:
+            x = jnp.abs(jnp.clip(place, self.middles[0], self.middles[-1]) - self.middles) / self.width
+            near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
+            found = jnp.where(x < 1, near, jnp.where(x < 2, far, 0.0))
+            return found / jnp.sum(found)
+        deviation = values[f"{name}_sd"] if self.deviation is None else self.deviation
+        edges = self.middles[:-1] + self.width / 2
+        below = ndtr((edges - place) / deviation)
+        return jnp.diff(jnp.concatenate([jnp.zeros(1), below, jnp.ones(1)]))
+
+
+class Table(eqx.Module):
+    """What the scenes of every test tell, over the cells.
+
+    - `seen`: (tests,) 1, 0 or -1. `toppled`: (tests, cells, ...) share that topples, half of what is undecided; `lower`
+      and `upper`: none, or all of it. `density`: of the logarithm of a rotation that was seen, of what stood.
+    """
+
+    seen: Float[Array, " tests"]
+    toppled: Float[Array, "tests *cells"]
+    lower: Float[Array, "tests *cells"]
+    upper: Float[Array, "tests *cells"]
+    density: Float[Array, "tests *cells"] | None
+    has_rotation: np.ndarray | None
+
+    @classmethod
+    def of(cls, found: Scenes, seen, ways, told, deviation: float, shape: tuple[int, ...]) -> "Table":
+        """From scenes (tests, ways round, cells), and how every test faced."""
+        count = found.verdict.shape[1]
+        turned = np.clip(np.where(ways == 0, 0.5, ways < 0), 0, 1) if count > 1 else np.zeros_like(ways)
+        mix = np.stack([1 - turned, turned][:count], axis=1)
+
+        def mean(values):
+            return jnp.asarray(np.einsum("tw,twc->tc", mix, values).reshape(-1, *shape))
+
+        upper = mean((found.verdict == TOPPLED) | (found.verdict == UNDECIDED))
+        lower = mean(found.verdict == TOPPLED)
+        density, has = None, None
+        if told is not None:
+            has = np.isfinite(told)
+            with np.errstate(all="ignore"):
+                off = (np.log(told)[:, None, None] - np.log(found.rotation)) / deviation
+                density = np.exp(-(off**2) / 2) / (deviation * np.sqrt(2 * np.pi))
+            still = found.rotation < STILL
+            density = mean(np.where((told == 0)[:, None, None], still, np.where(still, 0.0, np.nan_to_num(density))))
+        return cls(jnp.asarray(seen), (lower + upper) / 2, lower, upper, density, has)
+
+
+def weighed(shares: Float[Array, "tests *cells"], weights: list) -> Float[Array, " tests"]:
+    """Means over all axes of cells."""
+    for each in reversed(weights):
+        shares = shares @ each
+    return shares

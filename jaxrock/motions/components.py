@@ -1,0 +1,122 @@
+"""Components of one record: two horizontal ones, and the vertical one."""
+
+import os
+import re
+from collections.abc import Sequence
+from typing import Annotated
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import finite, scalar, shown
+from jaxrock.motions.files.reading import read_record
+from jaxrock.motions.record import Record
+
+_VERTICAL = re.compile(r"\W*(U(P|D|-D|P-DOWN|P/DOWN)?|D(OW|W)N|V(ER\w*)?|..?Z|Z)\W*", re.IGNORECASE)
+
+
+class Components(eqx.Module):
+    """What one station recorded: two horizontal components at right angles, and perhaps the vertical one.
+
+    **Arguments:**
+
+    - `first`, `second`: `Record`s of one time step.
+    - `vertical`: positive upward; None: there is none.
+
+    Of components that are not equally long the ends of the longer ones are cut off.
+
+    **Raises:** ValueError for components of different time steps, or that say that they began at different times.
+    """
+
+    first: Record
+    second: Record
+    vertical: Record | None
+
+    @arguments
+    def __init__(self, first: Record, second: Record, vertical: Record | None = None):
+        parts = [each for each in (first, second, vertical) if each is not None]
+        steps = [float(each.dt) for each in parts]
+        if max(steps) > (1 + 1e-9) * min(steps):
+            raise ValueError(f"Arguments `first`, `second`, `vertical` must have one time step, but have {steps} s.")
+        starts = {each.origin.start for each in parts} - {""}
+        if len(starts) > 1:
+            raise ValueError(
+                f"Arguments `first`, `second`, `vertical` must begin at one time, but begin at {sorted(starts)}."
+            )
+        count = min(each.samples.shape[-1] for each in parts)
+        self.first, self.second, *rest = (
+            Record(each.samples[:count], each.dt, each.name, each.origin) for each in parts
+        )
+        self.vertical = rest[0] if rest else None
+
+    @arguments
+    def along(self, angle: ArrayLike) -> Record:
+        """The horizontal component in one direction.
+
+        **Arguments:**
+
+        - `angle`: from the first component towards the second [rad].
+
+        **Returns:** a `Record`: cos(angle) first + sin(angle) second. `with_vertical(components.vertical)` adds the
+        vertical component.
+
+        **Raises:** ValueError for an angle that is not finite.
+        """
+        angle = scalar("angle", finite("angle", angle))
+        samples = jnp.cos(angle) * self.first.samples + jnp.sin(angle) * self.second.samples
+        name = "" if not self.first.name else f"{self.first.name}, turned"
+        return Record(samples, self.first.dt, name, self.first.origin._replace(component=""))
+
+
+def is_vertical(record: Record) -> bool:
+    """Whether a record says that it is the vertical component."""
+    return bool(_VERTICAL.fullmatch(record.origin.component))
+
+
+def _is_column(value) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0
+
+
+@arguments
+def read_components(
+    paths: str | os.PathLike | Sequence[str | os.PathLike],
+    *,
+    columns: Annotated[
+        Sequence[int] | None, list_of((lambda each: isinstance(each, (int, np.integer))), "columns")
+    ] = None,
+    **given,
+) -> Components:
+    """Read the components of one record together.
+
+    **Arguments:**
+
+    - `paths`: two or three files, one for each component; or one file that holds them all.
+    - `columns`: of one file, which of its columns or channels, two or three; None: the first three.
+    - `given`: `format`, `dt` and `unit`, as in `read_record`.
+
+    Which component is vertical the files say (UP, UD, Z, ...); where they do not, it is the last of three.
+
+    **Returns:** `Components`, the horizontal ones in the order of the files.
+
+    **Raises:** as `read_record`; ValueError for another number of components, for two that say they are vertical, and
+    as `Components`.
+    """
+    if isinstance(paths, (str, os.PathLike)):
+        records = [read_record(paths, column=int(column), **given) for column in (columns or (0, 1, 2))]
+    elif columns is not None:
+        raise ValueError("Argument `columns` must be None where there is a file for each component.")
+    elif not isinstance(paths, Sequence) or len(paths) not in (2, 3):
+        raise ValueError(f"Argument `paths` must be one file, or two or three, but is {shown(paths)}.")
+    else:
+        records = [read_record(path, **given) for path in paths]
+    if len(records) not in (2, 3):
+        raise ValueError(f"Argument `columns` must hold two or three columns, but holds {len(records)}.")
+    upward = [k for k, record in enumerate(records) if is_vertical(record)]
+    if len(upward) > 1 or len(records) == 2 and upward:
+        said = [records[k].origin.component for k in upward]
+        raise ValueError(f"Argument `paths` must hold two horizontal components, but {said} are vertical.")
+    vertical = records.pop(upward[0] if upward else 2) if len(records) == 3 else None
+    return Components(*records, vertical)

@@ -1,0 +1,97 @@
+"""SMC, the format of the USGS: eleven lines of text, numbers of two headers in fixed places, comments, samples."""
+
+import functools
+import re
+
+from jaxrock._text import check_end, file_error
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import (
+    agreed_step,
+    agreed_unit,
+    announced_samples,
+    check_peak,
+    fixed_numbers,
+    no_column,
+    numbers_of_width,
+)
+from jaxrock.motions.record import Origin
+
+_TEXT, _WHOLE, _REAL = 11, 6, 10  # lines of each header
+_FIRST = re.compile(r"^\s*([0-9])\s+((?:UN)?CORRECTED ACCELEROGRAM|VELOCITY|DISPLACEMENT|.*SPECTR\w+)", re.IGNORECASE)
+_COMMENTS, _COUNT = 15, 16  # places among the whole numbers
+_RATE, _LARGEST, _SMALLEST = 1, 29, 31  # places among the real numbers: samples a second, peaks [cm/s2]
+_UNKNOWN = 1e38
+_WIDTH = 10
+
+
+class SMC(AbstractFormat):
+    """SMC of the USGS, in cm/s^2."""
+
+    name = "smc"
+    suffixes = (".smc",)
+
+    def recognises(self, lines):
+        return len(lines) > 28 and bool(_FIRST.match(lines[0])) and _whole(lines) is not None
+
+    def read(self, name, lines, dt, unit, column):
+        no_column(name, column, "SMC")
+        kind = _FIRST.match(lines[0])
+        if not kind or len(lines) < _TEXT + _WHOLE + _REAL:
+            raise file_error(name, "line 1 does not say what the file holds, as an SMC file must.")
+        if "ACCELEROGRAM" not in kind[2].upper():
+            raise file_error(name, f"line 1 states {kind[2].lower()}, but samples must be accelerations.")
+        whole, real = _whole(lines), _real(lines)
+        if whole is None or real is None:
+            raise file_error(name, "lines 12 to 27 should hold the numbers of an SMC file's headers.")
+        if not 0 < real[_RATE] < _UNKNOWN:
+            raise file_error(name, f"line {_TEXT + _WHOLE + 1} states {real[_RATE]:g} samples a second.")
+        unit = agreed_unit(name, 1, unit, "cm/s2")
+        start = _TEXT + _WHOLE + _REAL + max(whole[_COMMENTS], 0)
+        if any(not line.startswith("|") for line in lines[_TEXT + _WHOLE + _REAL : start]):
+            raise file_error(name, f"header announces {whole[_COMMENTS]} lines of comments, which are not there.")
+        samples = announced_samples(
+            name,
+            lines,
+            start,
+            whole[_COUNT],
+            lambda line: fixed_numbers(line, _WIDTH),
+            functools.partial(numbers_of_width, width=_WIDTH),
+        )
+        last = next(line for line in reversed(lines) if line.strip()).rstrip()
+        check_end(name, lines, [lines[start][:_WIDTH]] * 2 + [last[-_WIDTH:]], by_program=True)
+        peaks = [abs(real[place]) for place in (_LARGEST, _SMALLEST) if abs(real[place]) < _UNKNOWN]
+        if peaks:
+            check_peak(name, 18, max(peaks), samples, "the header")
+        origin = _origin(lines[:_TEXT])
+        title = ", ".join(filter(None, (origin.event, origin.station, origin.component)))
+        return Accelerogram(samples, agreed_step(name, dt, 1 / real[_RATE]), unit, title, origin)
+
+
+def _whole(lines: list[str]) -> list[int] | None:
+    """The 48 whole numbers."""
+    rows = [line.rstrip() for line in lines[_TEXT : _TEXT + _WHOLE]]
+    if any(len(row) % _WIDTH or not re.fullmatch(r"[\s\d-]+", row) for row in rows):
+        return None
+    fields = [row[k : k + _WIDTH].strip() for row in rows for k in range(0, len(row), _WIDTH)]
+    if len(fields) != 48 or not all(re.fullmatch(r"-?\d+", field) for field in fields):
+        return None
+    return [int(field) for field in fields]
+
+
+def _real(lines: list[str]) -> list[float] | None:
+    """The 50 real numbers."""
+    rows = [fixed_numbers(line, 15) for line in lines[_TEXT + _WHOLE : _TEXT + _WHOLE + _REAL]]
+    return None if None in rows or sum(map(len, rows)) != 50 else [x for row in rows for x in row]
+
+
+def _origin(lines: list[str]) -> Origin:
+    """What the lines of text say: they have fixed places."""
+    station = re.match(r"\s*station\s*=\s*(.*?)(?:,\s*\S*\s*component\s*=\s*(.*))?$", lines[5].rstrip(), re.IGNORECASE)
+    time = re.match(r"\s*(\d+\s+\d+\s+\d+\s+\d+)\s+(.*)", lines[3].rstrip())
+    return Origin(
+        " ".join(time[2].split()) if time else "",
+        " ".join(station[1].split()) if station else "",
+        " ".join((station[2] or "").split()) if station else "",
+        " ".join(time[1].split()) if time else "",
+        lines[2].strip(),
+    )

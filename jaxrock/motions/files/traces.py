@@ -1,0 +1,35 @@
+"""Traces of ObsPy as records; ObsPy is not imported: a trace brings what is needed."""
+
+from typing import Annotated, Any
+
+import numpy as np
+
+from jaxrock._arguments import arguments, word_of
+from jaxrock._checks import shown
+from jaxrock.motions.files.parsing import PER_G
+from jaxrock.motions.record import Origin, Record
+
+
+@arguments
+def record_of_trace(trace: Any, unit: Annotated[str, word_of(*PER_G)]) -> Record:
+    """A trace of ObsPy as a record: `[rk.record_of_trace(trace, "m/s2") for trace in stream]`.
+
+    **Arguments:**
+
+    - `trace`: an `obspy.Trace` of accelerations without gaps, its instrument's response removed.
+    - `unit`: of its samples, which a trace does not tell: "g", "m/s2" or "cm/s2".
+
+    **Returns:** a `Record`, whose `origin` is what the trace says of its station, channel and start.
+
+    **Raises:** ValueError for what is no trace, for one with gaps, or with samples that are not finite.
+    """
+    stats, data = getattr(trace, "stats", None), getattr(trace, "data", None)
+    if stats is None or data is None or not hasattr(stats, "delta"):
+        raise ValueError(f"Argument `trace` must be a trace of ObsPy, but is {shown(trace)}.")
+    if np.ma.is_masked(data):
+        raise ValueError("Argument `trace` must have no gaps, but has: fill or cut them first.")
+    told = [str(getattr(stats, name, "") or "") for name in ("network", "station", "location", "channel")]
+    code = ".".join(told[:2]).strip(".")
+    origin = Origin("", code, told[3], str(getattr(stats, "starttime", "") or ""), told[1], "obspy", unit, "")
+    samples = np.asarray(np.ma.getdata(data), float) / PER_G[unit]
+    return Record(samples, float(stats.delta), ".".join(told).strip("."), origin)

@@ -1,0 +1,276 @@
+"""What is done to records before they shake anything: from displacement and velocity, baseline, taper, filter,
+resample, cut, scale. Known records only: NumPy and SciPy do it, not JAX.
+
+Every function gives a new `Record` that keeps the name and the origin.
+"""
+
+from fractions import Fraction
+from typing import Annotated
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+from jaxtyping import ArrayLike
+
+from jaxrock._arguments import arguments, at_least, known, word_of
+from jaxrock._checks import Values, factor as any_factor, finite, not_negative, positive, scalar, size, strength
+from jaxrock._parameters import check_single
+from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.record import Record
+
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def _samples(record: Record) -> tuple[np.ndarray, float]:
+    check_single(record=record)
+    return np.asarray(record.samples, float), float(record.dt)
+
+
+def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Record:
+    return Record(samples, record.dt if dt is None else dt, record.name, record.origin)
+
+
+def _smoothed(values: np.ndarray, dt: float, corner: float | None, order: int) -> np.ndarray:
+    """After a low-pass without delay; where the ground is at either end it stays."""
+    return values if corner is None else _butterworth(values, dt, None, corner, order, True, "edge")
+
+
+def _butterworth(values, dt, low, high, order, zero_phase, beyond="constant") -> np.ndarray:
+    edges = [edge for edge in (low, high) if edge is not None]
+    kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
+    sections = scipy.signal.butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / dt, output="sos")
+    if not zero_phase:
+        return scipy.signal.sosfilt(sections, values)
+    room = int(min(values.size - 1, np.ceil(3 * order / (min(edges) * dt))))
+    longer = np.pad(values, room, beyond)  # by default the ground rests before and after
+    return scipy.signal.sosfiltfilt(sections, longer, padtype=None)[room : room + values.size]
+
+
+def _corner(name: str, value: float | None, dt: float) -> float | None:
+    if value is not None and not 0 < value < 0.5 / dt:
+        raise ValueError(
+            f"Argument `{name}` must be above 0 and below half the sampling rate, {0.5 / dt:g} Hz, but is {value}."
+        )
+    return value
+
+
+Corner = Annotated[float | None, known(positive)]
+Order = Annotated[int, at_least(1, 20)]
+
+
+def _series(name: str, values: Values, dt: ArrayLike, unit: str) -> tuple[np.ndarray, float]:
+    array = np.asarray(strength(name, values), float)
+    if array.ndim != 1 or array.size < 4:
+        raise ValueError(f"Argument `{name}` must be a list of at least 4 samples, but has shape {array.shape}.")
+    return array * _UNITS[unit], float(scalar("dt", size("dt", dt)))
+
+
+@arguments
+def from_displacement(
+    displacement: Values,
+    dt: ArrayLike,
+    *,
+    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    corner: Corner = None,
+    order: Order = 4,
+    name: str = "",
+) -> Record:
+    """A record from the ground's displacement, such as a shake table's.
+
+    **Arguments:**
+
+    - `displacement`: (n,) samples, n at least 4; the ground is at rest at first.
+    - `dt`: time between samples [s], positive.
+    - `unit`: of the displacement: "m", "cm" or "mm".
+    - `corner`: of a Butterworth low-pass of this `order`, run forwards and backwards before it is differentiated [Hz];
+      None: no filter, and noise grows with the square of the frequency.
+    - `name`: of the record.
+
+    **Returns:** a `Record`: the second derivative of the cubic spline through the samples, which is at rest at first
+    and straight between samples. So integrated twice it comes back to every sample. Over 9.81 m/s^2.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    values, dt = _series("displacement", displacement, dt, unit)
+    values = _smoothed(values - values[0], dt, _corner("corner", corner, dt), order)
+    spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values, bc_type=((1, 0.0), "not-a-knot"))
+    return Record(spline(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
+
+
+@arguments
+def from_velocity(
+    velocity: Values,
+    dt: ArrayLike,
+    *,
+    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    corner: Corner = None,
+    order: Order = 4,
+    name: str = "",
+) -> Record:
+    """A record from the ground's velocity.
+
+    **Arguments:**
+
+    - `velocity`: (n,) samples, n at least 4.
+    - `dt`, `corner`, `order`, `name`: as in `from_displacement`.
+    - `unit`: "m", "cm" or "mm", a second.
+
+    **Returns:** a `Record`: the first derivative of the cubic spline through the samples, at the samples. Over 9.81
+    m/s^2.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    values, dt = _series("velocity", velocity, dt, unit)
+    values = _smoothed(values, dt, _corner("corner", corner, dt), order)
+    spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
+    return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
+
+
+@arguments
+def baseline_corrected(record: Record, degree: Annotated[int, at_least(1, 10)] = 2) -> Record:
+    """A record without the drift of its velocity: the derivative of a polynomial fitted to the velocity is taken off.
+
+    **Arguments:**
+
+    - `record`: a `Record` of two samples or more.
+    - `degree`: of the polynomial in velocity, which is zero at time 0; 1 takes a constant off the acceleration.
+
+    **Returns:** a `Record`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    samples, dt = _samples(record)
+    if samples.size <= degree:
+        raise ValueError(f"Argument `record` must have more samples than `degree`, {degree}, but has {samples.size}.")
+    time = np.linspace(0.0, 1.0, samples.size)
+    velocity = np.concatenate([[0.0], np.cumsum((samples[1:] + samples[:-1]) / 2)]) / max(samples.size - 1, 1)
+    powers = np.arange(1, degree + 1)
+    terms = np.linalg.lstsq(time[:, None] ** powers, velocity, rcond=None)[0]
+    return _like(record, samples - (powers * terms * time[:, None] ** (powers - 1)).sum(axis=1))
+
+
+@arguments
+def tapered(record: Record, seconds: ArrayLike) -> Record:
+    """A record that rises from zero and falls to zero as half a cosine.
+
+    **Arguments:**
+
+    - `seconds`: how long either end takes [s], 0 or more, at most half the record.
+
+    **Returns:** a `Record`: times Tukey's window.
+
+    **Raises:** ValueError for arguments outside their ranges.
+    """
+    samples, dt = _samples(record)
+    seconds, whole = float(scalar("seconds", not_negative("seconds", seconds))), (samples.size - 1) * dt
+    if 2 * seconds > whole:
+        raise ValueError(f"Argument `seconds` must be at most half the record, {whole / 2:g} s, but is {seconds}.")
+    return _like(record, samples * scipy.signal.windows.tukey(samples.size, 2 * seconds / whole if whole else 0.0))
+
+
+@arguments
+def filtered(
+    record: Record, low: Corner = None, high: Corner = None, *, order: Order = 4, zero_phase: bool = True
+) -> Record:
+    """A record after a Butterworth filter.
+
+    **Arguments:**
+
+    - `low`, `high`: frequencies that pass [Hz], above and below which; None: no such end. One of them at least.
+    - `order`: of the filter.
+    - `zero_phase`: whether it runs forwards and backwards (which doubles its order); the ground rests before and after.
+
+    **Returns:** a `Record`.
+
+    **Raises:** ValueError for corners that are not in order, or not below half the sampling rate.
+    """
+    samples, dt = _samples(record)
+    low, high = _corner("low", low, dt), _corner("high", high, dt)
+    if low is None and high is None:
+        raise ValueError("Arguments `low` and `high` must not both be None.")
+    if low is not None and high is not None and low >= high:
+        raise ValueError(f"Argument `high` must be above `low`, {low} Hz, but is {high}.")
+    return _like(record, _butterworth(samples, dt, low, high, order, zero_phase))
+
+
+@arguments
+def resampled(record: Record, dt: ArrayLike) -> Record:
+    """A record with another time step.
+
+    **Arguments:**
+
+    - `dt`: the new time step [s], positive.
+
+    **Returns:** a `Record`. With a shorter step it lies on the old one's straight lines; with a step that is a whole
+    number of times shorter it is the same motion. With a longer step it has passed a linear-phase low-pass below half
+    the new sampling rate first (`scipy.signal.resample_poly`).
+
+    **Raises:** ValueError for arguments outside their ranges, or a longer step that is no ratio of small numbers.
+    """
+    samples, old = _samples(record)
+    new = float(scalar("dt", size("dt", dt)))
+    if new <= old:
+        time = new * np.arange(int(np.floor((samples.size - 1) * old / new * (1 + 1e-12))) + 1)
+        return _like(record, np.interp(time, old * np.arange(samples.size), samples), new)
+    ratio = Fraction(old / new).limit_denominator(1000)
+    if ratio == 0 or abs(float(ratio) * new / old - 1) > 1e-9:
+        raise ValueError(f"Argument `dt` must be to the old step, {old:g} s, as small whole numbers are, but is {new}.")
+    return _like(record, scipy.signal.resample_poly(samples, ratio.numerator, ratio.denominator), new)
+
+
+@arguments
+def cut(record: Record, begin: ArrayLike = 0.0, end: ArrayLike | None = None) -> Record:
+    """The part of a record between two times, from the sample at or after the first to that at or before the second.
+
+    **Arguments:**
+
+    - `begin`, `end`: times [s]; `end` None: the record's.
+
+    **Returns:** a `Record` that begins at time 0.
+
+    **Raises:** ValueError for a part without samples.
+    """
+    samples, dt = _samples(record)
+    begin = float(scalar("begin", not_negative("begin", begin)))
+    end = (samples.size - 1) * dt if end is None else float(scalar("end", finite("end", end)))
+    first, last = int(np.ceil(begin / dt - 1e-9)), int(np.floor(min(end / dt, samples.size) + 1e-9))
+    part = samples[first : last + 1]
+    if last < first or part.size == 0:
+        raise ValueError(f"Arguments `begin` and `end` must leave a sample, but are {begin:g} and {end:g} s.")
+    return _like(record, part)
+
+
+@arguments
+def scaled(
+    record: Record,
+    factor: ArrayLike | None = None,
+    *,
+    acceleration: ArrayLike | None = None,
+    velocity: ArrayLike | None = None,
+) -> Record:
+    """A record times a factor, or to a peak.
+
+    **Arguments:** one of
+
+    - `factor`: any number.
+    - `acceleration`: peak acceleration that it gets [g], positive.
+    - `velocity`: peak velocity that it gets [m/s], positive.
+
+    **Returns:** a `Record`.
+
+    **Raises:** ValueError where not just one is given, and for a peak that a record which does not move cannot get.
+    """
+    samples, _ = _samples(record)
+    given = {"factor": factor, "acceleration": acceleration, "velocity": velocity}
+    given = {name: value for name, value in given.items() if value is not None}
+    if len(given) != 1:
+        raise ValueError("Just one of the arguments `factor`, `acceleration` and `velocity` must be given.")
+    ((name, value),) = given.items()
+    if name == "factor":
+        return _like(record, samples * float(scalar(name, any_factor(name, value))))
+    value = float(scalar(name, positive(name, value)))
+    peak = float((peak_acceleration if name == "acceleration" else peak_velocity)(record))
+    if not peak > 0:
+        raise ValueError("Argument `record` must move, but does not.")
+    return _like(record, samples * (value / peak))

@@ -1,0 +1,82 @@
+"""The scenes of a suite: every motion at many scales, both ways round, on many blocks.
+
+Motions go one after the other, the scenes of one all at once: they share its samples. Records get room for as many
+samples as the next power of two, so that a few programs serve a suite of any lengths.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrock._parameters import one_of_many
+from jaxrock._progress import Progress
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.motion import Scaled
+from jaxrock.motions.record import with_room
+from jaxrock.motions.suite import Suite
+from jaxrock.responses.current_model import current_model
+from jaxrock.responses.outcome import outcome
+from jaxrock.status import Status
+
+STOOD, TOPPLED, UNDECIDED = 0, 1, -1
+
+
+class Scenes(NamedTuple):
+    """What became of them: arrays (motions, factors, blocks).
+
+    - `verdict`: 1 toppled, 0 stood, -1 undecided.
+    - `rotation`: peak rotation over slenderness (of an asymmetric block over the smaller one); infinite if it toppled,
+      NaN where undecided.
+    - `margin`: as in `Outcome`; NaN where undecided.
+    """
+
+    verdict: np.ndarray
+    rotation: np.ndarray
+    margin: np.ndarray
+
+
+def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
+    """A block with parameters of shape (draws,)."""
+    shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for leaf in jax.tree.leaves(block)))
+    if len(shape) > 1:
+        raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), block)
+
+
+def scenes(
+    blocks: Block | AsymmetricBlock, suite: Suite, factors: np.ndarray, model: AbstractEquation, engine, progress
+) -> Scenes:
+    """Stacked blocks under every motion of a suite times its factors, (motions, factors) or (factors,) for all."""
+    factors = np.broadcast_to(factors, (len(suite), np.shape(factors)[-1]))
+    draws, count = jax.tree.leaves(blocks)[0].shape[0], factors.shape[1]
+    # Neighbours differ by the factor: they move alike.
+    lanes = jax.tree.map(lambda x: jnp.repeat(x, count), blocks)
+    model = current_model(model, lanes, next(suite.motions()), factors)
+    bar = Progress(factors.size * draws, "suite", progress)
+    found = []
+    for motion, row in zip(suite.motions(), factors):
+        found.append(_of_one(with_room(motion), lanes, jnp.tile(jnp.asarray(row), draws), model, engine))
+        bar.add(count * draws)
+    shape = len(suite), draws, count
+    parts = (np.stack([np.asarray(x) for x in part]).reshape(shape).swapaxes(1, 2) for part in zip(*found))
+    return Scenes(*parts)
+
+
+@jax.jit
+def _of_one(motion, blocks, factors, model, engine) -> Scenes:
+    """All scenes of one motion, side by side."""
+
+    def one(lane, factor):
+        block = one_of_many(blocks, lane)
+        result = outcome(block, Scaled(motion, factor), model, engine=engine)
+        alpha = jnp.minimum(block.alpha1, block.alpha2) if isinstance(block, AsymmetricBlock) else block.alpha
+        good = result.status == Status.successful
+        verdict = jnp.where(good, jnp.where(result.overturned, TOPPLED, STOOD), UNDECIDED).astype(jnp.int8)
+        rotation, margin = (jnp.where(good, x, jnp.nan) for x in (result.max_rotation / alpha, result.margin))
+        return Scenes(verdict, rotation, margin)
+
+    return jax.vmap(one)(jnp.arange(factors.size), factors)

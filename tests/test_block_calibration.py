@@ -1,0 +1,143 @@
+"""A block from verdicts under known motions: the truth is found again, and the likelihood is smooth."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.stats
+
+import jaxrock as rk
+
+RANDOM = np.random.default_rng(1)
+COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
+MOTIONS = [rk.SinePulse(a, t) for a, t in zip(RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT))]
+SUITE = rk.Suite(MOTIONS)
+TRUE = ALPHA * np.exp(SCATTER * RANDOM.normal(size=COUNT))
+UNKNOWN, SPREAD = rk.Unknown(0.05, 0.5), rk.Unknown(0.05, 0.8)
+POINT = {"alpha": 0.18, "alpha_sd": 0.2}
+
+
+def verdicts(seed):
+    """What blocks do, each drawn for its test: peak rotation over its slenderness too."""
+    true = ALPHA * np.exp(SCATTER * np.random.default_rng(seed).normal(size=COUNT))
+
+    def one(alpha, amplitude, period):
+        result = rk.outcome(rk.Block(alpha, P), rk.SinePulse(amplitude, period))
+        return result.overturned, result.max_rotation / alpha
+
+    amplitudes, periods = np.array([[m.amplitude, m.period] for m in MOTIONS]).T
+    fell, rotation = jax.jit(jax.vmap(one))(true, amplitudes, periods)
+    return np.asarray(fell), np.asarray(rotation)
+
+
+FELL, ROTATION = verdicts(5)
+
+
+@pytest.fixture(scope="module")
+def found():
+    make = lambda alpha: rk.Block(alpha, P)
+    return rk.calibrate_block(make, SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=128, folds=10,
+                              progress=False)  # fmt: skip
+
+
+def test_the_truth_is_found_again(found):
+    assert found.status == rk.CalibrationStatus.successful
+    for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
+        off = np.log(float(found.values[name]) / truth) / float(found.standard_errors[name])
+        assert abs(off) < 2.5
+        assert 0.005 < float(found.standard_errors[name]) < 0.25
+
+
+@pytest.mark.parametrize("name", ["alpha", "alpha_sd"])
+def test_slopes_of_the_likelihood_by_differences(found, name):
+    slope = float(jax.grad(found.log_density)(POINT)[name])
+    step = 1e-5 * POINT[name]
+    ends = [float(found.log_density({**POINT, name: POINT[name] + sign * step})) for sign in (1, -1)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
+
+
+@pytest.mark.parametrize("test", [3, 57, 140])
+def test_a_probability_is_the_share_of_the_distribution_that_topples(found, test):
+    """By intervals whose ends are found by halving: the grid knows them to a cell."""
+    alphas = np.linspace(0.03, 0.8, 400)
+    fell = lambda alpha: bool(rk.outcome(rk.Block(alpha, P), MOTIONS[test]).overturned)
+    lost = np.asarray(jax.jit(jax.vmap(lambda a: rk.outcome(rk.Block(a, P), MOTIONS[test]).overturned))(alphas))
+    law, share = scipy.stats.lognorm(float(found.values["alpha_sd"]), scale=float(found.values["alpha"])), 0.0
+    edges = np.flatnonzero(np.diff(lost.astype(int)))
+    share = law.cdf(alphas[0]) if lost[0] else 0.0
+    for edge in edges:
+        low, high = alphas[edge], alphas[edge + 1]
+        for _ in range(12):
+            middle = (low + high) / 2
+            low, high = (middle, high) if fell(middle) == lost[edge] else (low, middle)
+        share += law.cdf(low) if lost[edge] else -law.cdf(low)
+    assert (float(found.probability[test]) - 0.005) / 0.99 == pytest.approx(share, abs=0.02)
+
+
+def test_diagnostics(found):
+    toppled, chosen = np.asarray(found.toppled), np.asarray(found.probability)
+    pairs = [(a > b) + 0.5 * (a == b) for a in chosen[toppled == 1] for b in chosen[toppled == 0]]
+    assert found.auc() == pytest.approx(np.mean(pairs), rel=1e-12)
+    assert 0.8 < found.auc(held_out=True) <= found.auc() + 0.01
+    curve = found.curve(5)
+    assert curve["tests"].sum() == COUNT
+    assert np.abs(curve["probability"] - curve["toppled"]).max() < 0.2
+    odd = found.disagreeing(0.2)
+    as_it_was = np.where(toppled == 1, chosen, 1 - chosen)
+    assert set(odd) == set(np.flatnonzero(as_it_was < 0.2))
+    assert (np.asarray(found.bounds[0]) <= chosen).all() and (chosen <= np.asarray(found.bounds[1])).all()
+
+
+def test_rotations_say_more_than_verdicts(found):
+    noisy = ROTATION * np.exp(0.2 * RANDOM.normal(size=COUNT))
+    seen = np.where(FELL, np.nan, np.where(noisy < 0.01, 0.0, noisy))
+    more = rk.calibrate_block(lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
+                              cells=128, rotation=seen, rotation_sd=0.2, progress=False)  # fmt: skip
+    assert more.status == rk.CalibrationStatus.successful
+    for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
+        assert float(more.standard_errors[name]) < float(found.standard_errors[name])
+        assert abs(np.log(float(more.values[name]) / truth)) < 3 * float(more.standard_errors[name])
+
+
+def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
+    make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)
+    ways = np.where(np.random.default_rng(2).random(12) < 0.5, 1, -1)
+    fell = [bool(rk.outcome(make(TRUE[k], P), int(way) * MOTIONS[k]).overturned) for k, way in enumerate(ways)]
+    unknowns = {"alpha": UNKNOWN, "p": rk.Unknown(1.5, 6.0)}
+    given = {"cells": {"alpha": 24, "p": 8}, "progress": False}
+    for facing in (ways, 0):
+        fit = rk.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
+        assert set(fit.values) == {"alpha", "p"}
+        assert np.isfinite(fit.probability).all()
+    turned = rk.calibrate_block(make, [-m for m in MOTIONS[:12]], fell, unknowns, {"alpha": 0.3}, facing=-ways,
+                                **given)  # fmt: skip
+    known = rk.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=ways, **given)
+    np.testing.assert_allclose(turned.probability, known.probability, atol=1e-6)
+    step = 1e-5
+    point = {"alpha": 0.21, "p": 2.7}
+    slope = float(jax.grad(known.log_density)(point)["p"])
+    ends = [float(known.log_density({**point, "p": 2.7 + sign * step})) for sign in (1, -1)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"toppled": [1, 0]}, "`toppled` must hold 1, 0, -1 for each of 1 tests"),
+        ({"toppled": [2]}, "`toppled` must hold"),
+        ({"unknowns": {}}, "`unknowns` must hold"),
+        ({"scatter": {}}, "`scatter` must hold one or more"),
+        ({"scatter": {"p": 0.1}}, "`scatter` must hold one or more"),
+        ({"scatter": {"alpha": -0.1}}, "`scatter` must be positive"),
+        ({"facing": 2}, "`facing` must hold"),
+        ({"rotation": [0.5]}, "`rotation` must be NaN for tests that toppled"),
+        ({"folds": 5}, "`folds` must be 0, or from 2 to the 1 groups"),
+        ({"cells": {"q": 9}}, "`cells` must have some of the names"),
+        ({"block": lambda beta: rk.Block(beta, 2.0)}, "`block` must make a block of"),
+    ],
+)
+def test_what_is_refused(given, message):
+    good = {"block": lambda alpha: rk.Block(alpha, P), "motions": MOTIONS[:1], "toppled": [1],
+            "unknowns": {"alpha": UNKNOWN}, "scatter": {"alpha": SPREAD}, "progress": False}  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        rk.calibrate_block(**good | given)

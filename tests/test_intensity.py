@@ -1,0 +1,161 @@
+"""Measures of intensity: closed forms of harmonic pulses, direct quadrature, and another integrator of oscillators."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid, quad, solve_ivp
+
+import jaxrock as rk
+
+G, A, T = 9.81, 0.3, 0.8
+SINE = rk.SinePulse(A, T)
+NOISE = np.random.default_rng(3).normal(0, 0.2, 400)
+RECORD = rk.Record(NOISE, 0.02)
+
+
+def lines(time):
+    return G * np.interp(time, 0.02 * np.arange(NOISE.size), NOISE)
+
+
+@pytest.mark.parametrize(
+    "measure, expected",
+    [
+        pytest.param(rk.intensity.peak_displacement, A * G * T**2 / (2 * np.pi), id="PGD"),
+        pytest.param(rk.intensity.velocity_to_acceleration, T / np.pi, id="PGV/PGA"),
+        pytest.param(rk.intensity.arias, np.pi / (2 * G) * (A * G) ** 2 * T / 2, id="Arias"),
+        pytest.param(rk.intensity.cumulative_absolute_velocity, A * G * T * 2 / np.pi, id="CAV"),
+        pytest.param(lambda m: rk.intensity.uplift_ratio(m, rk.Block(0.2, 2.0)), A / np.tan(0.2), id="PGA/(g tan)"),
+        pytest.param(
+            lambda m: rk.intensity.velocity_ratio(m, rk.Block(0.2, 2.0)),
+            2.0 * A * T / np.pi / np.tan(0.2),
+            id="p PGV/(g tan)",
+        ),
+    ],
+)
+def test_of_a_sine_pulse(measure, expected):
+    assert measure(SINE) == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("name, power", [("arias", 2), ("cumulative_absolute_velocity", 1), ("peak_displacement", 1),
+                                         ("velocity_to_acceleration", 0), ("significant_duration", 0)])  # fmt: skip
+def test_of_a_motion_twice_as_strong(name, power):
+    measure = getattr(rk.intensity, name)
+    assert measure(2.0 * SINE) == pytest.approx(2.0**power * measure(SINE), rel=1e-12)
+
+
+def test_significant_duration_of_a_sine_pulse():
+    """The share of Arias intensity by t is t/T - sin(4 pi t/T)/(4 pi)."""
+    ends = [rk.intensity.significant_duration(SINE, 1e-9, share) for share in (0.05, 0.95)]
+    begin = rk.intensity.significant_duration(SINE, 1e-9, 0.25) - T / 4  # by how much the first share is late
+    found = (np.array(ends) - begin) / T
+    np.testing.assert_allclose(found - np.sin(4 * np.pi * found) / (4 * np.pi), [0.05, 0.95], atol=1e-7)
+    assert rk.intensity.significant_duration(SINE) == pytest.approx(np.diff(ends)[0], rel=1e-9)
+
+
+def test_of_a_record_by_quadrature():
+    """Each line by itself: quadrature knows nothing of closed forms."""
+    time = 0.02 * np.arange(NOISE.size)
+
+    def summed(function):
+        return sum(quad(function, a, b, epsabs=1e-13, limit=200)[0] for a, b in zip(time[:-1], time[1:]))
+
+    assert rk.intensity.arias(RECORD) == pytest.approx(np.pi / (2 * G) * summed(lambda t: lines(t) ** 2), rel=1e-10)
+    cav = summed(lambda t: abs(lines(t)))
+    assert rk.intensity.cumulative_absolute_velocity(RECORD) == pytest.approx(cav, rel=1e-6)
+    fine = np.linspace(0, time[-1], 100 * (NOISE.size - 1) + 1)
+    place = cumulative_trapezoid(cumulative_trapezoid(lines(fine), fine, initial=0), fine, initial=0)
+    found = np.abs(place).max()
+    assert rk.intensity.peak_displacement(RECORD) == pytest.approx(found, rel=1e-6)
+
+
+def test_peak_displacement_lies_between_samples():
+    """Speed up, slow down, stop: the ground turns back within one line."""
+    record = rk.Record([1.0, 1.0, -3.0, -3.0], 1.0)
+    velocity, place = G * 1.0, G * 0.5
+    # Then a = 1 - 4 t: v = 1 + t - 2 t^2 is zero at t = 1.
+    assert rk.intensity.peak_displacement(record) == pytest.approx(place + velocity + G * (0.5 - 4 / 6), rel=1e-12)
+
+
+@pytest.mark.parametrize("period, damping", [(0.25, 0.05), (0.05, 0.05), (0.9, 0.0), (3.0, 0.2)])
+def test_spectra_by_another_integrator(period, damping):
+    omega, end = 2 * np.pi / period, 0.02 * (NOISE.size - 1)
+
+    def slope(t, y):
+        return [y[1], -2 * damping * omega * y[1] - omega**2 * y[0] - (lines(t) if t < end else 0.0)]
+
+    found = solve_ivp(slope, (0, end + period), [0, 0], "DOP853", max_step=0.005, rtol=1e-9, atol=1e-12,
+                      dense_output=True)  # fmt: skip
+    place, speed = np.abs(found.sol(np.linspace(0, end + period, 200_001))).max(axis=1)
+    assert rk.intensity.spectral_acceleration(RECORD, period, damping) == pytest.approx(omega**2 * place / G, rel=1e-6)
+    assert rk.intensity.spectral_velocity(RECORD, period, damping) == pytest.approx(omega * place, rel=1e-6)
+    relative = rk.intensity.spectral_velocity(RECORD, period, damping, pseudo=False)
+    assert relative == pytest.approx(speed, rel=1e-4)
+
+
+@pytest.mark.parametrize("period", [0.9, 1.5, 6.0])
+def test_residual_spectrum_of_a_half_sine(period):
+    """Undamped, longer than two pulses: the peak is that of the free vibration after it (Chopra, 4.8.3)."""
+    duration, b = 0.4, period / 0.8
+    expected = A * abs(2 * b * np.cos(np.pi * duration / period) / (b**2 - 1))
+    found = rk.intensity.spectral_acceleration(rk.HalfSinePulse(A, duration), period, 0.0)
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
+def test_long_and_short_oscillators():
+    """A stiff one moves with the ground, of a soft one the mass stays where it is."""
+    record = rk.example_record()
+    peak = float(rk.peak_acceleration(record))
+    assert rk.intensity.spectral_acceleration(record, 0.004) == pytest.approx(peak, rel=2e-3)
+    soft = rk.intensity.spectral_velocity(rk.SinePulse(A, T), 1000.0, 0.0) * 1000.0 / (2 * np.pi)
+    assert soft == pytest.approx(A * G * T**2 / (2 * np.pi), rel=1e-3)
+
+
+def test_average_spectral_acceleration():
+    periods = [0.2, 0.5, 1.0]
+    each = rk.intensity.spectral_acceleration(RECORD, periods)
+    assert each.shape == (3,)
+    average = rk.intensity.average_spectral_acceleration(RECORD, periods)
+    assert average == pytest.approx(each.prod() ** (1 / 3), rel=1e-12)
+
+
+def test_mean_period_of_a_long_sine():
+    record = rk.Record(np.sin(2 * np.pi * np.arange(40_000) * 0.005 / 0.5), 0.005)
+    assert rk.intensity.mean_period(record) == pytest.approx(0.5, rel=3e-3)
+
+
+def test_a_motion_made_of_pulses():
+    """A pulse, a pause and its mirror image: every sum is twice that of one."""
+    both = SINE + (-SINE).shifted(2.0)
+    assert rk.intensity.arias(both) == pytest.approx(2 * rk.intensity.arias(SINE), rel=1e-6)
+    assert rk.intensity.peak_displacement(both) == pytest.approx(rk.intensity.peak_displacement(SINE), rel=1e-6)
+
+
+def test_a_drifting_baseline_warns():
+    steady = rk.example_record()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rk.peak_velocity(steady)
+        rk.peak_velocity(rk.HalfSinePulse(A, T))  # which is meant
+    drifting = rk.Record(steady.samples + 0.02, steady.dt, "off")
+    with pytest.warns(UserWarning, match="The ground of off ends with .* its baseline drifts"):
+        rk.peak_velocity(drifting)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rk.peak_velocity(rk.processing.baseline_corrected(drifting, 1))
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: rk.intensity.spectral_acceleration(SINE, 0.0), "`period` must be from 0.001"),
+        (lambda: rk.intensity.spectral_acceleration(SINE, 1.0, 1.0), r"`damping` must be in \[0, 1\)"),
+        (lambda: rk.intensity.significant_duration(SINE, 0.5, 0.5), "`end` must be above `begin`"),
+        (lambda: rk.intensity.significant_duration(0.0 * SINE), "`motion` must move"),
+        (lambda: rk.intensity.velocity_to_acceleration(0.0 * SINE), "`motion` must move"),
+        (lambda: rk.intensity.arias(rk.SinePulse(np.array([0.1, 0.2]), 1.0)), "`motion` must hold one scene"),
+    ],
+)
+def test_what_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

@@ -1,0 +1,149 @@
+"""Rocks from meshes: boxes, prisms and rounded bases whose numbers are known."""
+
+import warnings
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxrock as rk
+
+trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
+
+WIDTH, DEPTH, HEIGHT = 0.6, 0.4, 2.0
+
+
+def box():
+    """On the ground, its middle at the origin."""
+    mesh = trimesh.creation.box((WIDTH, DEPTH, HEIGHT))
+    mesh.apply_translation([0, 0, HEIGHT / 2])
+    return mesh
+
+
+def rounded(radius=3.0, half=0.5, height=1.0, sides=400):
+    """A prism on a base of large radius: its section rolls from the middle to the edge."""
+    across = np.linspace(-half, half, sides)
+    outline = np.stack([across, radius - np.sqrt(radius**2 - across**2)], 1)
+    outline = np.concatenate([outline, [[half, height], [-half, height]]])
+    count = len(outline)
+    ends = [np.column_stack([outline[:, 0], np.full(count, y), outline[:, 1]]) for y in (-0.5, 0.5)]
+    middle = [[0, y, height / 2] for y in (-0.5, 0.5)]
+    faces = []
+    for k in range(count):
+        a, b = k, (k + 1) % count
+        faces += [
+            [a, b, count + b],
+            [a, count + b, count + a],
+            [2 * count, b, a],
+            [2 * count + 1, count + a, count + b],
+        ]
+    mesh = trimesh.Trimesh(np.concatenate([*ends, middle]), faces)
+    mesh.fix_normals()
+    return mesh
+
+
+@pytest.mark.parametrize("azimuth, width", [(0.0, WIDTH), (np.pi / 2, DEPTH), (np.pi, WIDTH)])
+def test_a_box_is_a_rectangle(azimuth, width):
+    found = rk.AsymmetricBlock.from_mesh(box(), azimuth)
+    plane = rk.Block.from_dimensions(width, HEIGHT)
+    for name in ("alpha1", "alpha2"):
+        assert float(getattr(found, name)) == pytest.approx(float(plane.alpha), rel=1e-12)
+    assert float(found.p1) == pytest.approx(float(plane.p), rel=1e-12)
+    assert float(found.restitution1) == pytest.approx(float(plane.restitution), rel=1e-12)
+
+
+def test_a_box_askew():
+    """Towards its corner it stands on that; the inertia is that about the axis across."""
+    azimuth = np.arctan2(DEPTH, WIDTH)
+    section = rk.Rock.from_mesh(box()).section(azimuth)
+    assert section.right[0] == pytest.approx(np.hypot(WIDTH, DEPTH) / 2, rel=1e-12)
+    about = np.array([DEPTH**2 + HEIGHT**2, WIDTH**2 + HEIGHT**2]) / 12  # about the first, the second axis
+    expected = about @ [np.sin(azimuth) ** 2, np.cos(azimuth) ** 2]
+    assert section.gyration_radius**2 == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("suffix, unit, factor", [("stl", "mm", 1000), ("ply", "cm", 100), ("obj", "m", 1)])
+def test_files_and_units(tmp_path, suffix, unit, factor):
+    mesh, path = box(), tmp_path / f"rock.{suffix}"
+    mesh.apply_scale(factor)
+    mesh.export(path)
+    rock = rk.Rock.from_mesh(path, unit=unit)
+    assert rock.volume == pytest.approx(WIDTH * DEPTH * HEIGHT, rel=1e-6)
+    np.testing.assert_allclose(rock.slenderness([0.0]), np.arctan2(WIDTH, HEIGHT), rtol=1e-6)
+
+
+def test_a_lopsided_prism_is_its_outline():
+    outline = np.array([[-0.3, 0.0], [0.2, 0.0], [0.5, 1.5], [-0.2, 1.2]])
+    ends = [np.column_stack([outline[:, 0], np.full(4, y), outline[:, 1]]) for y in (0.0, 0.7)]
+    mesh = trimesh.convex.convex_hull(np.concatenate(ends))
+    found, plane = rk.AsymmetricBlock.from_mesh(mesh, 0.0), rk.AsymmetricBlock.from_outline(outline)
+    for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
+        assert float(getattr(found, name)) == pytest.approx(float(getattr(plane, name)), rel=1e-9)
+    turned = rk.AsymmetricBlock.from_mesh(mesh, np.pi)
+    assert float(turned.alpha1) == pytest.approx(float(plane.alpha2), rel=1e-9)
+
+
+def test_a_rounded_base_is_bounded_and_said():
+    """It rolls on to its edge: the ground within the tolerance is narrower, and known in closed form."""
+    rock = rk.Rock.from_mesh(rounded(), tolerance=0.005)
+    with pytest.warns(UserWarning, match="The base is rounded: the rock rolls on"):
+        narrow = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+    with pytest.warns(UserWarning, match="The base is rounded"):
+        wide = rk.AsymmetricBlock.from_mesh(rock, 0.0, base="wide")
+    assert rock.section(0.0).right[0] == pytest.approx(np.sqrt(3**2 - 2.995**2), rel=0.02)
+    edge = [0.5, 3 - np.sqrt(9 - 0.25)]
+    np.testing.assert_allclose(rock.section(0.0, "wide").right, edge, rtol=1e-9)
+    assert float(wide.alpha1) == pytest.approx(np.arctan2(edge[0], rock.centre[2] - edge[1]), rel=1e-9)
+    assert float(narrow.alpha1) < 0.5 * float(wide.alpha1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rk.AsymmetricBlock.from_mesh(rock, np.pi / 2)  # along the cylinder it is flat
+
+
+@pytest.mark.parametrize("rotation", np.linspace(0.0, 0.9, 7))
+def test_the_righting_moment_of_the_rolling_rock_lies_between(rotation):
+    """Arm of the weight about the lowest vertex of the turned rock beyond its base, and about fixed ones."""
+    rock = rk.Rock.from_mesh(rounded(), tolerance=0.005)
+    narrow, wide = rock.section(0.0), rock.section(0.0, "wide")
+    points = np.stack([rock.vertices[:, 0] - rock.centre[0], rock.vertices[:, 2]], 1) - narrow.centre
+    points = points[points[:, 0] >= narrow.right[0] - 1e-12]
+    across, up = np.array([np.cos(rotation), np.sin(rotation)]), np.array([-np.sin(rotation), np.cos(rotation)])
+    rolling = points[(points @ up).argmin()] @ across
+    arms = [(each.right - each.centre) @ across for each in (narrow, wide)]
+    assert arms[0] - 1e-12 <= rolling <= arms[1] + 1e-12
+    if 0.1 < rotation:
+        assert arms[0] < rolling - 0.01
+
+
+def test_polar_plot():
+    axes = rk.plot.slenderness(rk.Rock.from_mesh(box()), points=24)
+    assert axes[0].lines[0].get_ydata()[0] == pytest.approx(np.arctan2(WIDTH, HEIGHT), rel=1e-9)
+    plt.close("all")
+
+
+def leaning():
+    mesh = box()
+    mesh.apply_transform([[1, 0, 0.5, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return mesh
+
+
+def holed():
+    mesh = box()
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    return mesh
+
+
+@pytest.mark.parametrize(
+    "mesh, given, message",
+    [
+        (leaning(), {}, "`mesh` must stand"),
+        (holed(), {}, "`mesh` must be closed"),
+        (box(), {"unit": "ft"}, "`unit` must be one of"),
+        (box(), {"tolerance": 0.0}, "`tolerance` must be positive"),
+        ("x", {}, None),
+        (3, {}, "`mesh` must be a mesh of trimesh"),
+    ],
+)
+def test_what_is_refused(mesh, given, message):
+    with pytest.raises(OSError if message is None else ValueError, match=message):
+        rk.AsymmetricBlock.from_mesh(mesh, 0.0, **given)

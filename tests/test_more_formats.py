@@ -1,0 +1,209 @@
+"""COSMOS, SMC and K-NET, where records come from, components, ObsPy's traces, writing, a million samples."""
+
+import time
+import types
+
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from references.damaged_files import FILES, SAMPLES
+
+CM = 980.665
+COSMOS, SMC, KNET = (FILES[name].text for name in ("COSMOS", "SMC", "K-NET"))
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a file and return its path."""
+
+    def write(content, name="motion.txt"):
+        path = tmp_path / name
+        path.write_text(content)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "text, dt, kind",
+    [
+        pytest.param(COSMOS, 0.005, "cosmos", id="COSMOS V2"),
+        pytest.param(COSMOS.replace("Corrected", "Uncorrected"), 0.005, "cosmos", id="COSMOS V1"),
+        pytest.param(COSMOS.replace("acceleration pts", "uncorrected accel. pts"), 0.005, "cosmos", id="COSMOS words"),
+        pytest.param(COSMOS[: COSMOS.index("End-of")], 0.005, "cosmos", id="COSMOS without end"),
+        pytest.param(SMC, 0.005, "smc", id="SMC"),
+        pytest.param(SMC.replace("\n", "\r\n"), 0.005, "smc", id="SMC with CRLF"),
+        pytest.param(SMC.replace("2 CORRECTED", "1 UNCORRECTED"), 0.005, "smc", id="SMC uncorrected"),
+    ],
+)
+def test_formats_of_fixed_places(file, text, dt, kind):
+    """Found from the content alone."""
+    record = rk.read_record(file(text))
+    np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-4, atol=1e-7)
+    assert (float(record.dt), record.origin.format, record.origin.unit) == (dt, kind, "cm/s2")
+
+
+@pytest.mark.parametrize("name", ["motion.NS", "motion.txt"])
+def test_knet_takes_the_offset_off(file, name):
+    record = rk.read_record(file(KNET, name))
+    counts = np.array(KNET.split("Memo.")[1].split(), float)
+    np.testing.assert_allclose(record.samples, (counts - counts.mean()) * 3920 / 6182761 / CM, rtol=1e-12)
+    assert float(record.dt) == 0.01
+
+
+@pytest.mark.parametrize(
+    "text, name, message",
+    [
+        (COSMOS.replace("      23 acc", "      22 acc"), "a.V2c", "announces 22 samples, but 23 follow"),
+        (COSMOS.replace("acceleration pts", "velocity pts"), "a.V2c", "announces velocity, but samples must be"),
+        (COSMOS.replace("cm/sec2(04)", "counts(50)"), "a.V2c", "states the unit 'counts'"),
+        (COSMOS.replace("approx    0 secs", "approx  120 secs"), "a.V2c", "23 samples in 120 s, but the header a time"),
+        (COSMOS.replace("Real-header", "Whole-header"), "a.V2c", "no line announces 'Real-header values'"),
+        (COSMOS.replace("e+01\n", "e+02\n", 3), "a.V2c", "the header states a peak of"),
+        (COSMOS.replace("acceleration pts", ""), "a.V2c", "no line announces 'acceleration pts'"),
+        (SMC.replace("2 CORRECTED ACCELEROGRAM", "3 VELOCITY"), "a.smc", "line 1 states velocity"),
+        (SMC.replace("        23    -32768", "        24    -32768"), "a.smc", "announces 24 samples, but 23 follow"),
+        (SMC.replace("\n|\n", "\n"), "a.smc", "announces 1 lines of comments, which are not there"),
+        (SMC.replace("2.0000000E+02", "0.0000000E+02"), "a.smc", "states 0 samples a second"),
+        (SMC.replace("    -32768      ", "    -3276x      ", 1), "a.smc", "lines 12 to 27 should hold"),
+        (SMC.replace("E+1", "E+2", 2), "a.smc", "the header states a peak of"),
+        (KNET.replace("100Hz", "50Hz"), "a.NS", "announces 12 samples, but 24 follow"),
+        (KNET.replace("(gal)/", "(cm)/"), "a.NS", "must state a number as 'Scale Factor'"),
+        (KNET.replace("3920", "39200"), "a.NS", "line 9 states a peak of"),
+        (KNET.replace("100Hz", "0Hz"), "a.NS", "must state a positive frequency"),
+        ("RESPONSE AND FOURIER AMPLITUDE SPECTRA\n 1 2 3\n", "a.V3", r"holds response spectra \(V3\)"),
+        ("UNCORRECTED ACCELEROGRAM DATA\n 1 2 3\n", "a.V1", r"holds uncorrected pairs \(V1\)"),
+    ],
+)
+def test_what_is_mislabelled_is_refused(file, text, name, message):
+    assert text not in (COSMOS, SMC, KNET), "nothing was replaced"
+    with pytest.raises(ValueError, match=f"^File `{name}`: .*{message}"):
+        rk.read_record(file(text, name))
+
+
+@pytest.mark.parametrize(
+    "text, origin",
+    [
+        (SMC, ("Loma Prieta, CA", "San Francisco, 1295 Shafter", "360", "1989 10 18 0004", "SAF0A", "smc", "cm/s2")),
+        (KNET, ("2011/03/11 14:46:00 M9.0", "MYG004", "N-S", "2011/03/11 14:46:36", "MYG004", "knet", "cm/s2")),
+        (FILES["AT2"].text, ("LOMA PRIETA 10/18/89", "WAHO", "090", "", "", "at2", "g")),
+        (FILES["ESM"].text, ("GREECE", "", "", "", "", "esm", "cm/s2")),
+    ],
+)
+def test_origin(file, text, origin):
+    assert tuple(rk.read_record(file(text)).origin) == (*origin, "motion.txt")
+
+
+# ------------------------------------------------------------------------------------------- components
+
+
+def component(direction, factor=1):
+    """A K-NET file of one direction."""
+    peak = KNET.index("Max. Acc. (gal)")
+    text = KNET[:peak] + KNET[KNET.index("Memo.") :]
+    head, body = text.replace("Dir.              N-S", f"Dir.              {direction}").split("Memo.")
+    counts = factor * np.array(body.split(), int)
+    return head + "Memo.\n" + "".join(f" {x}\n" for x in counts)
+
+
+@pytest.mark.parametrize("order", [("N-S", "E-W", "U-D"), ("U-D", "N-S", "E-W"), ("4", "6", "5")])
+def test_components_are_known_by_what_they_say(file, order):
+    factors = {"N-S": 1, "4": 1, "E-W": 2, "5": 2, "U-D": 3, "6": 3}
+    paths = [file(component(each, factors[each]), f"motion{k}") for k, each in enumerate(order)]
+    found = rk.read_components(paths)
+    one = rk.read_record(file(component("N-S"))).samples
+    for part, factor in ((found.first, 1), (found.second, 2), (found.vertical, 3)):
+        np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
+
+
+def test_two_components_and_columns_of_one_file(file):
+    assert rk.read_components([file(component("N-S"), "a"), file(component("E-W"), "b")]).vertical is None
+    text = "".join(f"{0.02 * k:.2f},{x!r},{2 * x!r},{3 * x!r}\n" for k, x in enumerate(SAMPLES.tolist()))
+    found = rk.read_components(file(text), columns=(1, 2, 3), unit="g")
+    np.testing.assert_allclose(found.second.samples, 2 * SAMPLES)
+    np.testing.assert_allclose(found.vertical.samples, 3 * SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "second, message",
+    [
+        (component("U-D"), "must hold two horizontal components"),
+        (component("E-W").replace("14:46:36", "14:46:37"), "must begin at one time"),
+        (component("E-W").replace("100Hz", "50Hz").replace("0.24", "0.48"), "must have one time step"),
+    ],
+)
+def test_components_that_do_not_go_together(file, second, message):
+    with pytest.raises(ValueError, match=message):
+        rk.read_components([file(component("N-S"), "a"), file(second, "b")])
+
+
+# --------------------------------------------------------------------------------------- traces, writing
+
+
+def trace(**changed):
+    stats = types.SimpleNamespace(network="US", station="ABC", location="", channel="HNZ", delta=0.02, starttime="")
+    return types.SimpleNamespace(**{"data": SAMPLES * 9.80665, "stats": stats} | changed)
+
+
+def test_a_trace_of_obspy():
+    record = rk.record_of_trace(trace(), "m/s2")
+    np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-14)
+    assert (record.name, record.origin.component, float(record.dt)) == ("US.ABC..HNZ", "HNZ", 0.02)
+    assert rk.motions.components.is_vertical(record)
+
+
+def test_a_real_trace_of_obspy():
+    obspy = pytest.importorskip("obspy")
+    made = obspy.Trace(SAMPLES * 9.80665, {"delta": 0.02, "station": "ABC", "channel": "HNE"})
+    record = rk.record_of_trace(made, "m/s2")
+    np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-14)
+    assert record.origin.start.startswith("1970-01-01")
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [(trace(data=np.ma.array(SAMPLES, mask=SAMPLES > 0.1)), "no gaps"), ("x", "must be a trace of ObsPy"),
+     (trace(data=[0.0, np.nan]), "must be finite")],
+)  # fmt: skip
+def test_traces_that_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        rk.record_of_trace(given, "g")
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    origin = rk.Origin("LOMA PRIETA", "WAHO", "090")
+    record = rk.Record(SAMPLES, 1 / 256, "some\nname", origin)
+    for write, given, digits in ((rk.write_at2, {}, 1e-8), (rk.write_csv, {"unit": "g"}, 0)):
+        path = tmp_path / "motion"
+        write(record, path)
+        found = rk.read_record(path, **given)
+        np.testing.assert_allclose(found.samples, SAMPLES, rtol=digits)
+        assert float(found.dt) == pytest.approx(1 / 256, rel=1e-11)
+    rk.write_at2(record, path)
+    assert tuple(rk.read_record(path).origin)[:3] == origin[:3]
+    rk.write_csv(record, path, "cm/s2")
+    np.testing.assert_allclose(rk.read_record(path, unit="cm/s2").samples, SAMPLES, rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["AT2", "CSV", "V2"])
+def test_a_million_samples_in_seconds(tmp_path, kind):
+    """In one second on a quiet core; where lines are looked at one by one it takes twenty."""
+    count = 1_000_000
+    values = np.round(np.random.default_rng(0).normal(0, 0.1, count), 7)
+    heads = {
+        "AT2": f"PEER\nA, B, C\nACCELERATION IN UNITS OF G\nNPTS= {count}, DT= .005 SEC\n",
+        "CSV": "time,acceleration\n",
+        "V2": f"{count} POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: G)\n",
+    }
+    text = np.char.mod({"AT2": "%15.7E", "CSV": "%10.7f", "V2": "%10.7f"}[kind], values).astype(str)
+    if kind == "CSV":
+        lines = [f"{0.01 * k:.2f},{x}" for k, x in enumerate(text)]
+    else:
+        lines = ["".join(text[k : k + 8]) for k in range(0, count, 8)]
+    path = tmp_path / "long"
+    path.write_text(heads[kind] + "\n".join(lines) + "\n")
+    begin = time.process_time()
+    record = rk.read_record(path, **({"unit": "g"} if kind == "CSV" else {}))
+    assert time.process_time() - begin < 5
+    np.testing.assert_allclose(record.samples, values, atol=1e-12)

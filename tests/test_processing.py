@@ -1,0 +1,135 @@
+"""What is done to records: each step against what it must leave alone, and what it must take away."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.motions.straight import straight
+
+G, DT = 9.81, 0.01
+TIME = DT * np.arange(1001)
+EVENT = rk.Origin(event="Made", station="Here", component="090")
+SMOOTH = rk.Record(0.2 * np.sin(2 * np.pi * TIME) * np.exp(-((TIME - 4) ** 2)), DT, "made", EVENT)
+do = rk.processing
+
+
+def test_a_record_comes_back_from_its_displacement():
+    """The spline of the displacement is what straight lines of acceleration integrate to."""
+    lines = straight(SMOOTH)
+    found = do.from_displacement(100 * lines.displacement, DT, unit="cm")
+    np.testing.assert_allclose(found.samples[:-3], SMOOTH.samples[:-3], atol=1e-9)
+    np.testing.assert_allclose(straight(found).displacement, lines.displacement, atol=1e-14)
+
+
+def test_a_record_comes_back_from_its_velocity():
+    found = do.from_velocity(straight(SMOOTH).velocity, DT)
+    np.testing.assert_allclose(found.samples, SMOOTH.samples, atol=2e-4)
+    np.testing.assert_allclose(straight(found).velocity, straight(SMOOTH).velocity, atol=2e-4)
+
+
+def test_noise_of_a_displacement_needs_the_filter():
+    place = straight(SMOOTH).displacement + np.random.default_rng(1).normal(0, 1e-5, TIME.size)
+    raw, smooth = (do.from_displacement(place, DT, corner=corner) for corner in (None, 8.0))
+    assert np.abs(raw.samples - SMOOTH.samples).max() > 0.02
+    assert np.abs(smooth.samples - SMOOTH.samples).max() < 2e-3
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_drift_of_the_velocity_is_taken_off(degree):
+    drift = sum(0.01 * (TIME / 10) ** k for k in range(degree))
+    clean = do.baseline_corrected(SMOOTH, degree)
+    found = do.baseline_corrected(rk.Record(SMOOTH.samples + drift, DT), degree)
+    np.testing.assert_allclose(found.samples, clean.samples, atol=1e-6)
+    assert np.abs(clean.samples - SMOOTH.samples).max() < 1e-3
+
+
+@pytest.mark.parametrize("low, high, kept", [(None, 3.0, 1.0), (3.0, None, 8.0), (0.5, 3.0, 1.0), (3.0, 20.0, 8.0)])
+def test_filters_keep_what_passes(low, high, kept):
+    """Of 1 Hz and 8 Hz at once: one passes, without delay."""
+    parts = {f: np.sin(2 * np.pi * f * TIME) * np.exp(-((TIME - 5) ** 2)) for f in (1.0, 8.0)}
+    found = do.filtered(rk.Record(sum(parts.values()), DT), low, high)
+    assert np.abs(found.samples - parts[kept]).max() < 0.03
+    delayed = do.filtered(rk.Record(sum(parts.values()), DT), low, high, zero_phase=False)
+    assert np.abs(delayed.samples - parts[kept]).max() > 0.04
+
+
+def test_a_taper_changes_the_ends_only():
+    found = do.tapered(rk.Record(np.ones(1001), DT), 1.0)
+    np.testing.assert_allclose(found.samples[100:-100], 1.0)
+    np.testing.assert_allclose(found.samples[:101], (1 - np.cos(np.pi * TIME[:101])) / 2, atol=1e-12)
+    np.testing.assert_allclose(found.samples, found.samples[::-1], atol=1e-12)
+    np.testing.assert_array_equal(do.tapered(SMOOTH, 0.0).samples, SMOOTH.samples)
+
+
+def test_a_shorter_step_is_the_same_motion():
+    found = do.resampled(SMOOTH, DT / 4)
+    assert found.samples.size == 4001
+    for measure in (rk.intensity.arias, rk.intensity.peak_displacement, rk.peak_velocity):
+        assert float(measure(found)) == pytest.approx(float(measure(SMOOTH)), rel=1e-10)
+    uneven = do.resampled(SMOOTH, 0.007)
+    np.testing.assert_allclose(uneven.samples, np.interp(0.007 * np.arange(1429), TIME, SMOOTH.samples), atol=1e-15)
+
+
+def test_a_longer_step_loses_what_it_cannot_hold():
+    fast = rk.Record(SMOOTH.samples + 0.1 * np.sin(2 * np.pi * 40 * TIME), DT)
+    found = do.resampled(fast, 0.025)
+    np.testing.assert_allclose(found.samples[10:-10], np.interp(0.025 * np.arange(401), TIME, SMOOTH.samples)[10:-10],
+                               atol=2e-3)  # fmt: skip
+
+
+def test_cut_and_scaled():
+    part = do.cut(SMOOTH, 2.0, 6.0)
+    np.testing.assert_array_equal(part.samples, SMOOTH.samples[200:601])
+    np.testing.assert_array_equal(do.cut(SMOOTH, 2.003, 5.997).samples, SMOOTH.samples[201:600])
+    np.testing.assert_array_equal(do.cut(SMOOTH).samples, SMOOTH.samples)
+    assert float(rk.peak_acceleration(do.scaled(SMOOTH, acceleration=0.4))) == pytest.approx(0.4, rel=1e-14)
+    assert float(rk.peak_velocity(do.scaled(SMOOTH, velocity=0.3))) == pytest.approx(0.3, rel=1e-12)
+    np.testing.assert_array_equal(do.scaled(SMOOTH, -2.0).samples, -2 * SMOOTH.samples)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        do.baseline_corrected,
+        lambda r: do.tapered(r, 0.5),
+        lambda r: do.filtered(r, 0.1),
+        lambda r: do.resampled(r, 0.02),
+        lambda r: do.cut(r, 1.0),
+        lambda r: do.scaled(r, 2.0),
+    ],
+)
+def test_name_and_origin_are_kept(step):
+    assert (step(SMOOTH).name, step(SMOOTH).origin) == ("made", EVENT)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: do.filtered(SMOOTH), "`low` and `high` must not both be None"),
+        (lambda: do.filtered(SMOOTH, 2.0, 1.0), "`high` must be above `low`"),
+        (lambda: do.filtered(SMOOTH, high=50.0), "`high` must be above 0 and below half the sampling rate, 50 Hz"),
+        (lambda: do.tapered(SMOOTH, 6.0), "`seconds` must be at most half the record"),
+        (lambda: do.cut(SMOOTH, 20.0), "must leave a sample"),
+        (lambda: do.scaled(SMOOTH), "Just one of the arguments"),
+        (lambda: do.scaled(SMOOTH, 1.0, velocity=1.0), "Just one of the arguments"),
+        (lambda: do.scaled(rk.Record(np.zeros(9), DT), acceleration=1.0), "`record` must move"),
+        (lambda: do.resampled(SMOOTH, DT * np.pi), "`dt` must be to the old step"),
+        (lambda: do.from_displacement([0.0, 1.0], DT), "at least 4 samples"),
+        (lambda: do.from_displacement(np.zeros(9), DT, unit="km"), "`unit` must be one of 'm', 'cm', 'mm'"),
+        (lambda: do.baseline_corrected(rk.Record([1.0], DT)), "more samples than `degree`"),
+        (lambda: rk.Components(SMOOTH, rk.Record(SMOOTH.samples, 0.02)), "must have one time step"),
+    ],
+)
+def test_what_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_components_turn():
+    other = rk.Record(np.cos(TIME), DT)
+    pair = rk.Components(SMOOTH, other)
+    np.testing.assert_allclose(pair.along(0.0).samples, SMOOTH.samples)
+    np.testing.assert_allclose(pair.along(np.pi / 2).samples, other.samples, atol=1e-15)
+    turned = jax.vmap(lambda angle: pair.along(angle).samples)(np.array([0.3, 0.3 + np.pi / 2]))
+    np.testing.assert_allclose(np.sum(turned**2, 0), SMOOTH.samples**2 + other.samples**2, rtol=1e-12)

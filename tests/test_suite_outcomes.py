@@ -1,0 +1,205 @@
+"""Suites as recorded and at many scales: every scene against one of its own, and what is made of them."""
+
+import xml.etree.ElementTree as ElementTree
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+
+import jaxrock as rk
+
+RANDOM = np.random.default_rng(4)
+RECORDS = [
+    rk.Record(
+        RANDOM.uniform(0.5, 1.5) * np.exp(-((np.linspace(-2, 2, n)) ** 2)) * np.sin(0.06 * np.arange(n) + k),
+        dt,
+        f"record {k}",
+    )
+    for k, (n, dt) in enumerate([(300, 0.01), (700, 0.01), (450, 0.02), (1100, 0.005)])
+]
+MOTIONS = [*RECORDS, rk.SinePulse(np.array([0.6, 1.2]), 0.7)]
+SCALE = np.array([0.4, 1.0, 2.5])
+ROCKS = rk.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.3, 0.2]), np.array([2.5, 3.5]))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Two lopsided rocks under all motions, at three scales, both ways round."""
+    return rk.suite_outcomes(ROCKS, MOTIONS, SCALE, facing="both", progress=False)
+
+
+def test_every_scene_is_one_of_its_own(found):
+    assert found.verdict.shape == (6, 3, 2, 2) and found.undecided == 0
+    assert 0.1 < (found.verdict == 1).mean() < 0.9
+    for m, motion in ((1, RECORDS[1]), (2, RECORDS[2]), (5, rk.SinePulse(1.2, 0.7))):
+        for s, f, b in [(0, 0, 0), (1, 1, 1), (2, 0, 1)]:
+            rock = rk.AsymmetricBlock(*(float(x[b]) for x in (ROCKS.alpha1, ROCKS.alpha2, ROCKS.p1)))
+            alone = rk.outcome(rock, float(found.facing[f] * SCALE[s]) * motion)
+            assert found.verdict[m, s, f, b] == int(alone.overturned)
+            rotation = float(alone.max_rotation) / min(float(rock.alpha1), float(rock.alpha2))
+            assert found.rotation[m, s, f, b] == pytest.approx(rotation, rel=1e-9)
+            assert found.margin[m, s, f, b] == pytest.approx(float(alone.margin), rel=1e-7)
+
+
+def test_turning_round_a_symmetric_block_changes_nothing():
+    found = rk.suite_outcomes(rk.Block(0.2, 2.5), RECORDS, facing="both", progress=False)
+    assert found.verdict.shape == (4, 1, 2, 1)
+    np.testing.assert_array_equal(found.verdict[:, :, 0], found.verdict[:, :, 1])
+    turned = rk.suite_outcomes(rk.Block(0.2, 2.5), [rk.Record(-m.samples, m.dt) for m in RECORDS], progress=False)
+    np.testing.assert_allclose(turned.rotation[:, 0, 0, 0], found.rotation[:, 0, 1, 0], rtol=1e-9)
+
+
+def by_hand():
+    """A block that comes back, one that does not topple, one undecided."""
+    verdict = np.array([[0, 1, 0, 1], [0, 0, 0, 0], [0, -1, 1, 1]], np.int8)[:, :, None, None]
+    rotation = np.where(verdict == 1, np.inf, np.where(verdict == 0, 0.5, np.nan))
+    suite = rk.Suite([rk.SinePulse(0.5, each) for each in (0.5, 1.0, 2.0)])
+    scale = np.array([0.5, 1.0, 2.0, 4.0])
+    return rk.SuiteOutcomes(suite, rk.Block(np.array([0.2]), np.array([2.0])), scale, (1,), verdict, rotation, rotation)
+
+
+def test_capacities_are_never_forced_to_rise():
+    found = by_hand()
+    np.testing.assert_array_equal(found.capacity[:, 0, 0], [[0.5, 1.0], [4.0, np.inf], [0.5, 2.0]])
+    np.testing.assert_array_equal(found.comes_back[:, 0, 0], [True, False, False])
+    assert found.undecided == 1
+
+
+def test_damage_states_are_bounded():
+    lower, upper = by_hand().reaches([0.1, 0.6])
+    np.testing.assert_array_equal(lower[0], [[1, 0], [1, 1], [1, 0], [1, 1]])
+    np.testing.assert_array_equal(lower[2, 1], [0, 0])
+    np.testing.assert_array_equal(upper[2, 1], [1, 1])
+    assert (lower <= upper).all()
+
+
+def test_long_table(found):
+    table = found.table({"Arias": rk.intensity.arias})
+    assert {len(column) for column in table.values()} == {found.verdict.size}
+    row = np.flatnonzero((table["motion"] == "record 2") & (table["scale"] == 2.5) & (table["facing"] == -1))
+    assert row.size == 2
+    np.testing.assert_array_equal(table["verdict"][row], found.verdict[2, 2, 1])
+    np.testing.assert_allclose(table["alpha1"][row], ROCKS.alpha1)
+    np.testing.assert_allclose(table["PGA"][row], 2.5 * float(rk.peak_acceleration(RECORDS[2])))
+    np.testing.assert_allclose(table["Arias"][row], 2.5**2 * rk.intensity.arias(RECORDS[2]), rtol=1e-12)
+    frame = pytest.importorskip("pandas").DataFrame(table)
+    assert frame.groupby("motion").size().eq(12).all()
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"scale": [1.0, 1.0]}, "`scale` must be a number, or rise"),
+        ({"scale": -1.0}, "`scale` must be positive"),
+        ({"facing": "left"}, "`facing` must be one of 'one', 'both'"),
+        ({"motions": []}, "at least one motion"),
+    ],
+)
+def test_what_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        rk.suite_outcomes(**{"block": rk.Block(0.2, 2.0), "motions": [MOTIONS[0]]} | given)
+
+
+# ---------------------------------------------------------------------------------------------- probit fits
+
+N = 300
+MEASURES = {"PGA": np.exp(RANDOM.normal(-1, 0.5, N)), "ratio": np.exp(RANDOM.normal(-2, 0.4, N))}
+TRUTH = np.array([4.0, 2.0, 1.2])
+DESIGN = np.stack([np.ones(N), *map(np.log, MEASURES.values())])
+FELL = (scipy.stats.norm.cdf(TRUTH @ DESIGN) > RANDOM.random(N)).astype(float)
+
+
+def test_a_probit_of_two_measures_by_another_optimiser():
+    """SciPy climbs the likelihood, differences give its curvature."""
+
+    def height(line):
+        return -scipy.stats.norm.logcdf(np.where(FELL == 1, 1, -1) * (line @ DESIGN)).sum()
+
+    best = scipy.optimize.minimize(height, TRUTH, method="BFGS", options={"gtol": 1e-9}).x
+    fit = rk.fit_probit(MEASURES, FELL)
+    np.testing.assert_allclose([fit.intercept, *fit.slopes], best, rtol=1e-6)
+    step, curvature = 1e-4, np.zeros((3, 3))
+    for i, j in np.ndindex(3, 3):
+        a, b = step * np.eye(3)[i], step * np.eye(3)[j]
+        both = height(best + a + b) - height(best + a - b) - height(best - a + b) + height(best - a - b)
+        curvature[i, j] = both / (4 * step**2)
+    np.testing.assert_allclose(fit.covariance, np.linalg.inv(curvature), rtol=1e-4, atol=1e-7)
+    assert float(fit.log_likelihood) == pytest.approx(-height(best), rel=1e-10)
+    inside = scipy.stats.norm.cdf(best @ [1, np.log(0.4), np.log(0.15)])
+    assert float(fit(PGA=0.4, ratio=0.15)) == pytest.approx(inside, rel=1e-5)
+
+
+@pytest.mark.parametrize("clusters", [None, np.arange(N) // 5])
+def test_against_an_established_package(clusters):
+    statsmodels = pytest.importorskip("statsmodels.api")
+    fit = rk.fit_probit(MEASURES, FELL, clusters=clusters)
+    kind = (
+        {} if clusters is None else {"cov_type": "cluster", "cov_kwds": {"groups": clusters, "use_correction": False}}
+    )
+    other = statsmodels.Probit(FELL, DESIGN.T).fit(disp=0, tol=1e-14, **kind)
+    np.testing.assert_allclose([fit.intercept, *fit.slopes], other.params, rtol=1e-6)
+    count = N if clusters is None else clusters.max() + 1
+    factor = 1.0 if clusters is None else np.sqrt(count / (count - 1))
+    np.testing.assert_allclose(fit.standard_errors, factor * other.bse, rtol=1e-4)
+
+
+def test_errors_for_few_motions():
+    """Of 15 motions with 20 scenes each: intervals of the jackknife hold the slope's truth more often."""
+    inside = {"information": 0, "clusters": 0, "jackknife": 0}
+    labels, repetitions = np.repeat(np.arange(15), 20), 40
+    for seed in range(repetitions):
+        random = np.random.default_rng(seed)
+        level = np.exp(random.normal(0, 0.5, labels.size))
+        capacity = random.normal(0, 0.6, 15)[labels] + random.normal(0, 0.3, labels.size)
+        fell = np.log(level) > capacity
+        for kind in inside:
+            fit = rk.fit_probit({"PGA": level}, fell, clusters=labels, errors=kind)
+            assert fit.status == rk.FitStatus.successful
+            # P = Phi(ln level/sqrt(0.6^2 + 0.3^2)): the intercept is 0.
+            inside[kind] += abs(float(fit.intercept)) < 1.96 * float(fit.standard_errors[0])
+    shares = {kind: count / repetitions for kind, count in inside.items()}
+    assert shares["information"] < 0.75 < 0.85 < shares["clusters"] <= shares["jackknife"], shares
+
+
+def test_a_single_measure_is_the_lognormal_fit():
+    levels, trials = jnp.array([0.1, 0.2, 0.3, 0.5, 0.8]), 20.0
+    fell = [1, 4, 11, 15, 19]
+    one, other = rk.fit_probit({"PGA": levels}, fell, trials), rk.fit_fragility(levels, fell, trials)
+    assert float(one.fragility.median) == pytest.approx(float(other.fragility.median), rel=1e-9)
+    assert float(one.fragility.dispersion) == pytest.approx(float(other.fragility.dispersion), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "measures, fell, status",
+    [
+        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [0, 0, 1, 1], rk.FitStatus.separable),
+        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [1, 1, 1, 1], rk.FitStatus.separable),
+        ({"PGA": [0.2, 0.2, 0.2, 0.2]}, [0, 1, 0, 1], rk.FitStatus.not_converged),
+    ],
+)
+def test_fits_that_fail_say_so(measures, fell, status):
+    fit = rk.fit_probit(measures, fell)
+    assert fit.status == status
+    assert np.isnan(fit.slopes).all() and np.isnan(fit.covariance).all()
+
+
+# ----------------------------------------------------------------------------------------------------- NRML
+
+
+def test_nrml(tmp_path):
+    path, space = tmp_path / "f.xml", {"n": "http://openquake.org/xmlns/nrml/0.5"}
+    rk.write_nrml({"uplift": rk.LogNormalFragility(0.2, 0.1), "topples": rk.LogNormalFragility(0.4, 0.3)}, path)
+    root = ElementTree.parse(path).getroot()
+    assert root.find(".//n:limitStates", space).text == "uplift topples"
+    last = root.findall(".//n:params", space)[1].attrib
+    law = scipy.stats.lognorm(0.3, scale=0.4)
+    assert float(last["mean"]) == pytest.approx(law.mean(), rel=1e-9)
+    assert float(last["stddev"]) == pytest.approx(law.std(), rel=1e-9)
+    rk.write_nrml({"topples": rk.TabulatedFragility([0.1, 0.2, 0.4], [0.0, 0.7, 0.6])}, path, "PGV")
+    root = ElementTree.parse(path).getroot()
+    assert root.find(".//n:imls", space).text == "0.1 0.2 0.4"
+    assert root.find(".//n:poes", space).text == "0 0.7 0.6"
+    with pytest.raises(ValueError, match="`fragilities` must hold lognormal or tabulated"):
+        rk.write_nrml({}, path)
