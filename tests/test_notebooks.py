@@ -56,3 +56,12 @@ def test_what_readers_see(path):
 
 def test_there_are_notebooks():
     assert NOTEBOOKS
+
+
+def test_the_index_has_every_notebook_with_its_picture():
+    """Numbered without gaps, in order of reading."""
+    folder = NOTEBOOKS[0].parent
+    found = re.findall(r"\[!\[\]\((\S+)\)\]\((\S+)\.ipynb\)", (folder / "README.md").read_text())
+    assert [name for _, name in found] == [path.stem for path in NOTEBOOKS]
+    assert all((folder / picture).stat().st_size < 50_000 for picture, _ in found)
+    assert [int(name[:2]) for _, name in found[:-1]] == list(range(1, len(found)))
