@@ -9,14 +9,16 @@ nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient 
 nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-# Minutes of compilation, of what `test_arcs`, `test_closed_forms`, `test_derivatives`, `test_critical`, `test_inverse`,
-# `test_springs`, `test_asymmetric_rocks` and `test_flexible` judge.
+# Minutes of compilation, of what `test_arcs`, `test_borders`, `test_closed_forms`, `test_critical`, `test_inverse`,
+# `test_derivatives`, `test_similarity`, `test_springs`, `test_asymmetric_rocks` and `test_flexible` judge.
 SLOW = {
     "03_a_block_of_your_own",
     "05_one_sine_pulse",
+    "06_similarity",
     "07_sensitivity",
     "08_recover_a_pulse",
     "09_published_rocks",
+    "12_strength_duration_shape",
     "13_spring_models",
     "14_flexible_blocks",
 }
