@@ -141,6 +141,11 @@ def test_a_film_of_a_column():
     np.testing.assert_allclose(response.column(1.3)[-1], response(1.3)[1])
     film = started(rk.plot.animate(response, fps=10))
     film._func(13)
+    axes = rk.plot.history(response)
+    for axis, k, factor in ((axes[0], 0, 1 / COLUMN.alpha), (axes[1], 1, 1.0)):
+        time, values = axis.lines[0].get_xydata()[::4000].T
+        np.testing.assert_allclose(values, response(time)[k] * factor, rtol=1e-12)
+    assert axes[1].get_legend_handles_labels()[1] == ["top", "of it bending"]
     _, column, _ = drawn(film._fig.axes[0])
     rotation, top, bending = (float(x) for x in response(1.3))
     across = column[-1, 0] * np.cos(rotation) - column[-1, 1] * np.sin(rotation)

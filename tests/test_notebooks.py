@@ -9,16 +9,20 @@ nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient 
 nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
+in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-# Minutes of compilation, of what `test_arcs`, `test_closed_forms`, `test_derivatives`, `test_critical`, `test_inverse`,
-# `test_springs`, `test_asymmetric_rocks`, `test_flexible`, `test_search` and `test_found_record` judge.
+# Minutes of compilation, of what `test_arcs`, `test_borders`, `test_closed_forms`, `test_critical`, `test_inverse`,
+# `test_derivatives`, `test_similarity`, `test_springs`, `test_asymmetric_rocks`, `test_flexible`, `test_search` and
+# `test_found_record` judge.
 SLOW = {
     "03_a_block_of_your_own",
     "05_one_sine_pulse",
+    "06_similarity",
     "07_sensitivity",
     "08_recover_a_pulse",
     "09_published_rocks",
     "12_fit_it_yourself",
+    "12_strength_duration_shape",
     "13_spring_models",
     "14_flexible_blocks",
     "15_the_critical_record",
@@ -58,6 +62,16 @@ def test_what_readers_see(path):
     assert any(cell.outputs for cell in code)
 
 
-@pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")
+@in_repository
 def test_there_are_notebooks():
     assert NOTEBOOKS
+
+
+@in_repository
+def test_the_index_has_every_notebook_with_its_picture():
+    """Numbered without gaps, in order of reading."""
+    folder = NOTEBOOKS[0].parent
+    found = re.findall(r"\[!\[\]\((\S+)\)\]\((\S+)\.ipynb\)", (folder / "README.md").read_text())
+    assert [name for _, name in found] == [path.stem for path in NOTEBOOKS]
+    assert all((folder / picture).stat().st_size < 50_000 for picture, _ in found)
+    assert [int(name[:2]) for _, name in found[:-1]] == list(range(1, len(found)))

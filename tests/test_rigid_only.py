@@ -18,7 +18,6 @@ ASKED = {
     "fragility surface": "rk.simulated_surface(column, [pulse], [0.1, 0.2], [0.5, 1.0])",
     "random blocks": "rk.draw_blocks(column, 3, alpha=0.1)",
     "contact forces": "rk.contact_forces(response, column)",
-    "history": "rk.plot.history(response)",
     "phase plane": "rk.plot.phase(response)",
 }
 SCRIPT = """

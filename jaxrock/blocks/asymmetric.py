@@ -39,8 +39,8 @@ class AsymmetricBlock(eqx.Module):
     - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2; or a law of
       restitution for both. None: by angular momentum about the new corner, zero at least.
 
-    All may be arrays of one shape, for use under `jax.vmap`. **Raises:** ValueError for a value outside its range; where
-    the product of given restitutions, the energy that two impacts keep, exceeds 1. (One may: about unequal corners.)
+    All may be arrays of one shape. **Raises:** ValueError for a value outside its range; where the product of given
+    restitutions, the energy that two impacts keep, exceeds 1. (One may: about corners of unequal height it does.)
 
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
@@ -92,9 +92,7 @@ class AsymmetricBlock(eqx.Module):
         - `gyration_radius`: sqrt(I/m), I the moment of inertia about the centre of mass [m], 0 or more.
         - `gravity`: acceleration of gravity [m/s^2], positive.
 
-        **Returns:** an `AsymmetricBlock`.
-
-        **Raises:** ValueError for a value outside its range.
+        **Returns:** an `AsymmetricBlock`. **Raises:** ValueError for a value outside its range.
         """
         first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
         gyration = _gyration("gyration_radius", gyration_radius)

@@ -29,31 +29,23 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
 
 
-def _check_rigid(response) -> None:
-    if isinstance(response, FlexibleResponse):
-        raise ValueError(
-            "Argument `response` must be of a rigid block, but is a FlexibleResponse: draw its `rotation`, "
-            "`displacement` and `bending` over its `time`."
-        )
-
-
-def history(response: Response, axes=None):
+def history(response: Response | FlexibleResponse, axes=None):
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
     **Arguments:**
 
-    - `response`: result of `simulate`.
+    - `response`: result of `simulate`; of a flexible block the displacement of its top, and the part of it that is
+      bending, take the place of the velocity.
     - `axes`: three matplotlib axes; None makes a figure.
 
     **Returns:** the three axes.
-
-    **Raises:** ValueError for the response of a flexible block.
     """
     import matplotlib.pyplot as plt
 
-    _check_rigid(response)
     if axes is None:
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    if isinstance(response, FlexibleResponse):
+        return _bending_history(response, axes)
     scene = response.scene
     time, rotation, velocity = _dense(response)
     acceleration = acceleration_of(scene.motion, time)
@@ -76,6 +68,25 @@ def history(response: Response, axes=None):
     return axes
 
 
+def _bending_history(response: FlexibleResponse, axes):
+    time = np.linspace(0, float(response.duration), 20001)
+    rotation, displacement, bending = (np.asarray(x) for x in response(time))
+    impacts = np.asarray(response.impact_times)
+    axes[0].plot(time, rotation / float(response.scene.block.alpha), color=BLUE, linewidth=0.9)
+    axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
+    axes[1].plot(time, displacement, color=BLUE, linewidth=0.9, label="top")
+    axes[1].plot(time, bending, color=SAND, linewidth=0.7, label="of it bending")
+    axes[2].plot(time, acceleration_of(response.scene.ground, time), color="black", linewidth=0.9)
+    labels = (r"rotation of the base $\theta/\alpha$", "displacement [m]", "ground\nacceleration [g]")
+    for axis, label in zip(axes, labels):
+        axis.axhline(0, color=GREY, linewidth=0.5)
+        axis.set_ylabel(label)
+    axes[2].set_xlabel("time [s]")
+    for axis in axes[:2]:
+        axis.legend(loc="upper right", fontsize=8, frameon=False)
+    return axes
+
+
 def phase(response: Response, axis=None):
     """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
 
@@ -90,7 +101,11 @@ def phase(response: Response, axis=None):
     """
     import matplotlib.pyplot as plt
 
-    _check_rigid(response)
+    if isinstance(response, FlexibleResponse):
+        raise ValueError(
+            "Argument `response` must be of a rigid block, but is a FlexibleResponse, whose orbit is in no plane: use "
+            "`plot.history`."
+        )
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
     scene = response.scene
