@@ -243,28 +243,25 @@ def grid(kept: dict, rocks: int, points: int) -> None:
 
 
 def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
-    """Points that climbers need from the same starts, beside Adam of optax at several rates, all starts at once."""
+    """Own climbers beside optimisers of other libraries, from the same starts: how high they come, points, and
+    processor time of a search when everything is compiled."""
     import optax
+    import optimistix
 
     from jaxrock.inverse.estimate import _starts
+    from jaxrock.inverse.search import summits_of
     from jaxrock.inverse.unknowns import Evaluator
-    from jaxrock.numerics.climb import climb
 
     seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
     evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))
-    begin = _starts(starts, evaluate)
-    before = evaluate.count
-    found = climb(evaluate, begin)
-    rows = {"climbers": [float(found.values.max()), evaluate.count - before]}
-    for rate in (0.03, 0.1, 0.3):
-        method, points, best, before = optax.adam(rate), begin, -np.inf, evaluate.count
-        state = method.init(points)
-        for step in range(1, 301):
-            values, slopes = evaluate(points)
-            moves, state = method.update(-slopes, state)
-            points, best = np.asarray(optax.apply_updates(points, moves)), max(best, float(values.max()))
-            if step in (30, 100, 300):
-                rows[f"Adam, rate {rate:g}, {step} steps"] = [best, evaluate.count - before]
+    begin, rows = _starts(starts, evaluate), {}
+    methods = {"own climbers": None, "optimistix.BFGS": optimistix.BFGS(rtol=1e-6, atol=1e-6)}
+    methods |= {f"optax.adam({rate:g})": optax.adam(rate) for rate in (0.1, 0.3)}
+    for name, method in methods.items():
+        summits_of(evaluate, begin[:8], method)  # compiles
+        before, used = evaluate.count, time.process_time()
+        found = summits_of(evaluate, begin, method)
+        rows[name] = [float(found.values.max()), evaluate.count - before, time.process_time() - used]
     kept["optimizers"] = rows
     write(kept)
 

@@ -87,7 +87,7 @@ def test_found_record():
     status = rk.RecordStatus.successful
     found = rk.FoundRecord(after, start, number, number, number[None], number, number[None], number[None], status)
     records, between, spectra = rk.plot.found_record(found)
-    assert records.lines[0].get_label() == "a start"
+    assert records.get_title() == "a start" and records.get_xlim() == between.get_xlim() == (0.0, 1.5)
     for line, expected in ((records.lines[0], start.samples), (records.lines[1], after.samples)):
         np.testing.assert_allclose(line.get_xydata(), np.stack([[0.0, 0.5, 1.0, 1.5], expected], axis=1))
     np.testing.assert_allclose(between.lines[0].get_ydata(), change, atol=1e-16)

@@ -151,7 +151,7 @@ def sample_motion(
     - `sampler`: what makes another sampler of a `LogDensity`, such as
       `lambda density: numpyro.infer.NUTS(potential_fn=lambda point: -density(point))` or
       `lambda density: blackjax.nuts(density, 0.5, jnp.ones(2))`. Its eight chains begin at maxima of the estimate; the
-      first 500 steps of each are not kept. None: own chains, which are about ten times as fast here.
+      first 500 steps of each are not kept. None: own chains (`jaxrock.numerics.proposals`).
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Posterior`.

@@ -48,12 +48,18 @@ def found_record(found: FoundRecord, axes=None):
         _, axes = plt.subplots(3, 1, figsize=(7, 6), layout="constrained", height_ratios=(2, 1, 1))
     before, after, dt = np.asarray(found.start.samples), np.asarray(found.record.samples), float(found.start.dt)
     time, change = dt * np.arange(before.size), after - before
-    axes[0].plot(time, before, color=GREY, linewidth=0.8, label=found.start.name or "before")
+    axes[0].plot(time, before, color=GREY, linewidth=0.8, label="before")
     axes[0].plot(time, after, color=BLUE, linewidth=0.5, label="found")
     axes[1].plot(time, change, color=RED, linewidth=0.5)
     frequency = np.fft.rfftfreq(before.size, dt)[1:]
     for samples, color in ((before, GREY), (change, RED)):
         axes[2].loglog(frequency, dt * np.abs(np.fft.rfft(samples))[1:], color=color, linewidth=0.5)
+    axes[0].set_title(found.start.name, fontsize=8)
+    large = time[np.abs(change) > 0.02 * np.abs(change).max()]
+    if large.size:  # elsewhere there is nothing to see
+        around = 0.5 * (large[-1] - large[0]) + 10 * dt
+        axes[0].set_xlim(max(large[0] - around, 0.0), min(large[-1] + around, time[-1]))
+        axes[1].set_xlim(axes[0].get_xlim())
     axes[0].set(xlabel="time [s]", ylabel="acceleration [g]")
     axes[1].set(xlabel="time [s]", ylabel="change [g]")
     axes[2].set(xlabel="frequency [Hz]", ylabel="spectrum [g s]")
