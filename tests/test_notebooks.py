@@ -21,11 +21,11 @@ SLOW = {
     "07_sensitivity",
     "08_recover_a_pulse",
     "09_published_rocks",
-    "12_fit_it_yourself",
+    "16_fit_it_yourself",
     "12_strength_duration_shape",
     "13_spring_models",
     "14_flexible_blocks",
-    "15_the_critical_record",
+    "17_the_critical_record",
 }
 
 
