@@ -209,20 +209,23 @@ def test_surfaces_go_through_transformations(name):
     assert float(slopes[0]) == pytest.approx(float(difference), rel=1e-5)
 
 
-def test_sensitivities_go_through_transformations():
-    """Second derivatives of the peak, both ways round, and many scenes at once."""
+def elasticity(amplitude):
+    """Of the peak by the amplitude, and by everything."""
+    found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7), rk.Linear()).max_rotation
+    return found.derivative[3] * amplitude / found.value, found.elasticity
 
-    def elasticity(amplitude):
-        found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7), rk.Linear()).max_rotation
-        return found.derivative[3] * amplitude / found.value, found.elasticity  # by the amplitude
 
-    at = jnp.array([0.3, 0.31])
-    rows, every = jax.jit(jax.vmap(elasticity))(at)
+def test_sensitivities_go_through_jit_and_vmap():
+    rows, every = jax.jit(jax.vmap(elasticity))(jnp.array([0.3, 0.31]))
     np.testing.assert_allclose(every[:, 3], rows, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+def test_sensitivities_have_derivatives(derivative):
     step = 1e-5
     difference = (elasticity(0.3 + step)[0] - elasticity(0.3 - step)[0]) / (2 * step)
-    for derivative in (jax.jacfwd, jax.grad):
-        assert float(derivative(lambda a: elasticity(a)[0])(0.3)) == pytest.approx(float(difference), rel=1e-6)
+    assert float(derivative(lambda a: elasticity(a)[0])(0.3)) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_maps_go_through_forward_mode():
