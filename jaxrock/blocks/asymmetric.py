@@ -120,7 +120,6 @@ class AsymmetricBlock(eqx.Module):
         - `p2`: frequency parameter about corner 2 [rad/s], positive.
 
         **Returns:** an `AsymmetricBlock` with R2/R1 from (p2/p1)^2 = R2/R1/(kappa1 [(R2/R1)^2 + 1/kappa1 - 1]).
-
         **Raises:** ValueError for a value outside its range, or a p2 that no distance of the second corner gives.
         """
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
