@@ -41,7 +41,6 @@ class AsymmetricBlock(eqx.Module):
 
     All may be arrays of one shape. **Raises:** ValueError for a value outside its range; where the product of given
     restitutions, the energy that two impacts keep, exceeds 1. (One may: about corners of unequal height it does.)
-
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
 
