@@ -19,6 +19,7 @@ from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
 
+_LARGEST = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
 _gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e9))
 
 
@@ -39,8 +40,11 @@ class AsymmetricBlock(eqx.Module):
     - `restitution`: pair of the restitutions of an impact that ends the stay on side 1, and on side 2; or a law of
       restitution for both. None: by angular momentum about the new corner, zero at least.
 
-    All may be arrays of one shape. **Raises:** ValueError for a value outside its range; where the product of given
-    restitutions, the energy that two impacts keep, exceeds 1. (One may: about corners of unequal height it does.)
+    All may be arrays of one shape, for use under `jax.vmap`.
+
+    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the
+    energy that two impacts keep, exceeds 1. (One of them may: about corners of unequal height it often does.)
+
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """
 
@@ -63,10 +67,9 @@ class AsymmetricBlock(eqx.Module):
         radius_ratio: ArrayLike | None = None,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
     ):
-        set_parameters(self, alpha1=alpha1, alpha2=alpha2, p1=p1, inertia_ratio=inertia_ratio)
         self.given_radius_ratio = None
-        if radius_ratio is not None:
-            set_parameters(self, given_radius_ratio=radius_ratio)
+        given = {} if radius_ratio is None else {"given_radius_ratio": radius_ratio}
+        set_parameters(self, alpha1=alpha1, alpha2=alpha2, p1=p1, inertia_ratio=inertia_ratio, **given)
         two = isinstance(restitution, (tuple, list))
         self.law = PerSide(*pair("restitution", restitution)) if two else law_of(restitution, AngularMomentum())
 
@@ -91,7 +94,9 @@ class AsymmetricBlock(eqx.Module):
         - `gyration_radius`: sqrt(I/m), I the moment of inertia about the centre of mass [m], 0 or more.
         - `gravity`: acceleration of gravity [m/s^2], positive.
 
-        **Returns:** an `AsymmetricBlock`. **Raises:** ValueError for a value outside its range.
+        **Returns:** an `AsymmetricBlock`.
+
+        **Raises:** ValueError for a value outside its range.
         """
         first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
         gyration = _gyration("gyration_radius", gyration_radius)
@@ -119,6 +124,7 @@ class AsymmetricBlock(eqx.Module):
         - `p2`: frequency parameter about corner 2 [rad/s], positive.
 
         **Returns:** an `AsymmetricBlock` with R2/R1 from (p2/p1)^2 = R2/R1/(kappa1 [(R2/R1)^2 + 1/kappa1 - 1]).
+
         **Raises:** ValueError for a value outside its range, or a p2 that no distance of the second corner gives.
         """
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
@@ -126,8 +132,7 @@ class AsymmetricBlock(eqx.Module):
         together(p1=p1, p2=p2, inertia_ratio=kappa)
         square = (p2 / p1) ** 2
         inner = 1 - 4 * square**2 * kappa * (1 - kappa)
-        largest = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
-        checked("p2", jnp.broadcast_to(p2, inner.shape), largest, lambda _: inner >= 0)
+        checked("p2", jnp.broadcast_to(p2, inner.shape), _LARGEST, lambda _: inner >= 0)
         return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
 
     @classmethod
@@ -199,8 +204,8 @@ class AsymmetricBlock(eqx.Module):
         shape = Outline.of(outline)
         right, left, *rest = shape.standing(supports, centre, gyration_radius)
         block = cls.from_corners(right, left, *rest, restitution, gravity)
-        shape.check_rolling(right, 1, float(block.alpha1))
-        shape.check_rolling(left, -1, float(block.alpha2))
+        for corner, side, alpha in ((right, 1, block.alpha1), (left, -1, block.alpha2)):
+            shape.check_rolling(corner, side, float(alpha))
         return block
 
     @classmethod
@@ -221,20 +226,22 @@ class AsymmetricBlock(eqx.Module):
 
         **Arguments:**
 
-        - `mesh`, `unit`, `tolerance`: a `Rock`, or what `Rock.from_mesh` takes.
+        - `mesh`: a `Rock`, which knows `unit` and `tolerance`, or what `Rock.from_mesh` takes, with these as there.
         - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
         - `base`: "narrow" or "wide", as in `Rock.section`: where they differ the base is rounded, and it warns.
         - `restitution`, `gravity`: as in `from_radii`.
 
-        **Returns:** an `AsymmetricBlock`, which rocks in the plane alone. **Raises:** as `Rock.from_mesh`.
+        **Returns:** an `AsymmetricBlock`: rocking in the plane alone, without twisting, rolling sideways, or sliding.
+
+        **Raises:** as `Rock.from_mesh`, and ValueError for arguments outside their ranges.
         """
         return cls.from_corners(*section_of(mesh, azimuth, base, unit, tolerance)[:4], restitution, gravity)
 
     @property
     def radius_ratio(self) -> Real:
         """R2/R1: given, or that of a flat base."""
-        given = self.given_radius_ratio
-        return sine_cosine(self.alpha1)[1] / sine_cosine(self.alpha2)[1] if given is None else given
+        flat = sine_cosine(self.alpha1)[1] / sine_cosine(self.alpha2)[1]
+        return flat if self.given_radius_ratio is None else self.given_radius_ratio
 
     @property
     def inertia_ratio2(self) -> Real:
@@ -254,7 +261,7 @@ class AsymmetricBlock(eqx.Module):
 
     @property
     def restitution2(self) -> Real:
-        """The same on side 2."""
+        """The same for an impact that ends the stay on side 2."""
         return self.law.ratio(self.corners[1], jnp.zeros_like(self.p1))
 
     @property
@@ -273,6 +280,5 @@ class AsymmetricBlock(eqx.Module):
     @property
     def mirrored(self) -> "AsymmetricBlock":
         """The block seen from behind: its sides exchanged."""
-        law = PerSide(self.law.second, self.law.first) if isinstance(self.law, PerSide) else self.law
         radii = None if self.given_radius_ratio is None else 1 / self.given_radius_ratio
-        return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, law)
+        return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, self.law.mirrored)

@@ -75,6 +75,11 @@ class AbstractRestitution(eqx.Module):
         """Whether the ratio depends on the speed of the impact; if not, it is computed once for a scene."""
         return True
 
+    @property
+    def mirrored(self) -> "AbstractRestitution":
+        """The law of the block seen from behind: its sides exchanged. Another one where the law itself knows sides."""
+        return self
+
     def most(self, corners: Corners, speed: Real) -> Real:
         """An upper bound of the ratio of all impacts up to a speed; as it stands, of a law that rises or falls."""
         return jnp.maximum(self.ratio(corners, jnp.zeros_like(speed)), self.ratio(corners, speed))
@@ -183,6 +188,11 @@ class PerSide(AbstractRestitution):
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """That of the side."""
         return self.second if corners.side < 0 else self.first
+
+    @property
+    def mirrored(self) -> "PerSide":
+        """The ratios exchanged."""
+        return PerSide(self.second, self.first)
 
     @property
     def depends_on_speed(self) -> bool:
