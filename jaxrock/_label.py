@@ -19,4 +19,5 @@ class Label:
         return 0
 
     def __repr__(self):
-        return repr(self.value)
+        first = self.value[0] if isinstance(self.value, tuple) and self.value else self.value
+        return repr(first)

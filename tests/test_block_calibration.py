@@ -100,6 +100,7 @@ def test_rotations_say_more_than_verdicts(found):
         assert abs(np.log(float(more.values[name]) / truth)) < 3 * float(more.standard_errors[name])
 
 
+@pytest.mark.slow
 def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
     make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)
     ways = np.where(np.random.default_rng(2).random(12) < 0.5, 1, -1)

@@ -136,6 +136,7 @@ def test_a_film_follows_the_response(response):
     assert f"{int(response.impact_count)} impact" in axis.get_title()
 
 
+@pytest.mark.slow
 def test_a_film_of_a_column():
     response = rk.simulate(COLUMN, rk.SinePulse(0.4, 1.6), duration=4.0)
     np.testing.assert_allclose(response.column(1.3)[-1], response(1.3)[1])

@@ -388,7 +388,10 @@ def test_scenes_do_not_fall_back(name, caplog):
     assert "left to XLA" not in caplog.text
 
 
-@pytest.mark.parametrize("name", ["two records", "vertical records", "two sides, vertical"])
+@pytest.mark.parametrize(
+    "name",
+    ["two records", *(pytest.param(x, marks=pytest.mark.slow) for x in ("vertical records", "two sides, vertical"))],
+)
 def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
     """The knots of two motions are sorted once, and the blocks do the same as where XLA runs all of it."""
     a, u = jnp.full(20, 0.2), jnp.linspace(0.8, 2.0, 20)

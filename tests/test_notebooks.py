@@ -16,6 +16,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # `test_found_record` judge.
 SLOW = {
     "03_a_block_of_your_own",
+    "04_single_lobe_pulses",
     "05_one_sine_pulse",
     "06_similarity",
     "07_sensitivity",
