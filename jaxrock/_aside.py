@@ -2,6 +2,7 @@
 
 import _thread
 import contextlib
+import errno
 import os
 import shutil
 import time
@@ -22,8 +23,10 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
     - `replace`: whether it takes the place of a file that is there.
     - `lasting`: whether it has reached the disk before it is renamed, so that it outlives a loss of power.
 
-    **Raises:** FileExistsError where somebody else was faster, unless it replaces.
+    **Raises:** FileExistsError where somebody else was faster, unless it replaces; IsADirectoryError.
     """
+    if not path.name:  # the root, or where one is
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     aside = path.with_name(f".{path.name[:64]}.{uuid.uuid4().hex}.partial")
     try:
         yield aside

@@ -186,6 +186,12 @@ def test_what_is_written_is_read_again(tmp_path):
     np.testing.assert_allclose(rk.read_record(path, unit="cm/s2").samples, SAMPLES, rtol=1e-15)
 
 
+@pytest.mark.parametrize("path", ["", "/"])
+def test_a_folder_is_no_file(path):
+    with pytest.raises(IsADirectoryError):
+        rk.write_at2(rk.Record(SAMPLES, 0.01), path)
+
+
 @pytest.mark.parametrize("kind", ["AT2", "CSV", "V2"])
 def test_a_million_samples_in_seconds(tmp_path, kind):
     """In one second on a quiet core; where lines are looked at one by one it takes twenty."""

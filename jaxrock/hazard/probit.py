@@ -93,7 +93,10 @@ def fit_probit(
     first = lists[0]
     if first.ndim != 1 or first.size < 2 or any(each.shape != first.shape for each in lists):
         raise ValueError(f"Argument `measures` must hold lists of one length, but of {[x.shape for x in lists]}.")
-    trials = jnp.broadcast_to(not_negative("trials", trials), first.shape)
+    trials = not_negative("trials", trials)
+    if trials.shape not in ((), first.shape):
+        raise ValueError(f"Argument `trials` must have shape {first.shape} or (), but has shape {trials.shape}.")
+    trials = jnp.broadcast_to(trials, first.shape)
     toppled = outcomes(toppled, first, trials)
     if errors is None:
         errors = "information" if clusters is None else "clusters"

@@ -16,7 +16,7 @@ import scipy.optimize
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, known, list_of
-from jaxrock._checks import Values, as_real, below_one, share, shown
+from jaxrock._checks import Values, as_real, below_one, share, shown, whole
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
 from jaxrock.inverse.unknowns import Unknown
@@ -233,6 +233,7 @@ def _axes(unknowns, scatter, cells) -> dict[str, Axis]:
     if isinstance(cells, Mapping) and not set(cells) <= set(unknowns):
         raise ValueError(f"Argument `cells` must have some of the names {sorted(unknowns)}, but has {sorted(cells)}.")
     counts = cells if isinstance(cells, Mapping) else dict.fromkeys(unknowns, cells)
+    counts = {name: whole("cells", count, 8, 4096) for name, count in counts.items()}
     return {name: Axis.of(name, each, scatter.get(name), counts.get(name, 64)) for name, each in unknowns.items()}
 
 
@@ -249,7 +250,7 @@ def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarra
     seen, ways = of_tests("toppled", toppled, (1, 0, -1)), of_tests("facing", facing, (1, 0, -1))
     if rotation is None:
         return seen, ways, None
-    told = np.asarray(rotation, float)
+    told = np.asarray(as_real("rotation", rotation), float)
     if told.shape != (count,) or not (np.isnan(told) | (told == 0) | (told >= STILL)).all():
         raise ValueError(f"Argument `rotation` must hold 0, {STILL} or more, or NaN for each of {count} tests.")
     if (np.isfinite(told) & (seen == 1)).any():
