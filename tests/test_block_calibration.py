@@ -135,8 +135,8 @@ def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
         ({"rotation": [0.5]}, "`rotation` must be NaN for tests that toppled"),
         ({"folds": 5}, "`folds` must be 0, or from 2 to the 1 groups"),
         ({"cells": {"q": 9}}, "`cells` must have some of the names"),
-        ({"cells": {"alpha": np.inf}}, "`cells` must be a whole number from 8 to 4096"),
-        ({"rotation": "high"}, "`rotation` must be a number or an array"),
+        ({"cells": {"alpha": 4}}, "`cells` must be a whole number from 8 to 4096"),
+        ({"groups": [[1, 2], [3]]}, "`groups` must hold a label for each of 1 tests"),
         ({"block": lambda beta: rk.Block(beta, 2.0)}, "`block` must make a block of"),
     ],
 )

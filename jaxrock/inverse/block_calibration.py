@@ -211,13 +211,13 @@ def calibrate_block(
     axes = _axes(unknowns, scatter, cells)
     places = {**unknowns, **{f"{name}_sd": each for name, each in scatter.items() if isinstance(each, Unknown)}}
     seen, ways, told = _tests(len(suite), toppled, facing, rotation)
-    lanes = _blocks(block, axes)
+    lanes, dealt = _blocks(block, axes), _dealt(groups, len(suite), folds)
     found = scenes(
         lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
     )
     table = Table.of(found, seen, ways, told, rotation_sd, tuple(axis.count for axis in axes.values()))
     problem = _Problem(dict(places), axes, table, lapse)
-    return _fitted(problem, _dealt(groups, len(suite), folds))
+    return _fitted(problem, dealt)
 
 
 def _axes(unknowns, scatter, cells) -> dict[str, Axis]:
@@ -267,9 +267,14 @@ def _blocks(block: Callable, axes: dict[str, Axis]):
         raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
 
 
+def _numbered(labels) -> np.ndarray:
+    """A number for each label: those of one label have the same."""
+    return np.unique([str(label) for label in np.atleast_1d(np.asarray(labels, object))], return_inverse=True)[1]
+
+
 def _dealt(groups, count: int, folds: int) -> np.ndarray | None:
     """In which part every test is left out."""
-    labels = np.arange(count) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
+    labels = np.arange(count) if groups is None else _numbered(groups)
     if labels.shape != (count,):
         raise ValueError(f"Argument `groups` must hold a label for each of {count} tests, but has {labels.shape}.")
     number = int(labels.max()) + 1

@@ -13,7 +13,7 @@ import scipy.signal
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least, known, word_of
-from jaxrock._checks import Values, factor as any_factor, finite, not_negative, positive, scalar, size, strength
+from jaxrock._checks import Values, delay, factor as any_factor, not_negative, positive, scalar, size, strength
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
@@ -232,8 +232,8 @@ def cut(record: Record, begin: ArrayLike = 0.0, end: ArrayLike | None = None) ->
     **Raises:** ValueError for a part without samples.
     """
     samples, dt = _samples(record)
-    begin = float(scalar("begin", not_negative("begin", begin)))
-    end = (samples.size - 1) * dt if end is None else float(scalar("end", finite("end", end)))
+    begin = float(scalar("begin", delay("begin", begin)))
+    end = (samples.size - 1) * dt if end is None else float(scalar("end", delay("end", end)))
     first, last = int(np.ceil(begin / dt - 1e-9)), int(np.floor(min(end / dt, samples.size) + 1e-9))
     part = samples[first : last + 1]
     if last < first or part.size == 0:
