@@ -779,6 +779,7 @@ def _of_refusal(error: Exception) -> str | None:
 
 def _of_result(call: Call, result: Any) -> str | None:
     """Numbers that are not finite, where nothing says why."""
+    result = result.values if isinstance(result, rk.Grid) else result  # its axes are what was given
     leaves = jax.tree_util.tree_leaves_with_path(result)
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     if isinstance(result, rk.Outcome | rk.FlexibleOutcome):

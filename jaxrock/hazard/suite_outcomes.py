@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int8
 
 from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import Values, checked, positive, shown
+from jaxrock._checks import Values, checked, positive, shown, size
 from jaxrock._parameters import leaves_of
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -144,10 +144,12 @@ def suite_outcomes(
 
     **Source:** Vamvatsikos & Cornell (2002), incremental dynamic analysis.
     """
-    scales = np.atleast_1d(np.asarray(checked("scale", scale, "be positive and finite", _is_positive), float))
+    scales = np.atleast_1d(np.asarray(size("scale", scale), float))
     if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
         raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
     suite = motions if isinstance(motions, Suite) else Suite(motions)
+    strongest = float(np.max(suite.peak_acceleration))
+    checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
     blocks, ways = stacked(block), _FACINGS[facing]
     symmetric = isinstance(block, Block)
     factors = np.concatenate([way * scales for way in (ways[:1] if symmetric else ways)])
@@ -159,7 +161,3 @@ def suite_outcomes(
         return np.repeat(values, len(ways), axis=2) if symmetric else values
 
     return SuiteOutcomes(suite, blocks, scales, ways, *map(by_facing, found))
-
-
-def _is_positive(x):
-    return (x > 0) & (x < np.inf)

@@ -246,6 +246,8 @@ def mean_period(motion: AbstractMotion) -> float:
     **Source:** Rathje, Abrahamson & Bray (1998).
     """
     lines = straight(motion)
+    if lines.length.size == 0:
+        raise ValueError("Argument `motion` must last, but ends where it begins.")
     step = lines.length.min()
     time = step * np.arange(int(np.floor(lines.times[-1] / step * (1 + 1e-12))) + 1)
     knots = np.stack([lines.times[:-1], lines.times[1:] - 1e-9 * step], axis=1).ravel()
