@@ -362,3 +362,16 @@ def test_second_derivatives():
     assert float(bent(at)) == pytest.approx(float(slope(at + 1e-5) - slope(at - 1e-5)) / 2e-5, rel=1e-6)
     twice = (float(value(at + step)) - 2 * float(value(at)) + float(value(at - step))) / step**2
     assert float(bent(at)) == pytest.approx(twice, rel=5e-3)
+
+
+def test_compiled_by_the_user():
+    """`outcome` and `simulate` know a flexible block within `jax.jit`, too."""
+
+    def peaks(width):
+        block = rk.FlexibleBlock(width, 3.0, 3e9, 2500.0, 0.02, masses=2)
+        pulse = rk.SinePulse(0.3, 0.8)
+        found = rk.outcome(block, pulse, duration=2.0)
+        return found.max_rotation, rk.simulate(block, pulse, duration=2.0, samples=11).rotation
+
+    for found, expected in zip(jax.jit(peaks)(0.6), peaks(0.6)):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)

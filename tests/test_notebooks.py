@@ -61,6 +61,9 @@ def test_what_readers_see(path):
     for numbers in re.findall(r"\[([^\[\]]*)\]", text):
         assert len(re.findall(r"\d\.\d+", numbers)) <= 12, numbers
     assert any(cell.outputs for cell in code)
+    outputs = [output for cell in code for output in cell.outputs]
+    assert not [output.evalue for output in outputs if output.output_type == "error"]
+    assert not re.search(r"/(tmp|home|root|work|Users)/", "".join(str(output.get("text", "")) for output in outputs))
 
 
 @in_repository

@@ -51,7 +51,8 @@ def steps_of_flexible(model: AbstractEquation, initial: tuple, engine: AbstractE
     """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
     if model is not USUAL:
         raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")
-    if any(isinstance(x, jax.core.Tracer) or x != 0 for x in start_of(initial)):
+    # By NumPy: within `jax.jit` a comparison by JAX is traced, however well its sides are known.
+    if any(isinstance(x, jax.core.Tracer) or np.asarray(x) != 0 for x in start_of(initial)):
         raise ValueError(
             f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {shown(initial)}."
         )

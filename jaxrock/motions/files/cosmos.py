@@ -1,6 +1,5 @@
 """COSMOS, the format of strong-motion centres for one channel a file: V1 (uncorrected) and V2 (also V2c)."""
 
-import functools
 import re
 
 from jaxrock._text import check_end, file_error
@@ -8,11 +7,10 @@ from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import (
     agreed_step,
     agreed_unit,
-    announced_samples,
+    announced_columns,
     check_peak,
     fixed_numbers,
     no_column,
-    numbers_of_width,
 )
 from jaxrock.motions.record import Origin
 
@@ -52,14 +50,7 @@ class COSMOS(AbstractFormat):
             found = f"{count} samples in {seconds} s, but the header a time step of {step:g} s"
             raise file_error(name, f"line {at + 1} states {found}.")
         width = int(width)
-        samples = announced_samples(
-            name,
-            lines,
-            at + 1,
-            int(count),
-            lambda line: fixed_numbers(line, width),
-            functools.partial(numbers_of_width, width=width),
-        )
+        samples = announced_columns(name, lines, at + 1, int(count), width)
         if not any(re.match(r"\s*End-of-data", line, re.IGNORECASE) for line in lines[at + 1 :][-20:]):
             check_end(name, lines, [line[-width:] for line in lines[at + 1 :] if line.strip()], by_program=True)
         if unit == "cm/s2" and reals[_PEAK] != _UNKNOWN:

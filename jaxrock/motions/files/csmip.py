@@ -3,7 +3,6 @@
 A V1 file (uncorrected) of evenly spaced samples announces them likewise; spectra (V3) are refused by what they are.
 """
 
-import functools
 import re
 
 import numpy as np
@@ -14,10 +13,9 @@ from jaxrock.motions.files.parsing import (
     NUMBER,
     agreed_step,
     agreed_unit,
-    announced_samples,
+    announced_columns,
     check_peak,
     fixed_numbers,
-    numbers_of_width,
     to_float,
 )
 from jaxrock.motions.record import Origin
@@ -62,14 +60,7 @@ class CSMIP(AbstractFormat):
         unit = agreed_unit(name, at + 1, unit, written)
         dt = agreed_step(name, dt, to_float(step))
         width = int(width or 10)
-        samples = announced_samples(
-            name,
-            lines,
-            at + 1,
-            int(count),
-            lambda line: fixed_numbers(line, width),
-            functools.partial(numbers_of_width, width=width),
-        )
+        samples = announced_columns(name, lines, at + 1, int(count), width)
         if channel == len(channels) - 1:
             _check_end(name, lines, at + 1, width)
         if unit == "cm/s2":

@@ -3,6 +3,7 @@
 Nothing is guessed: where a header announces a count, a unit or a time step, contradictions raise.
 """
 
+import functools
 import re
 from collections.abc import Callable
 
@@ -145,6 +146,12 @@ def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Call
         elif values:
             break
     return values
+
+
+def announced_columns(name: str, lines: list[str], start: int, count: int, width: int) -> np.ndarray:
+    """`announced_samples` in columns `width` wide, which may touch."""
+    parse, at_once = functools.partial(fixed_numbers, width=width), functools.partial(numbers_of_width, width=width)
+    return announced_samples(name, lines, start, count, parse, at_once)
 
 
 def fixed_numbers(line: str, width: int) -> list[float] | None:

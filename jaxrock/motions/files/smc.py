@@ -1,6 +1,5 @@
 """SMC, the format of the USGS: eleven lines of text, numbers of two headers in fixed places, comments, samples."""
 
-import functools
 import re
 
 from jaxrock._text import check_end, file_error
@@ -8,11 +7,10 @@ from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import (
     agreed_step,
     agreed_unit,
-    announced_samples,
+    announced_columns,
     check_peak,
     fixed_numbers,
     no_column,
-    numbers_of_width,
 )
 from jaxrock.motions.record import Origin
 
@@ -49,14 +47,7 @@ class SMC(AbstractFormat):
         start = _TEXT + _WHOLE + _REAL + max(whole[_COMMENTS], 0)
         if any(not line.startswith("|") for line in lines[_TEXT + _WHOLE + _REAL : start]):
             raise file_error(name, f"header announces {whole[_COMMENTS]} lines of comments, which are not there.")
-        samples = announced_samples(
-            name,
-            lines,
-            start,
-            whole[_COUNT],
-            lambda line: fixed_numbers(line, _WIDTH),
-            functools.partial(numbers_of_width, width=_WIDTH),
-        )
+        samples = announced_columns(name, lines, start, whole[_COUNT], _WIDTH)
         last = next(line for line in reversed(lines) if line.strip()).rstrip()
         check_end(name, lines, [lines[start][:_WIDTH]] * 2 + [last[-_WIDTH:]], by_program=True)
         peaks = [abs(real[place]) for place in (_LARGEST, _SMALLEST) if abs(real[place]) < _UNKNOWN]
