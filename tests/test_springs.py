@@ -321,34 +321,6 @@ def test_histories_of_lumped_masses(law, count):
     np.testing.assert_allclose(response.impact_times[: len(impacts)], impacts, atol=1e-8)
 
 
-SHARED = Path(__file__).parents[2] / "shared" / "reference"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (SHARED / "springs.json").exists(), reason="the histories are not part of the package")
-@pytest.mark.parametrize(
-    ("name", "law"), [("SM_b_cos", "linear"), ("SM_a_exact_cos", "sine"), ("SM1_c_plastic_cos", "plastic")]
-)
-def test_histories_of_the_paper(name, law):
-    """Blocks and pulses of figures 5, 7, 9, 11 and 16: rotation and velocity of a DOP853 of its own."""
-    cases = [case for case in json.loads((SHARED / "springs.json").read_text())["cases"] if name in case["results"]]
-    stored = np.load(SHARED / "springs.npz")
-    assert len(cases) >= 3
-    for case in cases:
-        one, ground, known = case["params"], case["ground"], case["results"][name]
-        ratio, period = one["h_over_b"], 2 * np.pi / ground["omega"]
-        block = rk.Block(np.arctan(1 / ratio), np.sqrt(one["p2"]), one["eta"])
-        model = rk.Spring("mmSM" if one["n_masses"] else "SM1", law, one["n_masses"])
-        size = ground["ap"] / one["g"]
-        sine = "sine" in ground["type"]
-        motion = rk.SinePulse(size, period) if sine else rk.RickerPulse(size, period, center=ground["tc"])
-        response = rk.simulate(block, motion, model, duration=one["T"], samples=400)
-        assert response.impact_count == known["n_impacts"] or one["eta"] < 0.8  # that one comes to rest
-        for found, key in ((response.rotation, "theta"), (response.velocity, "thetadot")):
-            exact = stored[known["npz"][key]]
-            np.testing.assert_allclose(found, exact, rtol=0, atol=1e-7 * np.abs(exact).max())
-
-
 @pytest.mark.slow
 def test_kinds_are_one_model():
     """SM1, SM2 and SM3 differ by the law "plastic" alone, and the law "sine" rocks freely as the block itself does."""
