@@ -1,9 +1,14 @@
 """Every notebook runs from top to bottom, with fewer points; the files are left alone."""
 
+import ast
+import functools
+import inspect
 import re
 from pathlib import Path
 
 import pytest
+
+import jaxrock as rk
 
 nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient is installed")
 nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
@@ -11,10 +16,12 @@ nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-# Minutes of compilation, of what `test_arcs`, `test_borders`, `test_closed_forms`, `test_critical`, `test_inverse`,
-# `test_derivatives`, `test_similarity`, `test_springs`, `test_asymmetric_rocks`, `test_flexible`, `test_search` and
-# `test_found_record` judge.
+# Minutes of compilation, of what `test_arcs`, `test_block_calibration`, `test_borders`, `test_closed_forms`,
+# `test_critical`, `test_derivatives`, `test_asymmetric_rocks`, `test_flexible`, `test_found_record`, `test_hazard`,
+# `test_histories`, `test_inverse`, `test_search`, `test_similarity`, `test_spectra` and `test_springs` judge. All
+# of them are asked for names and arguments by `test_what_notebooks_call_there_is`.
 SLOW = {
+    "02_who_overturns",
     "03_a_block_of_your_own",
     "04_single_lobe_pulses",
     "05_one_sine_pulse",
@@ -22,11 +29,15 @@ SLOW = {
     "07_sensitivity",
     "08_recover_a_pulse",
     "09_published_rocks",
+    "10_hazard_curve_rejection",
+    "11_fit_a_history",
     "16_fit_it_yourself",
     "12_strength_duration_shape",
     "13_spring_models",
     "14_flexible_blocks",
+    "15_calibrate_a_block",
     "17_the_critical_record",
+    "errata",
 }
 
 
@@ -43,6 +54,32 @@ def test_notebook(path, monkeypatch, tmp_path_factory):
     with_fewer_points(notebook)
     beside = {"metadata": {"path": str(path.parent)}}  # where its data are
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=beside).execute()
+
+
+def called(tree):
+    """Of every call of the package in some code: the function and the names of its arguments."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("rk."):
+            yield ast.unparse(node), None
+        if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("rk."):
+            yield ast.unparse(node.func), [keyword.arg for keyword in node.keywords if keyword.arg]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_notebooks_call_there_is(path):
+    """Names of the package and of arguments, without running anything."""
+    code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    found = 0
+    for name, arguments in called(ast.parse("\n".join(re.sub(r"^[%!].*", "", text, flags=re.M) for text in code))):
+        if not re.fullmatch(r"[\w.]+", name):
+            continue  # of what a call returns
+        there = functools.reduce(getattr, name.split(".")[1:], rk)
+        if arguments:
+            taken = inspect.signature(there).parameters
+            if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):
+                assert set(arguments) <= set(taken), name
+        found += 1
+    assert found
 
 
 def with_fewer_points(notebook):

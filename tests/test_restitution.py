@@ -60,7 +60,7 @@ def outcomes(found) -> list[np.ndarray]:
     [
         (SOFT, "series"),
         (BRITTLE, "series"),
-        (BRITTLE, "diffrax"),
+        pytest.param(BRITTLE, "diffrax", marks=pytest.mark.slow),
         pytest.param(SOFT, "diffrax", marks=pytest.mark.slow),
     ],
 )
@@ -128,16 +128,19 @@ def scenes(count: int, seed: int = 0):
     return alpha, p, np.tan(alpha) * draw.uniform(1.2, 5.0, count), draw.uniform(0.4, 2.5, count)
 
 
-def followed(law, engine=None, count: int = 200):
+@jax.jit
+def followed(law, numbers, engine=None):
+    """Compiled once for every kind of law."""
+
     def one(alpha, p, amplitude, period):
         return rk.outcome(rk.Block(alpha, p, law), rk.SinePulse(amplitude, period), engine=engine)
 
-    return jax.jit(jax.vmap(one))(*scenes(count))
+    return jax.vmap(one)(*numbers)
 
 
 def test_a_law_that_does_not_change_is_a_number():
     """Of the same numbers, by the code for laws that may change: peaks, margins and errors are the same."""
-    plain, seeming = followed(0.9), followed(rk.restitution.SpeedDependent(0.9, 0.9, 1.0))
+    plain, seeming = (followed(law, scenes(200)) for law in (0.9, rk.restitution.SpeedDependent(0.9, 0.9, 1.0)))
     lost = np.asarray(plain.overturned)
     assert 20 < lost.sum() < 180
     for one, other in zip(outcomes(plain), outcomes(seeming)):
@@ -145,9 +148,11 @@ def test_a_law_that_does_not_change_is_a_number():
     np.testing.assert_allclose(plain.error, seeming.error, rtol=1e-6)
 
 
+@pytest.mark.slow  # fast: the laws with the series engine above, both engines in `test_engines_agree`
 def test_both_engines_agree():
     """Free stages by energy and by arcs, verdicts, peaks and margins."""
-    one, other = followed(SOFT, count=40), followed(SOFT, rk.Diffrax(rtol=1e-9), count=40)
+    few = [x[:40] for x in scenes(200)]
+    one, other = jax.tree.map(lambda x: x[:40], followed(SOFT, scenes(200))), followed(SOFT, few, rk.Diffrax(rtol=1e-9))
     assert (np.asarray(one.status == rk.Status.successful)).all()
     np.testing.assert_array_equal(one.overturned, other.overturned)
     safe = ~np.asarray(one.overturned)
@@ -157,9 +162,9 @@ def test_both_engines_agree():
 
 
 def test_many_scenes_are_as_one():
-    many = followed(SOFT, count=80)
+    many = followed(SOFT, scenes(200))
     for k in (0, 7, 31):
-        alpha, p, amplitude, period = (x[k] for x in scenes(80))
+        alpha, p, amplitude, period = (x[k] for x in scenes(200))
         one = rk.outcome(rk.Block(alpha, p, SOFT), rk.SinePulse(amplitude, period))
         np.testing.assert_allclose(float(one.margin), float(many.margin[k]), rtol=1e-9)
         assert int(one.impact_count) == int(many.impact_count[k])
@@ -169,7 +174,8 @@ def test_derivatives_by_its_parameters():
     """Forward and reverse mode beside differences."""
 
     def peak(x):
-        return rk.outcome(rk.Block(0.2, 2.0, rk.restitution.SpeedDependent(*x)), PULSE).max_rotation
+        block, engine = rk.Block(0.2, 2.0, rk.restitution.SpeedDependent(*x)), rk.Series(order=6)
+        return rk.outcome(block, PULSE, rk.Linear(), engine=engine).max_rotation
 
     at = jnp.array([0.95, 0.6, 0.3])
     forward, reverse = jax.jacfwd(peak)(at), jax.grad(peak)(at)
@@ -211,7 +217,11 @@ def test_impacts_that_end_rocking():
     assert 0 < int(found.impact_count) < int(constant.impact_count)
 
 
-@pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+@pytest.mark.parametrize(
+    "engine",
+    [ENGINES["series"], pytest.param(ENGINES["diffrax"], marks=pytest.mark.slow)],
+    ids=ENGINES,
+)
 def test_a_law_that_gains_energy_has_no_result(engine):
     found = rk.outcome(rk.Block(0.2, 2.0, Gaining()), PULSE, engine=engine)
     assert found.status == rk.Status.not_finite
@@ -257,7 +267,7 @@ def test_errors_grow_with_its_slope():
 def test_friction_at_impacts():
     """A more violent impact keeps less and needs more friction."""
     block = rk.Block(0.2, 2.0, SOFT)
-    response = rk.simulate(block, PULSE)
+    response = rk.simulate(block, PULSE, duration=2.8)  # as above: compiled once
     needed = rk.contact_forces(response, block).friction_at_impact
     speeds = np.asarray(response.impact_velocities)
     for side, friction in zip((1, -1), needed):
