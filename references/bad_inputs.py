@@ -846,8 +846,10 @@ def main(words: list[str]) -> int:
     if chosen not in ("", "cheap"):
         names = [name for name in names if re.search(chosen, name)]
     tried, found = attack(count, seed, names)
-    print(json.dumps({"tried": tried, "found": found}, indent=1))
-    return 1 if found else 0
+    called = {name.split(".")[0] for name in CALLS}
+    forgotten = sorted((public_names() - NOT_CALLED - called) | (NOT_CALLED - public_names()))
+    print(json.dumps({"tried": tried, "found": found, "forgotten": forgotten}, indent=1))
+    return 1 if found or forgotten else 0
 
 
 if __name__ == "__main__":

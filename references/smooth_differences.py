@@ -7,7 +7,7 @@ import numpy as np
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
 
-def gradient(function: Callable, points: np.ndarray, step: float = 1e-3) -> np.ndarray:
+def gradient(function: Callable, points: np.ndarray, step: float = 2e-4) -> np.ndarray:
     """Derivatives (rows, columns) of a function of many points, (rows, columns) to rows, by each of its columns."""
     points = np.asarray(points, float)
 

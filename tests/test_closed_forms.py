@@ -141,24 +141,27 @@ def test_walls_of_the_pulse_in_220_digits(_, duration, shape):
             assert above < 1 < below
 
 
+# A minute is compiled for both. The time of the peak has the derivatives that its rotation is made of.
+PEAKS = [single_lobe.peak_time, pytest.param(single_lobe.peak_rotation, marks=pytest.mark.slow)]
+
+
 @pytest.mark.parametrize("part, duration, shape", list(lobes()))
-def test_single_lobe_gradients(part, duration, shape):
-    strength = above_wall(part, duration, shape)
+@pytest.mark.parametrize("function", [single_lobe.safety_wall, *PEAKS])
+def test_single_lobe_gradients(function, part, duration, shape):
+    wall = function is single_lobe.safety_wall
+    values = (duration, shape) if wall else (above_wall(part, duration, shape), duration, shape)
     step = mp.mpf(10) ** -20
     with mp.workdps(220):
-        for name in ("wall", "peak_time", "peak_rotation"):
-            function = single_lobe.safety_wall if name == "wall" else getattr(single_lobe, name)
-            values = (duration, shape) if name == "wall" else (strength, duration, shape)
-            found = jax.grad(function, argnums=tuple(range(len(values))))(*values)
-            exact = []
-            for i in range(len(values)):
-                ends = []
-                for side in (1, -1):
-                    moved = [mp.mpf(v) for v in values]
-                    moved[i] += side * step
-                    ends.append(printed(name, *([0.5] if name == "wall" else []), *moved))
-                exact.append(float((ends[0] - ends[1]) / (2 * step)))
-            np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-11 * np.max(np.abs(exact)))
+        found = jax.grad(function, argnums=tuple(range(len(values))))(*values)
+        exact = []
+        for i in range(len(values)):
+            ends = []
+            for side in (1, -1):
+                moved = [mp.mpf(v) for v in values]
+                moved[i] += side * step
+                ends.append(printed("wall", 0.5, *moved) if wall else printed(function.__name__, *moved))
+            exact.append(float((ends[0] - ends[1]) / (2 * step)))
+        np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-11 * np.max(np.abs(exact)))
 
 
 @pytest.mark.parametrize("duration", [0.05, 1.0, 2.0, 7.0, 20.0, 300.0])
@@ -217,11 +220,12 @@ def test_single_lobe_safe_arguments():
         single_lobe.safety_wall(-1.0, 0.0)
     with pytest.raises(ValueError, match="Argument `shape` must be a number"):
         single_lobe.safety_wall(1.0, np.nan)
-    for function in (single_lobe.peak_rotation, single_lobe.peak_time):
-        gradients = jax.vmap(jax.grad(function))(
-            np.array([0.1, 0.5, 0.9, 1.0, 1.5]), np.full(5, 2.0), np.array([0.0, 1.0, -np.inf, 5.0, np.inf])
-        )
-        assert np.all(np.isfinite(gradients))
+
+
+@pytest.mark.parametrize("function", PEAKS)
+def test_single_lobe_safe_gradients(function):
+    for strength, shape in [(0.1, 0.0), (0.5, 1.0), (0.9, -np.inf), (1.0, 5.0), (1.5, np.inf)]:
+        assert np.isfinite(jax.grad(function, argnums=(0, 1, 2))(strength, 2.0, shape)[0])  # compiled above
 
 
 @jax.jit
@@ -273,10 +277,13 @@ def test_histories_agree_with_the_single_lobe():
 # ---- Sine pulse ----
 
 
+intervals = functools.cache(sine_pulse.overturning_intervals)
+
+
 def test_sine_intervals_against_the_papers_numbers(references):
-    for case in references["linear_sine_intervals"][::7]:  # the others: the test of the engine's intervals
+    for case in references["linear_sine_intervals"][::14]:  # the others: the test of the engine's intervals
         ratio, e = float(case["frequency_ratio"]), float(case["restitution"])
-        found = sine_pulse.overturning_intervals(ratio, e)
+        found = intervals(ratio, e)
         lower, upper = np.array([[float(x) if x else np.inf for x in ends] for ends in case["ends"]]).T
         np.testing.assert_allclose(found.lower, lower, rtol=1e-13)
         np.testing.assert_allclose(found.upper, upper, rtol=1e-13)
@@ -288,7 +295,7 @@ def engine_sine(intensity, ratio, e):
     return rk.outcome(rk.Block(ALPHA, 1.0, e), rk.SinePulse(ALPHA * intensity, 2 * jnp.pi / ratio), rk.Linear())
 
 
-QUICK = {(0.5, 0.9), (1.05, 0.95), (4.2, 0.9), (5.3, 1.0)}
+QUICK = {(0.5, 0.9), (4.2, 0.9), (5.3, 1.0)}
 
 
 @pytest.mark.parametrize("ratio, e", [
@@ -314,9 +321,8 @@ def test_engine_finds_every_interval(ratio, e):
 
 def test_islands():
     """What the paper's four curves miss: overturning after 3, 5, 7... impacts at low frequency."""
-    found = sine_pulse.overturning_intervals(0.5, 0.8)
-    np.testing.assert_array_equal(found.impacts, [5, 3, 1, 0])
-    np.testing.assert_array_equal(sine_pulse.overturning_intervals(3.0, 0.9).impacts, [1, 0])
+    np.testing.assert_array_equal(intervals(0.5, 0.8).impacts, [5, 3, 1, 0])
+    np.testing.assert_array_equal(intervals(3.0, 0.9).impacts, [1, 0])
 
 
 @pytest.mark.slow

@@ -150,13 +150,15 @@ def test_progress_bar(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_figures(surface, tmp_path):
+def test_figures(tmp_path):
     """Every function draws into given axes or its own, and returns them."""
-    response = rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.5, 1.1))
+    linear = {"restitution": 0.9, "model": rk.Linear(), "progress": False}
+    surface = rk.overturning_map(RATIOS[::6], INTENSITIES[::4], **linear)
+    response = rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.5, 1.1), rk.Linear())
     axes = rk.plot.history(response)
     assert len(axes) == 3 and axes[2].get_xlabel() == "time [s]"
     assert "manifold" in rk.plot.phase(response).get_legend().get_texts()[0].get_text()
-    spectrum = rk.self_similar_spectrum([2.0, 4.0], [1.5, 3.0], restitution=0.9)
+    spectrum = rk.self_similar_spectrum([2.0, 4.0], [1.5, 3.0], **linear)
     assert len(rk.plot.spectrum(spectrum)) == 2
     _, axis = plt.subplots()
     assert rk.plot.overturning(surface, axis) is axis
@@ -164,16 +166,15 @@ def test_figures(surface, tmp_path):
     plt.close("all")
 
 
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}
 FEW_RATIOS, FEW_INTENSITIES, PERIODS = np.array([2.0, 5.0, 6.0]), np.array([1.5, 2.5]), np.array([2.0, 5.0, 9.0])
 TRACED = {
-    "map, slenderness": lambda alpha: (
-        rk.overturning_map(FEW_RATIOS, FEW_INTENSITIES, alpha=alpha, progress=False).margin
-    ),
-    "map, axes": lambda alpha: rk.overturning_map(5 * alpha * FEW_RATIOS, FEW_INTENSITIES, progress=False).margin,
+    "map, slenderness": lambda alpha: rk.overturning_map(FEW_RATIOS, FEW_INTENSITIES, alpha=alpha, **QUICK).margin,
+    "map, axes": lambda alpha: rk.overturning_map(5 * alpha * FEW_RATIOS, FEW_INTENSITIES, **QUICK).margin,
     "map, shape of a pulse": lambda shape: (
         (
             rk.overturning_map(
-                FEW_RATIOS, FEW_INTENSITIES, pulse=lambda a, t: rk.ExponentialPulse(a, t, shape), progress=False
+                FEW_RATIOS, FEW_INTENSITIES, pulse=lambda a, t: rk.ExponentialPulse(a, t, shape), **QUICK
             )
         ).margin
     ),
@@ -183,17 +184,21 @@ TRACED = {
             uplift_strength=x * np.array([1, 2]),
             pulse=rk.ExponentialPulse,
             shape=x,
-            progress=False,
+            **QUICK,
         ).margin
     ),
-    "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, progress=False).max_rotation,
+    "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, **QUICK).max_rotation,
     "self-similar spectrum": lambda alpha: (
-        rk.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, progress=False).max_rotation
+        rk.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, **QUICK).max_rotation
     ),
 }
 
 
-@pytest.mark.parametrize("name", TRACED)
+# The axes: `test_maps_go_through_forward_mode`.
+SLOW = ("map, axes", "map, single lobes")
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in TRACED])
 def test_surfaces_go_through_transformations(name):
     """jit, vmap and derivatives; the same as on all devices."""
 
