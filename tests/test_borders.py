@@ -83,6 +83,7 @@ def test_borders_are_smooth(regions):
     assert np.max(np.abs(straight - exact)[drawn]) < 2e-3 * 9
 
 
+@pytest.mark.slow  # fast: the closed forms of a sine above, walls in `test_spectra`
 def test_the_wall_of_single_lobes():
     strength, duration = np.linspace(0.05, 0.95, 3), np.linspace(0.5, 6.0, 4)
     surface = rk.overturning_map(

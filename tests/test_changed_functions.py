@@ -428,7 +428,7 @@ def soft_sensitivities(model, engine):
     "study, kind",
     [
         (soft_map, "series"),
-        (soft_map, "functions"),
+        pytest.param(soft_map, "functions", marks=pytest.mark.slow),
         (soft_suite, "series"),
         pytest.param(soft_critical, "series", marks=pytest.mark.slow),
         pytest.param(soft_sensitivities, "series", marks=pytest.mark.slow),

@@ -514,7 +514,7 @@ print(before, len(caught), results[0].max_rotation.dtype)
     "block",
     [
         'rk.Block(0.2, 2.0), {"model": rk.Linear(), "engine": rk.Series(order=4)}',
-        "rk.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}",
+        pytest.param("rk.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}", marks=pytest.mark.slow),
     ],
     ids=["rigid", "flexible"],
 )

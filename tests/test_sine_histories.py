@@ -132,6 +132,7 @@ def test_histories_of_the_engine():
     assert np.all(np.isnan(sine_pulse.impact_velocity(a, w)[~hit])) and 10 < (~hit).sum() < 60
 
 
+@pytest.mark.slow  # fast: `test_sine_gradients` of what it is made of
 def test_derivatives():
     """By time the velocity; by intensity, frequency ratio and restitution as central differences, in every stage."""
     x = np.array(
