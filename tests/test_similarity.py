@@ -11,6 +11,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.studies import similarity
 from jaxrock.studies.similarity import orientations
+from references.smooth_differences import gradient
 
 TAU = np.linspace(0, 12, 400)
 
@@ -119,11 +120,10 @@ def lobe_peak(engine):
 @functools.cache
 def with_slopes(name):
     """Peaks of the lobes, and their derivatives."""
-    function = {
-        "closed form": lambda x: rk.closed_form.single_lobe.peak_rotation(*x),
-        "series": lobe_peak(None),
-        "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10)),
-    }[name]
+    if name == "closed form":
+        function = lambda x: rk.closed_form.single_lobe.peak_rotation(*x.T)
+        return function(LOBES), gradient(function, LOBES)
+    function = {"series": lobe_peak(None), "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10))}[name]
     return jax.jit(jax.vmap(jax.value_and_grad(function)))(LOBES)
 
 
