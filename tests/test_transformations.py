@@ -3,6 +3,8 @@
 Values by one call for each number; derivatives by differences of these, and of each other.
 """
 
+import functools
+import itertools
 import pickle
 import subprocess
 import sys
@@ -21,9 +23,14 @@ import jaxrock as rk
 BLOCK = rk.Block(0.2, 2.0, 0.9)
 COLUMN = rk.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
 AT = jnp.linspace(0.28, 0.32, 4)  # the block rocks under all of these
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
 
 
 def outcome(amplitude):
+    return rk.outcome(BLOCK, rk.SinePulse(amplitude, 0.8), **QUICK).max_rotation
+
+
+def of_housner(amplitude):
     return rk.outcome(BLOCK, rk.SinePulse(amplitude, 0.8)).max_rotation
 
 
@@ -107,12 +114,19 @@ SLOPES = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
+def combinations(ways, few):
+    """An outcome in all ways, a closed form in a few: both are recipes."""
+    for function, way in itertools.product((outcome, history, closed_form, column, by_diffrax), ways):
+        quick = function is outcome or (function is closed_form and way in few)
+        yield pytest.param(function, way, id=f"{function.__name__}-{way}", marks=() if quick else SLOW)
+
+
+@pytest.mark.parametrize("function, way", list(combinations(WAYS, ("vmap", "cond"))), indirect=["function"])
 def test_values(way, function, values):
     np.testing.assert_allclose(WAYS[way](function), values, rtol=2e-12)
 
 
-@pytest.mark.parametrize("way", SLOPES)
+@pytest.mark.parametrize("function, way", list(combinations(SLOPES, ("vmap of grad",))), indirect=["function"])
 def test_slopes(way, function, slopes):
     if way == "shard_map" and function is history:
         pytest.skip("reverse mode through a tape within shard_map needs check_vma=False")
@@ -141,11 +155,11 @@ def test_second_derivatives(function):
 
 
 def test_eager_jit_and_vmap_to_the_bit():
-    one = [rk.outcome(BLOCK, rk.SinePulse(a, 0.8)) for a in AT]
-    many = jax.vmap(lambda block, pulse: rk.outcome(block, pulse))(
+    one = [rk.outcome(BLOCK, rk.SinePulse(a, 0.8), **QUICK) for a in AT]
+    many = jax.vmap(lambda block, pulse: rk.outcome(block, pulse, **QUICK))(
         jax.tree.map(lambda x: jnp.broadcast_to(x, AT.shape), BLOCK), rk.SinePulse(AT, jnp.full(AT.shape, 0.8))
     )
-    compiled = [jax.jit(rk.outcome)(BLOCK, rk.SinePulse(a, 0.8)) for a in AT]
+    compiled = [jax.jit(functools.partial(rk.outcome, **QUICK))(BLOCK, rk.SinePulse(a, 0.8)) for a in AT]
     for name in ("max_rotation", "max_velocity", "time_of_max", "margin", "clearance", "error", "impact_count"):
         eager = np.array([getattr(each, name) for each in one])
         np.testing.assert_array_equal(eager, getattr(many, name))
@@ -178,13 +192,13 @@ def test_a_program_for_other_processes(function, values, tmp_path):
     assert of_nonsense != 0
 
 
-@pytest.mark.parametrize("platform", ["cuda", "rocm", "tpu"])
+@pytest.mark.parametrize("platform", ["cuda", pytest.param("rocm", marks=SLOW), "tpu"])
 def test_programs_for_accelerators(platform):
     """Lowered where there is none: no code for this processor in it, no call back to Python, of bounded size."""
     for function, shape, most in (
-        (outcome, (), 1.5e6),
-        (jax.vmap(outcome), (1024,), 3e6),
-        (jax.vmap(jax.grad(outcome)), (1024,), 6e6),
+        (of_housner, (), 1.5e6),
+        (jax.vmap(of_housner), (1024,), 3e6),
+        (jax.vmap(jax.grad(of_housner)), (1024,), 6e6),
     ):
         text = exported(function, [platform], shape).mlir_module()
         assert "custom_call" not in text or "jaxrock_" not in text
@@ -197,7 +211,7 @@ def test_nonsense_is_data_in_exported_programs():
     """There is nobody to raise an error there: numbers are not numbers, and the status says so."""
 
     def found(amplitude, alpha):
-        result = rk.outcome(rk.Block(alpha, 2.0, 0.9), rk.SinePulse(amplitude, 0.8))
+        result = rk.outcome(rk.Block(alpha, 2.0, 0.9), rk.SinePulse(amplitude, 0.8), **QUICK)
         return result.max_rotation, result.status == rk.Status.successful
 
     like = jax.ShapeDtypeStruct((), jnp.float64)
@@ -245,7 +259,8 @@ def test_debugging():
 
 
 def test_results_are_pickled_and_kept(tmp_path):
-    for found in (rk.outcome(BLOCK, rk.SinePulse(0.3, 0.8)), rk.simulate(BLOCK, rk.SinePulse(0.3, 0.8), samples=9)):
+    pulse = rk.SinePulse(0.3, 0.8)
+    for found in (rk.outcome(BLOCK, pulse, **QUICK), rk.simulate(BLOCK, pulse, samples=9, **QUICK)):
         again = pickle.loads(pickle.dumps(found))
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -259,7 +274,7 @@ def test_a_search_by_optax_under_vmap():
     """L-BFGS with its line search from several starts at once, as from each alone."""
 
     def loss(x):
-        found = rk.outcome(BLOCK, rk.SinePulse(jnp.exp(x[0]), jnp.exp(x[1])))
+        found = rk.outcome(BLOCK, rk.SinePulse(jnp.exp(x[0]), jnp.exp(x[1])), **QUICK)
         return (found.margin - 0.5) ** 2 + 1e-3 * (x**2).sum()
 
     def search(x):
