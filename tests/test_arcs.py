@@ -41,19 +41,19 @@ def test_equal_settings_are_one_engine():
 
 
 def test_single_budget():
-    assert rk.outcome(BLOCK, PULSE, engine=rk.Diffrax(max_solves=3)).status == rk.Status.step_budget_exhausted
+    found = rk.outcome(BLOCK, PULSE, rk.Linear(), engine=rk.Diffrax(max_solves=3))
+    assert found.status == rk.Status.step_budget_exhausted
 
 
 @pytest.mark.parametrize(
     "engine, tolerance",
     [
-        pytest.param(rk.Diffrax(solver=diffrax.Dopri8(), rtol=1e-9), 1e-8, id="Dopri8", marks=pytest.mark.slow),
-        pytest.param(
-            rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)", marks=pytest.mark.slow
-        ),
+        pytest.param(rk.Diffrax(solver=diffrax.Dopri8(), rtol=1e-9), 1e-8, id="Dopri8"),
+        pytest.param(rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)"),
         pytest.param(rk.Diffrax(controller=diffrax.ConstantStepSize()), 1e-6, id="constant steps"),
     ],
 )
+@pytest.mark.slow  # fast: `test_engines_agree`, `test_a_controller_with_arrays`
 def test_any_solver(engine, tolerance):
     """Explicit, implicit, adaptive or not: the same response within the tolerance."""
     exact, found = rk.outcome(BLOCK, PULSE), rk.outcome(BLOCK, PULSE, engine=engine)
@@ -88,19 +88,23 @@ def test_equation_needs_one_description(parts):
         rk.Equation(**parts)
 
 
-def test_equation_of_the_built_in_model():
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(rk.Equation(sine, cosine), marks=pytest.mark.slow),  # fast: `test_dissipation`
+        rk.Equation(acceleration=lambda x, v, push, block: -sine(x, block) - push * cosine(x, block)),
+    ],
+    ids=["moments", "acceleration"],
+)
+def test_equation_of_the_built_in_model(model):
     """Housner's equation, written as functions or as a whole right-hand side, is Housner's equation."""
     exact = rk.outcome(BLOCK, PULSE)
-    for model in (
-        rk.Equation(sine, cosine),
-        rk.Equation(acceleration=lambda x, v, push, block: -sine(x, block) - push * cosine(x, block)),
-    ):
-        table = model.moments(BLOCK)
-        assert float(table.saddle) == pytest.approx(0.2, rel=1e-15)
-        assert float(table.threshold) == pytest.approx(np.tan(0.2), rel=1e-15)
-        found = rk.outcome(BLOCK, PULSE, model)
-        assert found.status == rk.Status.successful and found.impact_count == exact.impact_count
-        assert abs(float(found.max_rotation - exact.max_rotation)) < 1e-8 * 0.2
+    table = model.moments(BLOCK)
+    assert float(table.saddle) == pytest.approx(0.2, rel=1e-15)
+    assert float(table.threshold) == pytest.approx(np.tan(0.2), rel=1e-15)
+    found = rk.outcome(BLOCK, PULSE, model)
+    assert found.status == rk.Status.successful and found.impact_count == exact.impact_count
+    assert abs(float(found.max_rotation - exact.max_rotation)) < 1e-8 * 0.2
 
 
 def test_dissipation():

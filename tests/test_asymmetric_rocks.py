@@ -31,7 +31,7 @@ def _facts(likelihood, values):
 
 def facts(observations):
     """Log-likelihoods, survival and surprise, (motions, rocks) each."""
-    likelihood = rk.Likelihood(observations, rk.SinePulse, SCATTER)
+    likelihood = rk.Likelihood(observations, rk.SinePulse, SCATTER, rk.Linear(), rk.Series(order=6))
     return [np.asarray(x) for x in _facts(likelihood, {k: jnp.asarray(x) for k, x in MOTIONS.items()})]
 
 

@@ -8,19 +8,21 @@ import pytest
 import jaxrock as rk
 from jaxrock.responses.outcome import _outcome
 
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
+
 
 class Unpadded(rk.Record):
     """A record that the engines take as it is."""
 
 
-@pytest.mark.parametrize("count", [65, 300])
+@pytest.mark.parametrize("count", [65, pytest.param(300, marks=pytest.mark.slow)])
 def test_room_for_more_samples_changes_nothing(count):
     """A record gets room for more samples, so that one program serves many lengths: results are those without."""
     samples, block = 1.5 * np.asarray(rk.example_record().samples)[380 : 380 + count], rk.Block(0.15, 3.0)
     kinds = rk.Record, Unpadded
-    for found, expected in zip(*(jax.tree.leaves(rk.outcome(block, kind(samples, 0.01))) for kind in kinds)):
+    for found, expected in zip(*(jax.tree.leaves(rk.outcome(block, kind(samples, 0.01), **QUICK)) for kind in kinds)):
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-15)
-    histories = [rk.simulate(block, kind(samples, 0.01), samples=101) for kind in kinds]
+    histories = [rk.simulate(block, kind(samples, 0.01), samples=101, **QUICK) for kind in kinds]
     np.testing.assert_allclose(*(history.time for history in histories), rtol=1e-15)
     np.testing.assert_allclose(*(history.rotation for history in histories), atol=1e-12)
 
@@ -30,7 +32,7 @@ def test_derivatives_by_the_time_step_with_room():
     samples, block = 1.5 * np.asarray(rk.example_record().samples)[380:510], rk.Block(0.15, 3.0)
 
     def slope(kind):
-        return jax.grad(lambda dt: rk.outcome(block, kind(samples, dt)).margin)(0.01)
+        return jax.grad(lambda dt: rk.outcome(block, kind(samples, dt), **QUICK).margin)(0.01)
 
     found, expected = slope(rk.Record), slope(Unpadded)
     assert abs(expected) > 1

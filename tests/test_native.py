@@ -371,7 +371,9 @@ SCENES = {
     ),
     "a scaled record": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin,
     "its derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin, (0, 1)),
-    "two records": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3)).margin,
+    "two records": lambda a, u: (
+        rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3), rk.Linear(), engine=rk.Series(order=6)).margin
+    ),
     "vertical records": lambda a, u: rk.outcome(rk.Block(a, 2.0), (u * SHORT).with_vertical(0.3 * SHORT)).margin,
     "two sides, vertical": lambda a, u: (
         rk.outcome(rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3))).margin
@@ -380,7 +382,13 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+# What the others are made of.
+FALL_BACK_SLOWLY = ("value", "derivatives", "a scaled record", "vertical records")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if x in FALL_BACK_SLOWLY else ()) for x in SCENES]
+)
 def test_scenes_do_not_fall_back(name, caplog):
     """A program that XLA has to take over is right, but many times as slow, and nothing tells."""
     with caplog.at_level(logging.DEBUG, "jaxrock"):
