@@ -155,7 +155,7 @@ def test_many_blocks_by_all_samples(settings):
         return jax.vmap(one, in_axes=(0, None))(alpha, samples)
 
     rows = jax.jit(jax.jacrev(many))(start)
-    step = 2e-5
+    step = 5e-6
     found = jax.jit(jax.vmap(many))(jnp.stack([start + k * step * d for d in changes for k in (-2, -1, 1, 2)]))
     assert set(np.sign(found[..., 0]).ravel()) == {-1.0, 1.0}
     values = jnp.where(jnp.isfinite(found), found, 0.0).reshape(2, 4, 3, 2)
