@@ -67,7 +67,9 @@ def test_one_scene_and_its_durations():
     block = rk.Block(0.1, 2.0, 0.9)
     amplitudes = rk.critical_amplitudes(block, rk.SinePulse(1.0, 2.5), rk.Linear())
     assert amplitudes.value.shape == (int(amplitudes.count),)
-    durations = rk.critical_durations(block, rk.SinePulse(amplitudes.value[0], 2.5), rk.Linear(), factor=(0.2, 5.0))
+    durations = rk.studies.critical_durations(
+        block, rk.SinePulse(amplitudes.value[0], 2.5), rk.Linear(), factor=(0.2, 5.0)
+    )
     assert float(np.abs(np.asarray(durations.value) - 2.5).min()) < 1e-10
     at = int(np.abs(np.asarray(durations.value) - 2.5).argmin())
     named = dict(zip(durations.names, np.asarray(durations.derivative[at])))
