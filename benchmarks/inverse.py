@@ -6,7 +6,7 @@
     python benchmarks/inverse.py posterior --rocks 100
     python benchmarks/inverse.py samplers
     python benchmarks/inverse.py probabilities
-    python benchmarks/inverse.py optimizers
+    python benchmarks/inverse.py optimizers [--rocks 100 --starts 64]
 
 Each adds what it measured to inverse.json and writes inverse.md from all of it; what is done of a coverage is kept,
 and goes on from there. Synthetic rocks are drawn anew in every repetition: sizes and shapes, then their true alpha, p
@@ -137,45 +137,69 @@ def posterior(kept: dict, rocks: int) -> None:
     write(kept)
 
 
-def samplers(kept: dict, rocks: int = 20, walkers: int = 24, steps: int = 2000) -> None:
-    """Points that `sample_motion` computes, beside those of an ensemble of walkers by NumPyro that begins at its
-    samples; effective sizes, of walkers as of chains, by the same function."""
-    import equinox as eqx
-    from numpyro.infer import AIES, MCMC
-
-    from jaxrock.inverse.posterior import diagnostics
+def samplers(kept: dict, rocks: int = 20) -> None:
+    """Effective samples a second of `sample_motion`, by own chains and by samplers of other libraries, and of tempered
+    particles; everything from the same maxima, compilation in it. Each is stored when it has ended."""
+    import blackjax
+    from numpyro.infer import NUTS
 
     seen = synthetic(rocks, np.random.default_rng(0), 0.2)
-    found = rk.inverse.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
-    drawn = rk.inverse.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
-    rows = {"chains with proposals that learn": (drawn.effective_size, drawn.r_hat, drawn.responses // (NODES * rocks))}
-    problem = Problem(rk.inverse.Likelihood(seen, rk.ExponentialPulse, 0.2), three())
-    low, high = problem.ends.T
-    arrays, rest = eqx.partition(problem, eqx.is_array)
+    given = {"scatter": 0.2, "progress": False}
+    found = rk.inverse.estimate_motion(seen, rk.ExponentialPulse, three(), starts=16, **given)
 
-    @jax.custom_batching.custom_vmap
-    def log_density(arrays, places):
-        inside = ((places >= low) & (places <= high)).all(axis=-1)
-        density = eqx.combine(arrays, rest).log_density(jnp.clip(places, low, high), slopes=False)
-        return jnp.where(inside, density, -jnp.inf)
+    def drawn_by(sampler, steps):
+        drawn = rk.inverse.sample_motion(
+            seen, rk.ExponentialPulse, three(), estimate=found, sampler=sampler, steps=steps, **given
+        )
+        size, r_hat = float(drawn.effective_size.min()), float(drawn.r_hat.max())
+        return size, r_hat, drawn.responses // (NODES * rocks), np.asarray(drawn[drawn.names[0]])
 
-    log_density.def_vmap(lambda size, batched, arrays, places: (log_density(arrays, places), True))
-    moves = {AIES.DEMove(): 0.6, AIES.StretchMove(): 0.3, AIES.DEMove(g0=1.0): 0.1}
-    kernel = AIES(potential_fn=lambda place: -log_density(arrays, place), moves=moves)  # walkers keep their numbers
-    chains = MCMC(kernel, num_warmup=0, num_samples=steps, num_chains=walkers, chain_method="vectorized",
-                  progress_bar=False)  # fmt: skip
-    values = {name: np.asarray(drawn[name]) for name in drawn.names}
-    places = np.stack([np.log(values["amplitude"]), np.log(values["duration"]), values["shape"]], axis=1)
-    start = places[np.random.default_rng(0).choice(len(places), walkers, replace=False)]
-    chains.run(jax.random.key(0), init_params=jnp.asarray(start))
-    walked = np.asarray(chains.get_samples(group_by_chain=True)).swapaxes(0, 1)
-    # It computes each proposal, and in every step anew where the walker is.
-    rows[f"ensemble of {walkers} walkers (AIES), {steps:,} steps"] = (*diagnostics(walked), 2 * steps * walkers)
-    kept["samplers"] = {
-        name: {"size": float(np.min(size)), "r_hat": float(np.max(r_hat)), "points": points}
-        for name, (size, r_hat, points) in rows.items()
+    def nuts_of_blackjax(density):
+        scale = jnp.asarray(np.std(of_own[1], axis=0) ** 2)  # what its own warm-up would have to find
+        return blackjax.nuts(density, 0.4, scale)
+
+    density = rk.inverse.log_density(seen, rk.ExponentialPulse, three(), scatter=0.2)
+    own = rk.inverse.sample_motion(seen, rk.ExponentialPulse, three(), estimate=found, **given)
+    of_own = own, np.asarray(density.point({name: own[name] for name in own.names}))
+    methods = {
+        "own chains": lambda: drawn_by(None, 4000),
+        "tempered SMC of BlackJAX, 500 particles": lambda: _tempered(density, 500),
+        "NUTS of NumPyro, 8 chains": lambda: drawn_by(lambda d: NUTS(potential_fn=lambda x: -d(x)), 250),
+        "NUTS of BlackJAX, 8 chains, scaled by own samples": lambda: drawn_by(nuts_of_blackjax, 250),
     }
-    write(kept)
+    rows = kept["samplers"] = {}
+    for name, method in methods.items():
+        jax.clear_caches()
+        begun, used = time.monotonic(), time.process_time()
+        size, r_hat, points, first = method()
+        spent = {"wall": time.monotonic() - begun, "cpu": time.process_time() - used}
+        told = {"mean": float(np.log(first).mean()), "sd": float(np.log(first).std())}
+        rows[name] = {"size": size, "r_hat": r_hat, "points": points, **spent, **told}
+        write(kept)
+
+
+def _tempered(density: rk.inverse.LogDensity, particles: int) -> tuple[float, None, int, np.ndarray]:
+    """The recipe of docs/inverse.md; particles that are alike count once, others as if they were independent."""
+    import blackjax
+    from blackjax.smc import resampling
+
+    size, moves, steps = len(density.names), 5, 5
+
+    def prior(point):
+        return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
+
+    settings = {"step_size": 0.3, "inverse_mass_matrix": jnp.eye(size), "num_integration_steps": steps}
+    kernel = blackjax.hmc.build_kernel(), blackjax.hmc.init, blackjax.smc.extend_params(settings)
+    smc = blackjax.adaptive_tempered_smc(
+        prior, density.objective, *kernel, resampling.systematic, 0.5, num_mcmc_steps=moves
+    )
+    state, key, step, points = smc.init(density.starts(particles)), jax.random.key(0), jax.jit(smc.step), 0
+    while state.tempering_param < 1:
+        key, one = jax.random.split(key)
+        state, _ = step(one, state)
+        points += particles * moves * (steps + 1)
+    distinct = len(np.unique(np.asarray(state.particles), axis=0))
+    return float(distinct), None, points, np.asarray(density.values(state.particles)[density.names[0]])
 
 
 def probabilities(kept: dict, rocks: int = 60, draws: int = 10_000) -> None:
@@ -242,9 +266,9 @@ def grid(kept: dict, rocks: int, points: int) -> None:
     write(kept)
 
 
-def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
+def optimizers(kept: dict, rocks: int, starts: int) -> None:
     """Own climbers beside optimisers of other libraries, from the same starts: how high they come, points, and
-    processor time of a search when everything is compiled."""
+    processor time of a search when everything is compiled. Each is stored when it has ended."""
     import optax
     import optimistix
 
@@ -252,18 +276,46 @@ def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
     from jaxrock.inverse.search import summits_of
     from jaxrock.inverse.unknowns import Evaluator
 
-    seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
-    evaluate = Evaluator(Problem(rk.inverse.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))
-    begin, rows = _starts(starts, evaluate), {}
-    methods = {"own climbers": None, "optimistix.BFGS": optimistix.BFGS(rtol=1e-6, atol=1e-6)}
-    methods |= {f"optax.adam({rate:g})": optax.adam(rate) for rate in (0.1, 0.3)}
+    many = rocks > 50
+    pulse, sought, scatter = (rk.ExponentialPulse, three(), 0.2) if many else (rk.SinePulse, unknowns(), 0.1)
+    seen = synthetic(rocks, np.random.default_rng(0 if many else [5, rocks]), scatter)
+    problem = Problem(rk.inverse.Likelihood(seen, pulse, scatter), sought)
+    begin = _starts(starts, Evaluator(problem))
+    methods = {
+        "own climbers": None,
+        "optimistix.BFGS": optimistix.BFGS(rtol=1e-6, atol=1e-6),
+        "SciPy L-BFGS-B": "SciPy",
+    }
+    methods["optax.adam(0.1)"] = optax.adam(0.1)
+    if not many:
+        methods |= {"optax.adam(0.3)": optax.adam(0.3), "optax.lbfgs": optax.lbfgs()}
+    rows = kept.setdefault("optimizers", {})[f"{rocks} rocks, {len(sought)} parameters, {starts} starts"] = {}
     for name, method in methods.items():
-        summits_of(evaluate, begin[:8], method)  # compiles
-        before, used = evaluate.count, time.process_time()
-        found = summits_of(evaluate, begin, method)
-        rows[name] = [float(found.values.max()), evaluate.count - before, time.process_time() - used]
-    kept["optimizers"] = rows
-    write(kept)
+        search = _by_scipy if method == "SciPy" else lambda *given, method=method: summits_of(*given, method).values
+        search(Evaluator(problem), begin[:8])  # compiles
+        evaluate, used = Evaluator(problem), time.process_time()
+        values = search(evaluate, begin)
+        rows[name] = [float(np.max(values)), evaluate.count, time.process_time() - used]
+        write(kept)
+
+
+def _by_scipy(evaluate, starts: np.ndarray) -> list[float]:
+    """One start after the other, and one point in each call of the compiled program, within bounds."""
+    from scipy.optimize import minimize
+
+    from jaxrock.inverse.unknowns import _batch
+
+    low, high = evaluate.ends
+    size = high - low
+
+    def loss(share):
+        value, slope = (np.asarray(x)[0] for x in _batch(evaluate.problem, (low + size * share)[None])[:2])
+        evaluate.note((low + size * share)[None], value[None])
+        return -float(value), -slope * size
+
+    shares = (evaluate.places(starts) - low) / size
+    bounds = [(0.0, 1.0)] * low.size
+    return [-minimize(loss, share, jac=True, method="L-BFGS-B", bounds=bounds).fun for share in shares]
 
 
 def write(kept: dict) -> None:
@@ -278,7 +330,7 @@ def main() -> None:
     parser.add_argument("--rocks", type=int, help="default 20; 100 for times")
     parser.add_argument("--repetitions", type=int, default=400)
     parser.add_argument("--scatter", type=float, default=0.1)
-    parser.add_argument("--starts", type=int, help="default 8; 64 for times")
+    parser.add_argument("--starts", type=int, help="default 8; 64 for times, 16 for optimizers")
     parser.add_argument("--spanning", action="store_true", help="rocks near the boundary")
     parser.add_argument("--points", type=int, default=256, help="of the plain grid, along each axis")
     given = parser.parse_args()
@@ -293,7 +345,7 @@ def main() -> None:
     elif given.what == "samplers":
         samplers(kept)
     elif given.what == "optimizers":
-        optimizers(kept)
+        optimizers(kept, given.rocks or 20, given.starts or 16)
     elif given.what == "probabilities":
         probabilities(kept)
     else:

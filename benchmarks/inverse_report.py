@@ -34,19 +34,15 @@ def text(kept: dict, truth: dict[str, float]) -> str:
         ]
         lines += ["", "Compilation is in it, the fit in whose maxima it begins is not."]
     if "samplers" in kept:
-        lines += ["", "## Samples beside those of NumPyro's ensembles (20 rocks, three parameters)", ""]
-        lines += ["| method | points | smallest effective size | points for each of these | largest R-hat |"]
-        lines += ["| --- | ---: | ---: | ---: | ---: |"]
-        lines += [
-            f"| {name} | {row['points']:,} | {row['size']:.0f} | {row['points'] / row['size']:.0f} | "
-            f"{row['r_hat']:.3f} |"
-            for name, row in kept["samplers"].items()
-        ]
+        lines += ["", "## Samples beside those of other libraries (20 rocks, three parameters)", ""]
+        columns = "points | smallest effective size | largest R-hat | processor time [s] | effective samples a second"
+        lines += [f"| method | {columns} | ln amplitude |"]
+        lines += ["| --- | ---: | ---: | ---: | ---: | ---: | --- |"]
+        lines += [_sampler_text(name, row) for name, row in kept["samplers"].items()]
         lines += [
             "",
-            "The points with which the chains learned are counted. Walkers began at samples of the chains; half of "
-            "their points are where a walker already is, which NumPyro computes again. Walkers depend on each other, "
-            "so that their effective size is rather too large.",
+            "Compilation and the points with which chains learned are counted. Of tempered particles those that are "
+            "alike count once, and the others as if they were independent: that is the most they can be worth.",
         ]
     if "probabilities" in kept:
         lines += ["", "## Probabilities that rocks stand, beside 10,000 drawn scenes", ""]
@@ -58,21 +54,26 @@ def text(kept: dict, truth: dict[str, float]) -> str:
             f"{row['mean']:+.4f} |"
             for row in kept["probabilities"]
         ]
-    if "optimizers" in kept:
-        highest = max(value for value, *_ in kept["optimizers"].values())
-        lines += ["", "## Searches from the same 16 starts (20 rocks, two parameters)", ""]
+    for key, rows in kept.get("optimizers", {}).items():
+        highest = max(value for value, *_ in rows.values())
+        lines += ["", f"## Searches from the same starts ({key})", ""]
         lines += ["| method | below the highest | points | processor time [s] |", "| --- | ---: | ---: | ---: |"]
         lines += [
-            f"| {name} | {highest - value:.1e} | {points:,} | {spent:.1f} |"
-            for name, (value, points, spent) in kept["optimizers"].items()
+            f"| {name} | {highest - value:.1e} | {points:,} | {spent:.2g} |"
+            for name, (value, points, spent) in rows.items()
         ]
-        lines += [
-            "",
-            "Own climbers give up those that are far below the best; the others go on until each has arrived.",
-        ]
+        lines += ["", "Own climbers give up those that are far below the best; others go on until each has arrived."]
     if "grid" in kept:
         lines += ["", "## Beside a grid", "", *_grid_text(kept["grid"])]
     return "\n".join(lines) + "\n"
+
+
+def _sampler_text(name: str, row: dict) -> str:
+    r_hat = "" if row["r_hat"] is None else f"{row['r_hat']:.3f}"
+    return (
+        f"| {name} | {row['points']:,} | {row['size']:.0f} | {r_hat} | {row['cpu']:.0f} | "
+        f"{row['size'] / row['cpu']:.3g} | {row['mean']:+.3f} +- {row['sd']:.3f} |"
+    )
 
 
 def _grid_text(row: dict) -> list[str]:

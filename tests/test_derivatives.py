@@ -13,6 +13,7 @@ import jaxrock as rk
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
+from jaxrock.transforms.differentiation import differentiable
 from references.in_jaxrock import MODELS, PULSES
 from references.smooth_differences import gradient
 
@@ -132,6 +133,66 @@ def test_all_samples_of_a_record(model):
         assert np.all(np.asarray(slopes)[np.array(known["indices"])[quiet]] == 0)
         along = float(jnp.dot(slopes, record.samples))
         assert along == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
+
+
+SETTINGS = {"linear": {"model": rk.Linear(), "engine": rk.Series(order=6)}, "nonlinear": {}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_many_blocks_by_all_samples(settings):
+    """Reverse mode through `jax.vmap` over blocks: beside differences along two changes of the record, `jax.vmap` of
+    reverse mode, forward mode, and the gradient of a sum."""
+    alpha, dt = jnp.array([0.1, 0.14, 0.2]), 0.02  # one overturns, one rocks, one hardly moves
+    time = dt * jnp.arange(90)
+    start = 0.24 * jnp.sin(2 * jnp.pi * time / 0.7)
+    changes = jnp.stack([jnp.cos(2 * jnp.pi * time / 0.5), time**2])
+
+    def one(angle, samples):
+        found = rk.outcome(rk.Block(angle, 3.0), rk.Record(samples, dt), **SETTINGS[settings])
+        return jnp.stack([found.margin, found.max_velocity / 3])
+
+    def many(samples):
+        return jax.vmap(one, in_axes=(0, None))(alpha, samples)
+
+    rows = jax.jit(jax.jacrev(many))(start)
+    step = 5e-6
+    found = jax.jit(jax.vmap(many))(jnp.stack([start + k * step * d for d in changes for k in (-2, -1, 1, 2)]))
+    assert set(np.sign(found[..., 0]).ravel()) == {-1.0, 1.0}
+    values = jnp.where(jnp.isfinite(found), found, 0.0).reshape(2, 4, 3, 2)
+    differences = (values[:, 0] - 8 * values[:, 1] + 8 * values[:, 2] - values[:, 3]) / (12 * step)
+    rows = jnp.where(jnp.isfinite(found[0])[..., None], rows, 0.0)
+    np.testing.assert_allclose(jnp.einsum("brn,cn->cbr", rows, changes), differences, rtol=1e-6, atol=1e-9)
+    each = jax.jit(jax.vmap(jax.jacrev(one, argnums=1), in_axes=(0, None)))(alpha, start)
+    np.testing.assert_allclose(each[:, 0], rows[:, 0], rtol=1e-10, atol=1e-12)
+    along = jax.jit(lambda d: jax.jvp(many, (start,), (d,))[1])(changes[0])
+    np.testing.assert_allclose(along[:, 0], rows[:, 0] @ changes[0], rtol=1e-10)
+    of_sum = jax.jit(jax.grad(lambda x: many(x)[:, 0].sum()))(start)
+    np.testing.assert_allclose(of_sum, rows[:, 0].sum(axis=0), rtol=1e-10, atol=1e-12)
+
+
+def test_a_tape_within_vmap():
+    """Reverse mode by many numbers, on a tape with a branch in it, at many scenes: beside the same without a tape."""
+
+    def twice_where_positive(x):
+        return jnp.where(x[0] > 0, 2.0, 1.0) * jnp.sum(jnp.sin(x) ** 2)
+
+    def on_tape(x):
+        def turned(y):
+            return jax.lax.scan(lambda s, z: (s + 2 * jnp.sin(z) ** 2, None), 0.0, y)[0]
+
+        return jax.lax.cond(x[0] > 0, turned, lambda y: jnp.sum(jnp.sin(y) ** 2), x)
+
+    tree = jnp.linspace(0.1, 2.0, 70)
+    scale = jnp.array([-1.0, 0.5, 1.0])
+    taped = differentiable(twice_where_positive, on_tape=on_tape)
+    many = lambda function: lambda x: jax.vmap(lambda s: function(s * x))(scale)
+    of_shared, plain = (jax.jacrev(many(f))(tree) for f in (taped, twice_where_positive))
+    np.testing.assert_allclose(of_shared, plain, rtol=1e-13)
+    np.testing.assert_allclose(jax.grad(lambda x: many(taped)(x).sum())(tree), plain.sum(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(jax.jacfwd(many(taped))(tree), plain, rtol=1e-13)
+    each = jax.vmap(jax.grad(taped))(scale[:, None] * tree)
+    np.testing.assert_allclose(scale[:, None] * each, plain, rtol=1e-13)
 
 
 @pytest.mark.slow

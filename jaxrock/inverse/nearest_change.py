@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 from scipy.optimize import nnls
 
 from jaxrock._parameters import one_of_many, shared
@@ -63,9 +63,14 @@ def _reached(site: Site, changes: Float[Array, "lanes n"]) -> Bool[Array, " lane
 
 
 @eqx.filter_jit
-def _margin_and_slopes(site: Site, number: Int[ArrayLike, ""], change: Float[Array, " n"]):
-    block = one_of_many(site.blocks, number)
-    return jax.value_and_grad(lambda change: site.margin(block, change)[0])(change)
+def _margins_and_slopes(site: Site, change: Float[Array, " n"]):
+    """Margins of all blocks, (blocks,), and their derivatives by the change, (blocks, n)."""
+
+    def one(number):
+        block = one_of_many(site.blocks, number)
+        return jax.value_and_grad(lambda change: site.margin(block, change)[0])(change)
+
+    return jax.lax.map(one, jnp.arange(site.side.size))
 
 
 class Found(NamedTuple):
@@ -101,8 +106,7 @@ class Search(NamedTuple):
 
     def slopes(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By how much margins fail, (blocks,), and its derivatives by the allowed changes, (blocks, n) [1/g]."""
-        found = [_margin_and_slopes(self.site, number, change) for number in range(self.site.side.size)]
-        margin, slopes = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
+        margin, slopes = map(np.asarray, _margins_and_slopes(self.site, change))
         side = np.asarray(self.site.side)
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)

@@ -102,7 +102,7 @@ def _pushed(leaves, changes, *, recipe, own, size):
     axes = [0 if mine else None for mine, move in zip(own, moves) if move]
     numbers = sum(x.size for x, move in zip(recipe.like, moves) if move)
     if recipe.on_tape is not None and numbers > _MANY:
-        return _pushed_on_tape(leaves, moves, moving, axes, recipe, own, size)
+        return _pushed_on_tape(leaves, moves, moving, recipe, own, size)
     along = value_and_jacobian(recipe, moves)
     found = scenes_p.bind(*leaves, recipe=along, own=own, size=size)
     value, jacobian = jax.tree.unflatten(jax.tree.structure(along.results), found)
@@ -121,19 +121,30 @@ def _pushed(leaves, changes, *, recipe, own, size):
     return value, [moved(*each) for each in zip(value, jacobian)]
 
 
-def _pushed_on_tape(leaves, moves, moving, axes, recipe, own, size):
+def _pushed_on_tape(leaves, moves, moving, recipe, own, size):
     """Value and change by the recipe's own code, through which reverse mode goes."""
 
-    def one(leaves, moving):
+    def one(given):
+        leaves, moving = given[: len(moves)], given[len(moves) :]
+
         def function(moving):
             rest = iter(moving)
             return recipe.taped([next(rest) if move else x for x, move in zip(leaves, moves)])
 
         return jax.jvp(function, ([x for x, move in zip(leaves, moves) if move],), (moving,))
 
-    if size is not None:
-        one = jax.vmap(one, in_axes=([0 if mine else None for mine in own], axes))
-    value, changed = one(list(leaves), moving)
+    given = [*leaves, *moving]
+    if size is None:
+        value, changed = one(given)
+    else:
+        # One scene after the other: lanes would all go on to the end of the longest tape there may be, and the way
+        # back is cut where JAX makes "both" of a branch.
+        mine = [*own, *(mine for mine, move in zip(own, moves) if move)]
+        shared = [None if flag else x for x, flag in zip(given, mine)]
+        value, changed = jax.lax.map(
+            lambda own: one([a if b is None else b for a, b in zip(own, shared)]),
+            [x if flag else None for x, flag in zip(given, mine)],
+        )
     changed = [_unmoved(x) if d.dtype == jax.dtypes.float0 else d for x, d in zip(value, changed)]
     return value, changed
 
