@@ -1,4 +1,4 @@
-"""How long notebooks take, in full size: every one with nothing kept (cold), and once more with what that has left (warm).
+"""How long notebooks take, in full size: with nothing kept (cold), and once more with what that has left (warm).
 
     python benchmarks/notebooks.py [--only NAMES] [--cells]
 
@@ -47,8 +47,8 @@ def measure(path: pathlib.Path, kept: str) -> tuple[float, float, list[tuple[flo
 
 def seconds(cell) -> float:
     """How long a cell ran, on the wall."""
-    told = cell.metadata["execution"]
-    begun, ended = (datetime.datetime.fromisoformat(told[key]) for key in ("iopub.execute_input", "shell.execute_reply"))
+    told, ends = cell.metadata["execution"], ("iopub.execute_input", "shell.execute_reply")
+    begun, ended = (datetime.datetime.fromisoformat(told[end]) for end in ends)
     return (ended - begun).total_seconds()
 
 
