@@ -46,7 +46,7 @@ def coverage(truth, kept):
     """Share of 95 % intervals that hold the truth, as if independent and robust; and of fits told as correlated."""
     inside, told = [], []
     for seed in range(REPETITIONS):
-        found = rk.fit_history(TIME, truth + errors(seed, kept), guess(seed, 0.05), starts=1)
+        found = rk.inverse.fit_history(TIME, truth + errors(seed, kept), guess(seed, 0.05), starts=1)
         for robust in (False, True):
             low, high = found.intervals(robust=robust).T
             inside.append((low < TRUTH) & (TRUTH < high))
@@ -59,7 +59,7 @@ def reached(truth, size, starts):
     """Share of 40 fits that come to the truth, and seconds for each, once compiled."""
     good, begin = [], None
     for seed in range(41):
-        found = rk.fit_history(TIME, truth + errors(seed, 0.0), guess(seed, size), starts=starts, seed=seed)
+        found = rk.inverse.fit_history(TIME, truth + errors(seed, 0.0), guess(seed, size), starts=starts, seed=seed)
         off = np.abs(found.values - TRUTH) / np.sqrt(np.diag(found.covariance))
         good.append(np.all(off < 5))
         begin = begin or time.perf_counter()  # the first one compiles

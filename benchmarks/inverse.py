@@ -35,9 +35,9 @@ KEPT = Path(__file__).with_suffix(".json")
 WHAT = ("coverage", "times", "grid", "posterior", "samplers", "probabilities", "optimizers")
 
 
-def unknowns() -> dict[str, rk.Unknown]:
+def unknowns() -> dict[str, rk.inverse.Unknown]:
     """What is looked for, and where; made when numbers are double."""
-    return {"amplitude": rk.Unknown(0.05, 2.0), "period": rk.Unknown(0.2, 3.0)}
+    return {"amplitude": rk.inverse.Unknown(0.05, 2.0), "period": rk.inverse.Unknown(0.2, 3.0)}
 
 
 def _fallen(alpha, p, amplitude, period):
@@ -51,7 +51,7 @@ def fallen(alpha: np.ndarray, p: np.ndarray, factor: np.ndarray) -> np.ndarray:
     return rk.sweep(_fallen, outer=False, progress=False, **lists).values["fallen"]
 
 
-def synthetic(count: int, rng: np.random.Generator, scatter: float, spanning: bool = False) -> rk.Observations:
+def synthetic(count: int, rng: np.random.Generator, scatter: float, spanning: bool = False) -> rk.inverse.Observations:
     """Rocks of many shapes and sizes, and what became of them."""
     drawn = 20 * count if spanning else count
     alpha, p = rng.uniform(0.08, 0.35, drawn), rng.uniform(1.8, 5.0, drawn)
@@ -62,14 +62,14 @@ def synthetic(count: int, rng: np.random.Generator, scatter: float, spanning: bo
     e = rng.normal(size=(3, count))
     lost = fallen(alpha * np.exp(0.03 * e[0]), p * np.exp(0.02 * e[1]), np.exp(scatter * e[2]))
     words = ["toppled" if x else "survived" for x in lost]
-    return rk.Observations(alpha, p, words, alpha_sd=0.03 * alpha, p_sd=0.02 * p)
+    return rk.inverse.Observations(alpha, p, words, alpha_sd=0.03 * alpha, p_sd=0.02 * p)
 
 
-def least_deviation(seen: rk.Observations, scatter: float) -> np.ndarray:
+def least_deviation(seen: rk.inverse.Observations, scatter: float) -> np.ndarray:
     """Of the logarithm of each parameter: no unbiased estimate has less (Cramer & Rao)."""
     step = 0.02 * np.concatenate([np.zeros((1, 2)), np.eye(2), -np.eye(2)])
     places = {name: x * np.exp(d) for (name, x), d in zip(TRUTH.items(), step.T)}
-    share = np.exp(np.asarray(rk.Likelihood(seen, rk.SinePulse, scatter).log_terms(places, slopes=False)))
+    share = np.exp(np.asarray(rk.inverse.Likelihood(seen, rk.SinePulse, scatter).log_terms(places, slopes=False)))
     slope = (share[1:3] - share[3:]) / 0.04
     information = (slope / (share[0] * (1 - share[0]))) @ slope.T
     return np.sqrt(np.diagonal(np.linalg.inv(information)))
@@ -82,7 +82,7 @@ def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: i
     for number in range(len(rows), repetitions):
         seen = synthetic(rocks, np.random.default_rng([number, rocks]), scatter, spanning)
         begun = time.process_time()
-        found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), scatter, starts=starts, progress=False)
+        found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns(), scatter, starts=starts, progress=False)
         # The first one compiles.
         spent = time.process_time() - begun if rows else None
         rows.append(
@@ -90,7 +90,7 @@ def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: i
                 "values": np.asarray(found.values).tolist(),
                 "interval": np.asarray(found.interval).tolist(),
                 "open": bool(found.open.any()),
-                "contradictory": bool(found.status == rk.EstimateStatus.contradictory),
+                "contradictory": bool(found.status == rk.inverse.EstimateStatus.contradictory),
                 "points": found.responses // (NODES * rocks),
                 "cpu": spent,
                 "least": least_deviation(seen, scatter).tolist(),
@@ -100,12 +100,12 @@ def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: i
             write(kept)
 
 
-def three() -> dict[str, rk.Unknown]:
+def three() -> dict[str, rk.inverse.Unknown]:
     """What is looked for of an exponential pulse."""
     return {
-        "amplitude": rk.Unknown(0.05, 2.0),
-        "duration": rk.Unknown(0.1, 3.0),
-        "shape": rk.Unknown(-6, 6, log=False),
+        "amplitude": rk.inverse.Unknown(0.05, 2.0),
+        "duration": rk.inverse.Unknown(0.1, 3.0),
+        "shape": rk.inverse.Unknown(-6, 6, log=False),
     }
 
 
@@ -114,7 +114,7 @@ def times(kept: dict, rocks: int, starts: int) -> None:
     seen = synthetic(rocks, np.random.default_rng(0), 0.2)
     for name in ("first", "again"):
         begun, used = time.monotonic(), time.process_time()
-        found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=starts, progress=False)
+        found = rk.inverse.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=starts, progress=False)
         row = {"wall": time.monotonic() - begun, "cpu": time.process_time() - used, "responses": found.responses}
         kept.setdefault("times", {})[f"{rocks} rocks, {starts} starts, {name}"] = row
         write(kept)
@@ -123,9 +123,9 @@ def times(kept: dict, rocks: int, starts: int) -> None:
 def posterior(kept: dict, rocks: int) -> None:
     """Samples of the same posterior: with compilation, but without the fit in whose maxima they begin."""
     seen = synthetic(rocks, np.random.default_rng(0), 0.2)
-    found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
+    found = rk.inverse.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
     begun, used = time.monotonic(), time.process_time()
-    drawn = rk.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
+    drawn = rk.inverse.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
     kept.setdefault("posterior", {})[f"{rocks} rocks"] = {
         "wall": time.monotonic() - begun,
         "cpu": time.process_time() - used,
@@ -146,10 +146,10 @@ def samplers(kept: dict, rocks: int = 20, walkers: int = 24, steps: int = 2000) 
     from jaxrock.inverse.posterior import diagnostics
 
     seen = synthetic(rocks, np.random.default_rng(0), 0.2)
-    found = rk.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
-    drawn = rk.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
+    found = rk.inverse.estimate_motion(seen, rk.ExponentialPulse, three(), 0.2, starts=16, progress=False)
+    drawn = rk.inverse.sample_motion(seen, rk.ExponentialPulse, three(), 0.2, estimate=found, progress=False)
     rows = {"chains with proposals that learn": (drawn.effective_size, drawn.r_hat, drawn.responses // (NODES * rocks))}
-    problem = Problem(rk.Likelihood(seen, rk.ExponentialPulse, 0.2), three())
+    problem = Problem(rk.inverse.Likelihood(seen, rk.ExponentialPulse, 0.2), three())
     low, high = problem.ends.T
     arrays, rest = eqx.partition(problem, eqx.is_array)
 
@@ -188,13 +188,13 @@ def probabilities(kept: dict, rocks: int = 60, draws: int = 10_000) -> None:
         period, strength = np.exp(rng.uniform(np.log(0.3), np.log(2.5), rocks)), np.exp(rng.uniform(0, 1.5, rocks))
         found, counted = [], []
         for a, b, t, x in zip(alpha, p, period, np.tan(alpha) * strength):
-            seen = rk.Observations([a], [b], ["survived"], alpha_sd=alpha_sd * a, p_sd=p_sd * b)
+            seen = rk.inverse.Observations([a], [b], ["survived"], alpha_sd=alpha_sd * a, p_sd=p_sd * b)
             e = rng.normal(size=(3, draws))
             scenes = rocks_at(seen, np.stack([alpha_sd * e[0], p_sd * e[1], 0 * e[1]])[..., None])
             lists = dict(zip(("alpha", "p", "restitution"), (np.ravel(y) for y in scenes)))
             lists |= {"amplitude": x * np.exp(scatter * e[2]), "period": np.full(draws, t)}
             counted.append(1 - rk.sweep(_fallen_block, outer=False, progress=False, **lists).values["fallen"].mean())
-            likelihood = rk.Likelihood(seen, rk.SinePulse, scatter, lapse=0.0)
+            likelihood = rk.inverse.Likelihood(seen, rk.SinePulse, scatter, lapse=0.0)
             found.append(float(likelihood.survival({"amplitude": x, "period": t})[0]))
         error = np.array(found) - np.array(counted)
         row = {"scatter": scatter, "alpha": alpha_sd, "p": p_sd, "rms": float(np.sqrt(np.mean(error**2)))}
@@ -214,8 +214,8 @@ def grid(kept: dict, rocks: int, points: int) -> None:
     only the points around the maximum are computed.
     """
     seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
-    found = rk.estimate_motion(seen, rk.SinePulse, unknowns(), 0.1, starts=16, progress=False)
-    problem = Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns())
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns(), 0.1, starts=16, progress=False)
+    problem = Problem(rk.inverse.Likelihood(seen, rk.SinePulse, 0.1), unknowns())
     density = jax.jit(lambda problem, places: problem.log_density(places, slopes=False))
     low, high = np.asarray(problem.ends).T
 
@@ -253,7 +253,7 @@ def optimizers(kept: dict, rocks: int = 20, starts: int = 16) -> None:
     from jaxrock.inverse.unknowns import Evaluator
 
     seen = synthetic(rocks, np.random.default_rng([5, rocks]), 0.1)
-    evaluate = Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))
+    evaluate = Evaluator(Problem(rk.inverse.Likelihood(seen, rk.SinePulse, 0.1), unknowns()))
     begin, rows = _starts(starts, evaluate), {}
     methods = {"own climbers": None, "optimistix.BFGS": optimistix.BFGS(rtol=1e-6, atol=1e-6)}
     methods |= {f"optax.adam({rate:g})": optax.adam(rate) for rate in (0.1, 0.3)}

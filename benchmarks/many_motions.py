@@ -43,7 +43,7 @@ def timed(run):
     return found, times[0][0], *times[1]
 
 
-def by_scipy(found: rk.SuiteOutcomes, count: int) -> tuple[float, int, int]:
+def by_scipy(found: rk.hazard.SuiteOutcomes, count: int) -> tuple[float, int, int]:
     """Seconds a history of the loop that is usually written, and how many verdicts of how many decided ones differ."""
     random, wrong, decided = np.random.default_rng(SEED), 0, 0
     records, settings = list(found.suite.motions()), scipy_loop.settings_of(1e-8, 1e-11)
@@ -62,19 +62,19 @@ def by_scipy(found: rk.SuiteOutcomes, count: int) -> tuple[float, int, int]:
 def main():
     """The largest first, so that its memory is its own."""
     rows = []
-    suite = rk.Suite(motions(100, 2000, 10_000))
-    blocks = rk.draw_blocks(rk.Block(0.2, 2.5), 20, alpha=0.2, p=0.2)
+    suite = rk.motions.Suite(motions(100, 2000, 10_000))
+    blocks = rk.blocks.draw_blocks(rk.Block(0.2, 2.5), 20, alpha=0.2, p=0.2)
     scale = np.geomspace(0.2, 5.0, 50)
-    many, first, again, cpu = timed(lambda: rk.suite_outcomes(blocks, suite, scale, progress=False))
+    many, first, again, cpu = timed(lambda: rk.hazard.suite_outcomes(blocks, suite, scale, progress=False))
     rows.append(("100 motions x 50 scales x 20 blocks", many, first, again, cpu))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     each, wrong, decided = by_scipy(many, 60)
 
-    suite = rk.Suite(motions(500, 2000, 10_000))
+    suite = rk.motions.Suite(motions(500, 2000, 10_000))
     rocks = rk.Block(np.array([0.15, 0.25]), np.array([2.5, 3.5]))
     sides = rk.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.2, 0.3]), np.array([2.5, 3.5]))
     for name, two in (("blocks", rocks), ("asymmetric blocks", sides)):
-        run = timed(lambda two=two: rk.suite_outcomes(two, suite, facing="both", progress=False))
+        run = timed(lambda two=two: rk.hazard.suite_outcomes(two, suite, facing="both", progress=False))
         rows.append((f"500 motions as recorded x 2 {name} x 2 facings", *run))
     report = [
         "# Suites of hundreds of motions",

@@ -22,7 +22,7 @@ def stripes(seed, motions):
     capacity = MEDIAN * np.exp(DISPERSION * np.random.default_rng(seed).normal(size=motions))
     verdict = (LEVELS > capacity[:, None])[:, :, None].astype(np.int8)
     ones, names = jnp.ones(motions), tuple(map(str, range(motions)))
-    return rk.SimulatedFragility(jnp.asarray(LEVELS), verdict, ones, ones, names, "PGA")
+    return rk.hazard.SimulatedFragility(jnp.asarray(LEVELS), verdict, ones, ones, names, "PGA")
 
 
 def coverage(motions):
@@ -31,10 +31,10 @@ def coverage(motions):
     for seed in range(REPETITIONS):
         found = stripes(seed, motions)
         fit = found.fit()
-        if fit.status != rk.FitStatus.successful:
+        if fit.status != rk.hazard.FitStatus.successful:
             failed += 1
             continue
-        plain = rk.fit_fragility(found.levels, found.counts().sum(axis=0), float(motions))
+        plain = rk.hazard.fit_fragility(found.levels, found.counts().sum(axis=0), float(motions))
         off = np.log([float(fit.fragility.median), float(fit.fragility.dispersion)]) - truth
         inside.append([np.abs(off) < 1.96 * np.sqrt(np.diag(f.covariance)) for f in (fit, plain)])
     return np.mean(inside, axis=0), failed
@@ -67,12 +67,12 @@ def main():
         shares = [f"{100 * a:.1f}, {100 * b:.1f}" for a, b in inside]
         lines.append(f"| {motions} | {shares[0]} | {shares[1]} | {failed} |")
         print(lines[-1], flush=True)
-    blocks = rk.draw_blocks(rk.Block.from_dimensions(0.5, 1.6, 0.92), 32, alpha=0.08, p=0.05, restitution=0.03)
+    blocks = rk.blocks.draw_blocks(rk.Block.from_dimensions(0.5, 1.6, 0.92), 32, alpha=0.08, p=0.05, restitution=0.03)
     pulses = [rk.SinePulse, rk.CosinePulse, functools.partial(rk.RickerPulse, kind="symmetric")]
     grid = np.geomspace(0.1, 3.0, 48), np.geomspace(0.03, 0.4, 24)
     runs = {
-        "surface: three pulses, 48 x 24 cells, 32 draws": lambda: rk.simulated_surface(blocks, pulses, *grid),
-        "stripes: the built-in record, 24 levels, 32 draws": lambda: rk.simulated_fragility(
+        "surface: three pulses, 48 x 24 cells, 32 draws": lambda: rk.hazard.simulated_surface(blocks, pulses, *grid),
+        "stripes: the built-in record, 24 levels, 32 draws": lambda: rk.hazard.simulated_fragility(
             blocks, [rk.example_record()], np.geomspace(0.1, 3.0, 24)
         ),
     }

@@ -1,6 +1,6 @@
 """Parameters of blocks, motions and models: declared once, with their fields, and found there by whoever needs them.
 
-    class Ramp(rk.AbstractMotion):
+    class Ramp(rk.motions.AbstractMotion):
         amplitude: jax.Array = rk.parameter("g")
         corners: jax.Array = rk.parameter("s", "positive", axes=1)
 

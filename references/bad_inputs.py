@@ -68,23 +68,23 @@ def simulated():
 
 
 def rocks():
-    return rk.Observations([0.2, 0.25], [2.0, 3.0], ["survived", "toppled"])
+    return rk.inverse.Observations([0.2, 0.25], [2.0, 3.0], ["survived", "toppled"])
 
 
 def unknowns():
-    return {"amplitude": rk.Unknown(0.1, 1.0), "period": rk.Unknown(0.2, 2.0)}
+    return {"amplitude": rk.inverse.Unknown(0.1, 1.0), "period": rk.inverse.Unknown(0.2, 2.0)}
 
 
 def density():
-    return rk.log_density(rocks(), rk.SinePulse, unknowns())
+    return rk.inverse.log_density(rocks(), rk.SinePulse, unknowns())
 
 
 def fragility():
-    return rk.LogNormalFragility(0.3, 0.4)
+    return rk.hazard.LogNormalFragility(0.3, 0.4)
 
 
 def curve():
-    return rk.HazardCurve(LEVELS, RATES)
+    return rk.hazard.HazardCurve(LEVELS, RATES)
 
 
 def flexible():
@@ -111,44 +111,46 @@ def verdicts():
     """A simulated fragility, put together by hand."""
     table = np.array([[[0], [1], [1]], [[0], [0], [1]]], np.int8)
     peaks = jnp.array([0.5, 0.6]), jnp.array([0.8, 0.7])
-    return rk.SimulatedFragility(jnp.asarray(LEVELS), table, *peaks, ("a", "b"), "PGA")
+    return rk.hazard.SimulatedFragility(jnp.asarray(LEVELS), table, *peaks, ("a", "b"), "PGA")
 
 
 def stone():
     """A box, put together by hand."""
     corners = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.2, 0.2) for z in (0.0, 2.0)])
     inertia = np.diag([0.16 + 4.0, 0.36 + 4.0, 0.36 + 0.16]) / 12
-    return rk.Rock(0.48, np.array([0.0, 0.0, 1.0]), inertia, corners, corners[corners[:, 2] == 0], 0.02)
+    return rk.blocks.Rock(0.48, np.array([0.0, 0.0, 1.0]), inertia, corners, corners[corners[:, 2] == 0], 0.02)
 
 
 def many():
     """Outcomes of a suite, put together by hand."""
     verdict, rotation = np.array([0, 1], np.int8).reshape(1, 2, 1, 1), np.array([0.5, INF]).reshape(1, 2, 1, 1)
     blocks = rk.Block(np.array([0.2]), np.array([2.0]))
-    return rk.SuiteOutcomes(rk.Suite([pulse()]), blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation)
+    return rk.hazard.SuiteOutcomes(
+        rk.motions.Suite([pulse()]), blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation
+    )
 
 
 def line():
     """A probit fit, put together by hand."""
     numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0)
-    return rk.ProbitFit(("PGA",), *numbers, rk.FitStatus.successful)
+    return rk.hazard.ProbitFit(("PGA",), *numbers, rk.hazard.FitStatus.successful)
 
 
 def surface():
     """A simulated surface, put together by hand."""
-    return rk.SimulatedSurface(jnp.asarray(LEVELS), jnp.asarray([0.1, 0.2]), np.zeros((1, 3, 2, 1), np.int8))
+    return rk.hazard.SimulatedSurface(jnp.asarray(LEVELS), jnp.asarray([0.1, 0.2]), np.zeros((1, 3, 2, 1), np.int8))
 
 
 def posterior():
     """Samples, put together by hand."""
     none = jnp.zeros(0)
-    return rk.Posterior(("amplitude",), jnp.ones((2, 5, 1)), none, none, none, none, 0, None, None)
+    return rk.inverse.Posterior(("amplitude",), jnp.ones((2, 5, 1)), none, none, none, none, 0, None, None)
 
 
 def hazard_curves():
     levels, rates = jnp.asarray(LEVELS).reshape(1, 1, 3), jnp.asarray(RATES).reshape(1, 1, 3)
     one = jnp.zeros(1)
-    return rk.HazardCurves(rk.HazardCurve(levels, rates), one, one, one, ("mean",), ("site",))
+    return rk.hazard.HazardCurves(rk.hazard.HazardCurve(levels, rates), one, one, one, ("mean",), ("site",))
 
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
@@ -196,7 +198,7 @@ CALLS: dict[str, Call] = {
         rk.AsymmetricBlock.from_mesh,
         {"mesh": stone(), "azimuth": 0.3, "base": "wide", "unit": "m", "tolerance": 0.01, "gravity": 9.81},
     ),
-    "Rock.from_mesh": Call(rk.Rock.from_mesh, {"mesh": "/nowhere/a.stl", "unit": "m", "tolerance": 0.01}),
+    "Rock.from_mesh": Call(rk.blocks.Rock.from_mesh, {"mesh": "/nowhere/a.stl", "unit": "m", "tolerance": 0.01}),
     "Rock.section": Call(stone().section, {"azimuth": 0.3, "base": "wide"}),
     "Rock.slenderness": Call(stone().slenderness, {"azimuth": [0.3, 0.4]}),
     "FlexibleBlock": Call(
@@ -216,7 +218,7 @@ CALLS: dict[str, Call] = {
         },
     ),
     "draw_blocks": Call(
-        rk.draw_blocks, {"block": block(), "draws": 4, "alpha": 0.01, "p": 0.01, "restitution": 0.01, "seed": 1}
+        rk.blocks.draw_blocks, {"block": block(), "draws": 4, "alpha": 0.01, "p": 0.01, "restitution": 0.01, "seed": 1}
     ),
     "restitution.Constant": Call(rk.restitution.Constant, {"value": 0.9}),
     "restitution.PerSide": Call(rk.restitution.PerSide, {"first": 0.9, "second": 0.8}),
@@ -230,17 +232,19 @@ CALLS: dict[str, Call] = {
     "CosinePulse": Call(rk.CosinePulse, CYCLE),
     "RickerPulse": Call(rk.RickerPulse, {**CYCLE, "kind": "symmetric", "center": 1.0}),
     "MavroeidisPapageorgiouPulse": Call(rk.MavroeidisPapageorgiouPulse, {**CYCLE, "oscillations": 2.0, "phase": 0.5}),
-    "Record": Call(rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a", "origin": rk.Origin()}),
-    "Components": Call(rk.Components, {"first": record(), "second": record(), "vertical": record()}),
-    "Components.along": Call(rk.Components(record(), record()).along, {"angle": 0.3}),
-    "WithVertical": Call(rk.WithVertical, {"horizontal": pulse(), "vertical": pulse()}),
+    "Record": Call(
+        rk.Record, {"acceleration": [0.0, 0.1, -0.1], "dt": 0.01, "name": "a", "origin": rk.motions.Origin()}
+    ),
+    "Components": Call(rk.motions.Components, {"first": record(), "second": record(), "vertical": record()}),
+    "Components.along": Call(rk.motions.Components(record(), record()).along, {"angle": 0.3}),
+    "WithVertical": Call(rk.motions.WithVertical, {"horizontal": pulse(), "vertical": pulse()}),
     "AbstractMotion.with_vertical": Call(pulse().with_vertical, {"vertical": pulse()}),
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
     "AbstractMotion.acceleration": Call(pulse().acceleration, {"time": [0.1, 0.2]}),
     "AbstractMotion.__mul__": Call(lambda factor: pulse() * factor, {"factor": 2.0}),
-    "Suite": Call(rk.Suite, {"motions": [pulse()], "names": ["a"]}),
-    "peak_acceleration": Call(rk.peak_acceleration, {"motion": pulse()}),
-    "peak_velocity": Call(rk.peak_velocity, {"motion": pulse()}),
+    "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"]}),
+    "peak_acceleration": Call(rk.intensity.peak_acceleration, {"motion": pulse()}),
+    "peak_velocity": Call(rk.intensity.peak_velocity, {"motion": pulse()}),
     "intensity.peak_displacement": Call(rk.intensity.peak_displacement, {"motion": pulse()}),
     "intensity.velocity_to_acceleration": Call(rk.intensity.velocity_to_acceleration, {"motion": pulse()}),
     "intensity.arias": Call(rk.intensity.arias, {"motion": pulse()}),
@@ -288,10 +292,10 @@ CALLS: dict[str, Call] = {
         may_be="friction|least_normal",
     ),
     "outcome_flexible": Call(
-        rk.outcome_flexible, {"block": flexible(), "motion": pulse(), "duration": 2.0, "max_steps": 100}
+        rk.responses.outcome_flexible, {"block": flexible(), "motion": pulse(), "duration": 2.0, "max_steps": 100}
     ),
     "simulate_flexible": Call(
-        rk.simulate_flexible,
+        rk.responses.simulate_flexible,
         {"block": flexible(), "motion": pulse(), "duration": 2.0, "samples": 24, "max_steps": 100},
     ),
     # Studies
@@ -302,14 +306,14 @@ CALLS: dict[str, Call] = {
         "derivative|value|intensity",
     ),
     "critical_durations": Call(
-        rk.critical_durations,
+        rk.studies.critical_durations,
         {**SCENE, "factor": (0.5, 1.0), "derivatives": False, "progress": False},
         True,
         "derivative|value|intensity",
     ),
     "sensitivity": Call(rk.sensitivity, SCENE, True, ".*"),
     "sensitivity_map": Call(
-        rk.sensitivity_map,
+        rk.studies.sensitivity_map,
         {"uplift_strength": [0.5], "pulse_duration": [2.0], "shape": 0.0, "alpha": 0.2, "restitution": 0.9, **QUICK},
         True,
         ".*",
@@ -341,43 +345,45 @@ CALLS: dict[str, Call] = {
         {"response": None, "scales": rk.similarity.scales(block()), "dimensionless_time": [0.1, 0.2]},
     ),
     # Hazard
-    "LogNormalFragility": Call(rk.LogNormalFragility, {"median": 0.3, "dispersion": 0.4}),
+    "LogNormalFragility": Call(rk.hazard.LogNormalFragility, {"median": 0.3, "dispersion": 0.4}),
     "LogNormalFragility.__call__": Call(fragility().__call__, {"level": [0.1, 0.2]}),
-    "TabulatedFragility": Call(rk.TabulatedFragility, {"levels": LEVELS, "probabilities": [0.1, 0.5, 0.9]}),
-    "TabulatedFragility.__call__": Call(rk.TabulatedFragility(LEVELS, [0.1, 0.5, 0.9]).__call__, {"level": [0.1, 0.2]}),
+    "TabulatedFragility": Call(rk.hazard.TabulatedFragility, {"levels": LEVELS, "probabilities": [0.1, 0.5, 0.9]}),
+    "TabulatedFragility.__call__": Call(
+        rk.hazard.TabulatedFragility(LEVELS, [0.1, 0.5, 0.9]).__call__, {"level": [0.1, 0.2]}
+    ),
     "fit_fragility": Call(
-        rk.fit_fragility,
+        rk.hazard.fit_fragility,
         {"levels": [0.1, 0.2, 0.3, 0.4], "toppled": [0, 2, 1, 3], "trials": 3},
         may_be="lowest_toppled",
     ),
-    "HazardCurve": Call(rk.HazardCurve, {"levels": LEVELS, "rates": RATES, "measure": "PGA"}, may_be="rates"),
+    "HazardCurve": Call(rk.hazard.HazardCurve, {"levels": LEVELS, "rates": RATES, "measure": "PGA"}, may_be="rates"),
     "HazardCurve.from_probabilities": Call(
-        rk.HazardCurve.from_probabilities,
+        rk.hazard.HazardCurve.from_probabilities,
         {"levels": LEVELS, "probabilities": [0.9, 0.5, 0.1], "investigation_time": 50.0},
         may_be="rates",
     ),
     "HazardCurve.rate": Call(curve().rate, {"level": [0.1, 0.2]}),
     "HazardCurve.scaled": Call(curve().scaled, {"factor": 2.0}),
     "HazardCurve.extended": Call(curve().extended, {"lowest": 0.01, "highest": 2.0}),
-    "toppling_rate": Call(rk.toppling_rate, {"fragility": fragility(), "curve": curve()}),
+    "toppling_rate": Call(rk.hazard.toppling_rate, {"fragility": fragility(), "curve": curve()}),
     "survival_probability": Call(
-        rk.survival_probability, {"fragilities": [fragility()], "ages": [1e4], "curve": curve()}
+        rk.hazard.survival_probability, {"fragilities": [fragility()], "ages": [1e4], "curve": curve()}
     ),
-    "branch_weights": Call(rk.branch_weights, {"prior": [0.5, 0.5], "survival": [0.1, 0.2]}),
+    "branch_weights": Call(rk.hazard.branch_weights, {"prior": [0.5, 0.5], "survival": [0.1, 0.2]}),
     "allowed_scale": Call(
-        rk.allowed_scale,
+        rk.hazard.allowed_scale,
         {"fragilities": fragility(), "ages": 1e4, "curve": curve(), "probability": 0.05},
         may_be=".*",
     ),
     "simulated_fragility": Call(
-        rk.simulated_fragility,
+        rk.hazard.simulated_fragility,
         {"block": block(), "motions": [pulse()], "levels": LEVELS, **QUICK, "measure": "PGA", "progress": False},
         True,
     ),
     "SimulatedFragility.fit": Call(verdicts().fit, {"bound": "lower"}, may_be="lowest_toppled"),
     "SimulatedFragility.tabulated": Call(verdicts().tabulated, {"bound": "lower"}),
     "suite_outcomes": Call(
-        rk.suite_outcomes,
+        rk.hazard.suite_outcomes,
         {"block": block(), "motions": [pulse()], "scale": [0.5, 1.0], **QUICK, "facing": "both", "progress": False},
         True,
         "capacity|rotation|margin",
@@ -389,7 +395,7 @@ CALLS: dict[str, Call] = {
         may_be=".*",
     ),
     "fit_probit": Call(
-        rk.fit_probit,
+        rk.hazard.fit_probit,
         {
             "measures": {"PGA": [0.1, 0.2, 0.3, 0.4, 0.5], "PGV": [0.1, 0.3, 0.1, 0.2, 0.1]},
             "toppled": [0, 1, 0, 1, 1],
@@ -400,7 +406,7 @@ CALLS: dict[str, Call] = {
     ),
     "ProbitFit.__call__": Call(line().__call__, {"PGA": [0.1, 0.2]}),
     "write_nrml": Call(
-        rk.write_nrml,
+        rk.hazard.write_nrml,
         {
             "fragilities": {"falls": fragility()},
             "path": "/nowhere/a.xml",
@@ -409,9 +415,9 @@ CALLS: dict[str, Call] = {
             "description": "b",
         },
     ),
-    "surface_of": Call(rk.surface_of, {"found": verdicts(), "bound": "lower"}),
+    "surface_of": Call(rk.hazard.surface_of, {"found": verdicts(), "bound": "lower"}),
     "fit_surface": Call(
-        rk.fit_surface,
+        rk.hazard.fit_surface,
         {
             "acceleration": [0.1, 0.2, 0.3, 0.4, 0.5],
             "ratio": [0.1, 0.3, 0.1, 0.2, 0.1],
@@ -421,27 +427,27 @@ CALLS: dict[str, Call] = {
         },
     ),
     "SurfaceFragility.__call__": Call(
-        rk.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).__call__,
+        rk.hazard.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).__call__,
         {"acceleration": [0.1, 0.2], "ratio": 0.1},
     ),
     "SurfaceFragility.acceleration": Call(
-        rk.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).acceleration,
+        rk.hazard.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).acceleration,
         {"probability": [0.1, 0.2], "ratio": 0.1},
     ),
     "SurfaceFragility.at": Call(
-        rk.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).at, {"ratio": 0.1}
+        rk.hazard.SurfaceFragility(jnp.array(0.3), jnp.array(-0.5), jnp.array(0.4)).at, {"ratio": 0.1}
     ),
     "simulated_surface": Call(
-        rk.simulated_surface,
+        rk.hazard.simulated_surface,
         {"block": block(), "pulses": [rk.SinePulse], "acceleration": LEVELS, "ratio": [0.1, 0.2], **QUICK},
         True,
     ),
     "SimulatedSurface.at": Call(surface().at, {"ratio": 0.15, "upper": False}),
     "HazardCurves.at": Call(hazard_curves().at, {"site": 0, "branch": 0}),
-    "read_hazard_curves": Call(rk.read_hazard_curves, {"paths": "/nowhere/a.csv"}),
+    "read_hazard_curves": Call(rk.hazard.read_hazard_curves, {"paths": "/nowhere/a.csv"}),
     # From rocks to motions
     "Observations": Call(
-        rk.Observations,
+        rk.inverse.Observations,
         {
             "alpha": [0.2, 0.25],
             "p": [2.0, 3.0],
@@ -456,7 +462,7 @@ CALLS: dict[str, Call] = {
         },
     ),
     "Observations.asymmetric": Call(
-        rk.Observations.asymmetric,
+        rk.inverse.Observations.asymmetric,
         {
             "blocks": rk.AsymmetricBlock([0.2, 0.3], 0.3, 2.0),
             "seen": ["survived", "toppled"],
@@ -465,13 +471,13 @@ CALLS: dict[str, Call] = {
         },
     ),
     "Observations.of": Call(rocks().of, {"which": [0]}),
-    "Unknown": Call(rk.Unknown, {"low": 0.1, "high": 1.0, "log": True, "prior": (0.3, 0.5)}),
+    "Unknown": Call(rk.inverse.Unknown, {"low": 0.1, "high": 1.0, "log": True, "prior": (0.3, 0.5)}),
     "Likelihood": Call(
-        rk.Likelihood,
+        rk.inverse.Likelihood,
         {"observations": rocks(), "motion": rk.SinePulse, "scatter": 0.3, **QUICK, "lapse": 0.02},
     ),
     "log_density": Call(
-        rk.log_density,
+        rk.inverse.log_density,
         {
             "observations": rocks(),
             "motion": rk.SinePulse,
@@ -485,7 +491,7 @@ CALLS: dict[str, Call] = {
     "LogDensity.values": Call(density().values, {"point": [0.0] * len(unknowns())}),
     "LogDensity.point": Call(density().point, {"values": {name: 0.9 for name in unknowns()}}, False, ".*"),
     "estimate_motion": Call(
-        rk.estimate_motion,
+        rk.inverse.estimate_motion,
         {
             "observations": rocks(),
             "motion": rk.SinePulse,
@@ -501,7 +507,7 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "find_record": Call(
-        rk.find_record,
+        rk.inverse.find_record,
         {
             "block": block(),
             "start": rk.Record([0.0, 0.5, 0.5, 0.5, 0.0, 0.0], 0.1),
@@ -520,7 +526,7 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "sample_motion": Call(
-        rk.sample_motion,
+        rk.inverse.sample_motion,
         {
             "observations": rocks(),
             "motion": rk.SinePulse,
@@ -539,9 +545,9 @@ CALLS: dict[str, Call] = {
     ),
     "Posterior.interval": Call(posterior().interval, {"share": 0.9}),
     "feasible_region": Call(
-        rk.feasible_region,
+        rk.inverse.feasible_region,
         {
-            "likelihood": rk.Likelihood(rocks(), rk.SinePulse, **QUICK),
+            "likelihood": rk.inverse.Likelihood(rocks(), rk.SinePulse, **QUICK),
             "over": {"amplitude": [0.1, 0.2], "period": [1.0]},
             "fixed": None,
             "progress": False,
@@ -549,7 +555,7 @@ CALLS: dict[str, Call] = {
         True,
     ),
     "unexceeded_motion": Call(
-        rk.unexceeded_motion,
+        rk.inverse.unexceeded_motion,
         {
             "observations": rocks(),
             "motion": rk.SinePulse,
@@ -562,12 +568,12 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "calibrate_block": Call(
-        rk.calibrate_block,
+        rk.inverse.calibrate_block,
         {
             "block": lambda alpha: rk.Block(alpha, 2.0),
             "motions": [pulse(), rk.SinePulse(0.7, 1.0)],
             "toppled": [0, 1],
-            "unknowns": {"alpha": rk.Unknown(0.1, 0.4)},
+            "unknowns": {"alpha": rk.inverse.Unknown(0.1, 0.4)},
             "scatter": {"alpha": 0.2},
             **QUICK,
             "rotation": None,
@@ -583,7 +589,7 @@ CALLS: dict[str, Call] = {
         ".*",
     ),
     "fit_history": Call(
-        rk.fit_history,
+        rk.inverse.fit_history,
         {
             "time": TIMES,
             "rotation": 0.05 * np.cosh(TIMES / 4),
@@ -600,13 +606,13 @@ CALLS: dict[str, Call] = {
         True,
         ".*",
     ),
-    "read_observations": Call(rk.read_observations, {"path": "/nowhere/a.csv"}),
+    "read_observations": Call(rk.inverse.read_observations, {"path": "/nowhere/a.csv"}),
     "read_components": Call(
-        rk.read_components, {"paths": ["/nowhere/a", "/nowhere/b"], "columns": None, "dt": 0.01, "unit": "g"}
+        rk.motions.read_components, {"paths": ["/nowhere/a", "/nowhere/b"], "columns": None, "dt": 0.01, "unit": "g"}
     ),
-    "record_of_trace": Call(rk.record_of_trace, {"trace": trace(), "unit": "g"}),
-    "write_at2": Call(rk.write_at2, {"record": record(), "path": "/nowhere/a.at2"}),
-    "write_csv": Call(rk.write_csv, {"record": record(), "path": "/nowhere/a.csv", "unit": "g"}),
+    "record_of_trace": Call(rk.motions.record_of_trace, {"trace": trace(), "unit": "g"}),
+    "write_at2": Call(rk.motions.write_at2, {"record": record(), "path": "/nowhere/a.at2"}),
+    "write_csv": Call(rk.motions.write_csv, {"record": record(), "path": "/nowhere/a.csv", "unit": "g"}),
     "read_record": Call(
         rk.read_record, {"path": "/nowhere/a.at2", "format": "at2", "dt": 0.01, "unit": "g", "column": 0}
     ),
@@ -690,8 +696,8 @@ WRONG = [
 OURS = [
     block(), rk.Block([0.2, 0.3], 2.0), pulse(), rk.SinePulse([0.5, 0.6], 1.0), 0.0 * pulse(), 1e-300 * pulse(),
     rk.Record([0.0], 0.01), rk.Linear(), rk.Series(), rk.Spring(), rock(), flexible(), rocks(), curve(), fragility(),
-    rk.Suite([pulse()]), rk.Unknown(0.1, 1.0), rk.Status.successful, rk.restitution.Constant(0.5), [pulse()],
-    [fragility()], rk.HazardCurve([LEVELS], [RATES]), pulse().with_vertical(pulse()), rk.similarity.scales(block()),
+    rk.motions.Suite([pulse()]), rk.inverse.Unknown(0.1, 1.0), rk.Status.successful, rk.restitution.Constant(0.5), [pulse()],
+    [fragility()], rk.hazard.HazardCurve([LEVELS], [RATES]), pulse().with_vertical(pulse()), rk.similarity.scales(block()),
 ]  # fmt: skip
 
 strange = st.one_of(
@@ -782,7 +788,7 @@ def _of_result(call: Call, result: Any) -> str | None:
     result = result.values if isinstance(result, rk.Grid) else result  # its axes are what was given
     leaves = jax.tree_util.tree_leaves_with_path(result)
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-    if isinstance(result, rk.Outcome | rk.FlexibleOutcome):
+    if isinstance(result, rk.responses.Outcome | rk.responses.FlexibleOutcome):
         return _of_outcome(result)
     told = [leaf for name, leaf in named.items() if "status" in name]
     if told and any(np.any(np.asarray(leaf) != 0) for leaf in told):

@@ -119,7 +119,7 @@ def _of_record(record: rk.Record) -> dict[str, np.ndarray]:
     return {"rows": np.asarray(record.samples)[:, None], "dt": np.asarray(record.dt)}
 
 
-def _of_rocks(seen: rk.Observations) -> dict[str, np.ndarray]:
+def _of_rocks(seen: rk.inverse.Observations) -> dict[str, np.ndarray]:
     names = ["alpha", "p", "restitution", "alpha_sd", "p_sd", "rotation", "rotation_sd", "seen"]
     columns = [np.asarray(getattr(seen, name), float) for name in names]
     if seen.other is not None:
@@ -127,7 +127,7 @@ def _of_rocks(seen: rk.Observations) -> dict[str, np.ndarray]:
     return {"rows": np.stack([np.asarray(c).reshape(-1, seen.alpha.size)[0] for c in columns], axis=1)}
 
 
-def _of_hazard(found: rk.HazardCurves) -> dict[str, np.ndarray]:
+def _of_hazard(found: rk.hazard.HazardCurves) -> dict[str, np.ndarray]:
     places = np.stack([np.asarray(x) for x in (found.longitude, found.latitude, found.depth)], axis=1)
     return {
         "rows": np.concatenate([places, np.asarray(found.curves.rates[0])], axis=1),
@@ -159,10 +159,10 @@ FILES = {
     "CSV": _record(_pairs("%.5f", ","), ".csv", unit="g"),
     "columns of free form": _record(_pairs("%r", "\t"), ".txt", unit="g"),
     "one column": _record("".join(f"{x!r}\n" for x in SAMPLES.tolist()), ".txt", unit="g", dt=0.01),
-    "rocks": File(_rocks(), rk.read_observations, _of_rocks, ".csv"),
-    "rocks of two sides": File(_sides(), rk.read_observations, _of_rocks, ".csv"),
-    "hazard": File(_hazard("%.6E"), rk.read_hazard_curves, _of_hazard, ".csv"),
-    "hazard of free form": File(_hazard("%g"), rk.read_hazard_curves, _of_hazard, ".csv"),
+    "rocks": File(_rocks(), rk.inverse.read_observations, _of_rocks, ".csv"),
+    "rocks of two sides": File(_sides(), rk.inverse.read_observations, _of_rocks, ".csv"),
+    "hazard": File(_hazard("%.6E"), rk.hazard.read_hazard_curves, _of_hazard, ".csv"),
+    "hazard of free form": File(_hazard("%g"), rk.hazard.read_hazard_curves, _of_hazard, ".csv"),
 }
 
 

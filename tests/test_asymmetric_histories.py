@@ -46,8 +46,8 @@ def test_both_sides_are_told():
     assert data.min() < -0.02 and np.sum(np.diff(np.sign(data)) != 0) >= 5
     data = data + size * np.random.default_rng(0).normal(size=TIME.size)
     guess = rk.AsymmetricBlock(0.18, 0.35, 2.7, KAPPA, restitution=(0.9, 0.9))
-    found = rk.fit_history(TIME, data, guess, starts=2, spread=0.05)
-    assert found.status == rk.HistoryStatus.successful, found.warnings
+    found = rk.inverse.fit_history(TIME, data, guess, starts=2, spread=0.05)
+    assert found.status == rk.inverse.HistoryStatus.successful, found.warnings
     assert found.names == tuple(TRUTH)
     errors = np.sqrt(np.diag(found.covariance))
     assert np.all(np.abs(found.values - list(TRUTH.values())) < 4 * errors)
@@ -59,4 +59,4 @@ def test_both_sides_are_told():
 def test_names_are_those_of_the_block():
     block = rk.AsymmetricBlock(0.2, 0.3, 2.5)
     with pytest.raises(ValueError, match="be different names out of alpha1, alpha2, p1"):
-        rk.fit_history(TIME, np.cos(TIME), block, parameters=("alpha", "p"))
+        rk.inverse.fit_history(TIME, np.cos(TIME), block, parameters=("alpha", "p"))

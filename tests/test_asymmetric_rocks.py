@@ -21,7 +21,7 @@ WORDS = ["survived", "toppled", "rotation"] * 4
 
 def rocks(ratio=1.35, facing=FACING, words=WORDS, inertia_ratio=0.7, **more):
     blocks = rk.AsymmetricBlock(ALPHA, ratio * ALPHA, P, inertia_ratio)
-    return rk.Observations.asymmetric(blocks, words, facing=facing, **(KNOWN | more))
+    return rk.inverse.Observations.asymmetric(blocks, words, facing=facing, **(KNOWN | more))
 
 
 @eqx.filter_jit
@@ -31,12 +31,12 @@ def _facts(likelihood, values):
 
 def facts(observations):
     """Log-likelihoods, survival and surprise, (motions, rocks) each."""
-    likelihood = rk.Likelihood(observations, rk.SinePulse, SCATTER)
+    likelihood = rk.inverse.Likelihood(observations, rk.SinePulse, SCATTER)
     return [np.asarray(x) for x in _facts(likelihood, {k: jnp.asarray(x) for k, x in MOTIONS.items()})]
 
 
 def test_equal_sides_are_symmetric_rocks():
-    symmetric = facts(rk.Observations(ALPHA, P, WORDS, **KNOWN))
+    symmetric = facts(rk.inverse.Observations(ALPHA, P, WORDS, **KNOWN))
     for facing in (FACING, np.zeros(12)):
         for found, expected in zip(facts(rocks(1.0, facing, inertia_ratio=0.75)), symmetric):
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
@@ -53,7 +53,7 @@ def test_ways_are_those_of_the_mirrored_rock_and_their_mean():
     # Seen from behind, with sides exchanged, it stands the other way round. (What is uncertain belongs to side 1.)
     blocks = rk.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P, 0.7).mirrored
     both = {"alpha_sd": 0.04 * 1.35 * ALPHA, "p_sd": 0.02 * blocks.p1}
-    behind = facts(rk.Observations.asymmetric(blocks, WORDS, facing=-FACING, **(KNOWN | both)))
+    behind = facts(rk.inverse.Observations.asymmetric(blocks, WORDS, facing=-FACING, **(KNOWN | both)))
     for found, expected in zip(behind, one):
         np.testing.assert_allclose(found[:, known], expected[:, known], rtol=1e-9, atol=1e-9)
 
@@ -69,15 +69,15 @@ def test_other_names_compile_nothing():
 def test_restitutions():
     """Of two impacts, one on each side, the energy kept is the square; their ratio is that of moments of inertia."""
     blocks = rk.AsymmetricBlock.from_radii(*np.array([[0.2, 0.3], [0.35, 0.25], [1.0, 1.2], [1.3, 1.1], [0.6, 0.7]]))
-    seen = rk.Observations.asymmetric(blocks, ["survived"] * 2)
+    seen = rk.inverse.Observations.asymmetric(blocks, ["survived"] * 2)
     for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
         np.testing.assert_allclose(getattr(seen.blocks, name), getattr(blocks, name), rtol=1e-14)
-    given = rk.Observations.asymmetric(blocks, ["survived"] * 2, [0.9, np.nan]).blocks
+    given = rk.inverse.Observations.asymmetric(blocks, ["survived"] * 2, [0.9, np.nan]).blocks
     assert float((given.restitution1 * given.restitution2)[0]) == pytest.approx(0.81)
     np.testing.assert_allclose(given.restitution1 / given.restitution2, blocks.restitution1 / blocks.restitution2)
     np.testing.assert_allclose(given.restitution1[1], blocks.restitution1[1])
     pair = rk.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.7, 0.9))
-    found = rk.Observations.asymmetric(pair, ["survived"]).of(np.array([0])).blocks
+    found = rk.inverse.Observations.asymmetric(pair, ["survived"]).of(np.array([0])).blocks
     np.testing.assert_allclose([found.restitution1, found.restitution2], [[0.7], [0.9]])
 
 
@@ -87,7 +87,7 @@ HEADER = "name,alpha1_deg,alpha2_deg,alpha1_deg_sd,radius1_m,radius2_m,radius1_m
 def test_a_file_of_rocks_with_two_sides(tmp_path):
     path = tmp_path / "rocks.csv"
     path.write_text(f"{HEADER}\na,10,15,0.5,1.2,1.25,0.1,,,toppled\nb,20,12,1,0.9,0.8,,0.7,-1,survived\n")
-    seen = rk.read_observations(path)
+    seen = rk.inverse.read_observations(path)
     blocks = seen.blocks
     np.testing.assert_allclose(blocks.alpha1, np.deg2rad([10, 20]))
     np.testing.assert_allclose(blocks.alpha2, np.deg2rad([15, 12]))
@@ -103,7 +103,7 @@ def test_a_file_of_rocks_with_two_sides(tmp_path):
         numbers = [blocks.alpha1[i], blocks.alpha2[i], blocks.p1[i], blocks.p2[i], blocks.inertia_ratio[i]]
         lines.append(",".join([*(repr(float(x)) for x in numbers), ("", "-1")[i], word]))
     path.write_text("\n".join(lines))
-    again = rk.read_observations(path)
+    again = rk.inverse.read_observations(path)
     for name in ("alpha1", "alpha2", "p1", "p2", "restitution1"):
         np.testing.assert_allclose(getattr(again.blocks, name), getattr(blocks, name), rtol=1e-12)
 
@@ -125,7 +125,7 @@ def test_impossible_rocks_are_named_by_their_line(tmp_path, header, line, messag
     path = tmp_path / "rocks.csv"
     path.write_text(f"{header}\n{line}\n")
     with pytest.raises(ValueError, match=message):
-        rk.read_observations(path)
+        rk.inverse.read_observations(path)
 
 
 # --------------------------------------------------------------------------------------- slow
@@ -168,7 +168,7 @@ def test_unexceeded_motions_of_two_sides():
     """Of a rock that may stand either way round the larger one; and up to it the rock does stand, that way."""
     durations = np.array([0.5, 1.2])
     one, other, unknown = (
-        rk.unexceeded_motion(rocks(facing=f, words=["survived"] * 12), rk.SinePulse, durations, progress=False)
+        rk.inverse.unexceeded_motion(rocks(facing=f, words=["survived"] * 12), rk.SinePulse, durations, progress=False)
         for f in (np.ones(12), -np.ones(12), np.zeros(12))
     )
     np.testing.assert_allclose(unknown.by_rock, np.maximum(one.by_rock, other.by_rock), rtol=1e-12)
@@ -179,8 +179,10 @@ def test_unexceeded_motions_of_two_sides():
         amplitude = np.where(finite, wall, 0.01)
         assert not overturned(sign=sign, amplitude=amplitude * (1 - 1e-9), period=durations, **known).any()
         assert overturned(sign=sign, amplitude=amplitude * (1 + 1e-9), period=durations, **known)[finite].all()
-    symmetric = rk.unexceeded_motion(rk.Observations(ALPHA, P, ["survived"] * 12), rk.SinePulse, durations)
-    equal = rk.unexceeded_motion(
+    symmetric = rk.inverse.unexceeded_motion(
+        rk.inverse.Observations(ALPHA, P, ["survived"] * 12), rk.SinePulse, durations
+    )
+    equal = rk.inverse.unexceeded_motion(
         rocks(1.0, words=["survived"] * 12, inertia_ratio=0.75), rk.SinePulse, durations, progress=False
     )
     np.testing.assert_allclose(equal.by_rock, symmetric.by_rock, rtol=1e-10)

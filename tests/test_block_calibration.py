@@ -11,9 +11,9 @@ import jaxrock as rk
 RANDOM = np.random.default_rng(1)
 COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
 MOTIONS = [rk.SinePulse(a, t) for a, t in zip(RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT))]
-SUITE = rk.Suite(MOTIONS)
+SUITE = rk.motions.Suite(MOTIONS)
 TRUE = ALPHA * np.exp(SCATTER * RANDOM.normal(size=COUNT))
-UNKNOWN, SPREAD = rk.Unknown(0.05, 0.5), rk.Unknown(0.05, 0.8)
+UNKNOWN, SPREAD = rk.inverse.Unknown(0.05, 0.5), rk.inverse.Unknown(0.05, 0.8)
 POINT = {"alpha": 0.18, "alpha_sd": 0.2}
 
 
@@ -36,12 +36,12 @@ FELL, ROTATION = verdicts(5)
 @pytest.fixture(scope="module")
 def found():
     make = lambda alpha: rk.Block(alpha, P)
-    return rk.calibrate_block(make, SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=512, folds=10,
+    return rk.inverse.calibrate_block(make, SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=512, folds=10,
                               progress=False)  # fmt: skip
 
 
 def test_the_truth_is_found_again(found):
-    assert found.status == rk.CalibrationStatus.successful
+    assert found.status == rk.inverse.CalibrationStatus.successful
     for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
         off = np.log(float(found.values[name]) / truth) / float(found.standard_errors[name])
         assert abs(off) < 2.5
@@ -92,9 +92,9 @@ def test_diagnostics(found):
 def test_rotations_say_more_than_verdicts(found):
     noisy = ROTATION * np.exp(0.2 * RANDOM.normal(size=COUNT))
     seen = np.where(FELL, np.nan, np.where(noisy < 0.01, 0.0, noisy))
-    more = rk.calibrate_block(lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
+    more = rk.inverse.calibrate_block(lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
                               cells=128, rotation=seen, rotation_sd=0.2, progress=False)  # fmt: skip
-    assert more.status == rk.CalibrationStatus.successful
+    assert more.status == rk.inverse.CalibrationStatus.successful
     for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
         assert float(more.standard_errors[name]) < float(found.standard_errors[name])
         assert abs(np.log(float(more.values[name]) / truth)) < 3 * float(more.standard_errors[name])
@@ -105,15 +105,15 @@ def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
     make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)
     ways = np.where(np.random.default_rng(2).random(12) < 0.5, 1, -1)
     fell = [bool(rk.outcome(make(TRUE[k], P), int(way) * MOTIONS[k]).overturned) for k, way in enumerate(ways)]
-    unknowns = {"alpha": UNKNOWN, "p": rk.Unknown(1.5, 6.0)}
+    unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}
     given = {"cells": {"alpha": 24, "p": 8}, "progress": False}
     for facing in (ways, 0):
-        fit = rk.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
+        fit = rk.inverse.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
         assert set(fit.values) == {"alpha", "p"}
         assert np.isfinite(fit.probability).all()
-    turned = rk.calibrate_block(make, [-m for m in MOTIONS[:12]], fell, unknowns, {"alpha": 0.3}, facing=-ways,
+    turned = rk.inverse.calibrate_block(make, [-m for m in MOTIONS[:12]], fell, unknowns, {"alpha": 0.3}, facing=-ways,
                                 **given)  # fmt: skip
-    known = rk.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=ways, **given)
+    known = rk.inverse.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=ways, **given)
     np.testing.assert_allclose(turned.probability, known.probability, atol=1e-6)
     step = 1e-5
     point = {"alpha": 0.21, "p": 2.7}
@@ -144,4 +144,4 @@ def test_what_is_refused(given, message):
     good = {"block": lambda alpha: rk.Block(alpha, P), "motions": MOTIONS[:1], "toppled": [1],
             "unknowns": {"alpha": UNKNOWN}, "scatter": {"alpha": SPREAD}, "progress": False}  # fmt: skip
     with pytest.raises(ValueError, match=message):
-        rk.calibrate_block(**good | given)
+        rk.inverse.calibrate_block(**good | given)

@@ -29,7 +29,7 @@ def surface():
 
 @pytest.fixture(scope="module")
 def regions(surface):
-    return rk.overturning_borders(surface).regions
+    return rk.studies.overturning_borders(surface).regions
 
 
 def at(regions, ratio):
@@ -89,7 +89,7 @@ def test_the_wall_of_single_lobes():
         pulse_duration=duration, uplift_strength=strength, pulse=rk.ExponentialPulse, shape=0.5, restitution=0.9,
         model=rk.Linear(), progress=False,
     )  # fmt: skip
-    (region,) = rk.overturning_borders(surface).regions
+    (region,) = rk.studies.overturning_borders(surface).regions
     wall = single_lobe.safety_wall(2 * np.pi / region.frequency_ratio, 0.5)
     np.testing.assert_allclose(1 / region.lower, wall, rtol=1e-11)
     axis = rk.plot.overturning(surface, by_duration=True)
@@ -138,7 +138,7 @@ def test_where_impacts_give_way_to_none_without_a_gap(monkeypatch):
 @pytest.mark.parametrize("change", [{"scene": None}, {"parameters": {"shape": jnp.zeros(2)}}])
 def test_maps_that_have_no_borders(surface, change):
     with pytest.raises(ValueError, match="Argument `result` must be a map of two axes"):
-        rk.overturning_borders(dataclasses.replace(surface, **change))
+        rk.studies.overturning_borders(dataclasses.replace(surface, **change))
 
 
 def test_map_with_borders(surface, regions):
@@ -178,7 +178,7 @@ def test_curves_reach_their_tips():
 
 def test_isolated_survivors_of_a_spectrum_are_seen():
     peaks = jnp.array([[np.inf, 0.7, np.inf, np.inf, 0.5, 0.4]])
-    spectrum = rk.Spectrum(
+    spectrum = rk.studies.Spectrum(
         abscissa=jnp.arange(6.0), max_rotation=peaks, max_velocity=peaks, impact_count=jnp.zeros((1, 6), int),
         overturned=jnp.isinf(peaks), margin=-peaks, status=rk.Status.successful, intensity=jnp.array([2.0]),
     )  # fmt: skip

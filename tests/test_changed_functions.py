@@ -175,15 +175,15 @@ def region(motion):
     def by_name(amplitude, duration):
         return motion(amplitude, duration)
 
-    seen = rk.Observations([0.2, 0.25], [2.0, 2.5], ["survived", "toppled"])
+    seen = rk.inverse.Observations([0.2, 0.25], [2.0, 2.5], ["survived", "toppled"])
     over = {"amplitude": [0.2, 0.4], "duration": [0.3, 0.6]}
-    likelihood = rk.Likelihood(seen, by_name)
-    return lambda: rk.feasible_region(likelihood, over, progress=False).log_likelihood
+    likelihood = rk.inverse.Likelihood(seen, by_name)
+    return lambda: rk.inverse.feasible_region(likelihood, over, progress=False).log_likelihood
 
 
 def stripes(model):
     levels = np.linspace(0.2, 0.8, 61)
-    found = rk.simulated_fragility(BLOCK, [PULSE], levels, model, engine=ENGINE, progress=False)
+    found = rk.hazard.simulated_fragility(BLOCK, [PULSE], levels, model, engine=ENGINE, progress=False)
     return found.verdict
 
 
@@ -209,7 +209,7 @@ SLOW = {
         lambda m: rk.rocking_spectrum(0.2, PULSE, [3.0, 4.0], model=m, engine=ENGINE, progress=False).margin
     ),
     "sensitivity_map": of_model(
-        lambda m: rk.sensitivity_map([0.5], [1.0], model=m, engine=ENGINE, progress=False).sensitivity.margin.value
+        lambda m: rk.studies.sensitivity_map([0.5], [1.0], model=m, engine=ENGINE, progress=False).sensitivity.margin.value
     ),
     "critical_amplitudes": of_model(
         lambda m: rk.critical_amplitudes(
@@ -217,7 +217,7 @@ SLOW = {
         ).value
     ),
     "fit_history": of_model(
-        lambda m: rk.fit_history(
+        lambda m: rk.inverse.fit_history(
             np.linspace(0, 1, 20), np.linspace(0.1, 0.05, 20), BLOCK, model=m, parameters=["p"], starts=1,
             engine=ENGINE,
         ).rotation
@@ -335,7 +335,7 @@ def test_functions_see_every_kind_of_block(block):
 def test_a_model_that_holds_an_equation():
     """Functions are found wherever they are in a model, and models without any are left alone."""
 
-    class Stiffer(rk.AbstractEquation):
+    class Stiffer(rk.models.AbstractEquation):
         inner: rk.Equation
 
         def moments(self, block):
@@ -373,7 +373,7 @@ def test_an_equal_function_is_not_compiled_again():
 # Models that hold arrays, which had been refused: "unhashable type".
 
 
-class Softer(rk.AbstractEquation):
+class Softer(rk.models.AbstractEquation):
     """Housner's block on a softer ground, and the same as functions."""
 
     factors: jax.Array
@@ -407,9 +407,9 @@ def soft_map(model, engine):
 
 def soft_suite(model, engine):
     levels = [0.25, 0.3, 0.35, 0.4, 0.5]
-    found = rk.simulated_fragility(BLOCK, [PULSE], levels, model, engine=engine, progress=False)
+    found = rk.hazard.simulated_fragility(BLOCK, [PULSE], levels, model, engine=engine, progress=False)
     softer = rk.Block(0.2, 2.0 * SOFT)
-    return found.verdict, rk.simulated_fragility(softer, [PULSE], levels, progress=False).verdict
+    return found.verdict, rk.hazard.simulated_fragility(softer, [PULSE], levels, progress=False).verdict
 
 
 def soft_critical(model, engine):
@@ -419,8 +419,8 @@ def soft_critical(model, engine):
 
 
 def soft_sensitivities(model, engine):
-    found = rk.sensitivity_map([0.5], [1.0], model=model, engine=engine, progress=False)
-    other = rk.sensitivity_map([0.5], [SOFT], progress=False)
+    found = rk.studies.sensitivity_map([0.5], [1.0], model=model, engine=engine, progress=False)
+    other = rk.studies.sensitivity_map([0.5], [SOFT], progress=False)
     return (x.sensitivity.max_rotation.elasticity[0, 0] for x in (found, other))
 
 

@@ -146,14 +146,16 @@ def test_fragility(command, at2, column, tmp_path):
     words += ["--scatter", "0.4", "--draws", "6", "--width", "0.4", "--height", "1.2"]
     status, table, errors = command("fragility", column, column, *words)
     levels = np.geomspace(0.2, 6.0, 12)
-    blocks = rk.draw_blocks(rk.Block.from_dimensions(0.4, 1.2), 6, alpha=0.4)
-    found = rk.simulated_fragility(blocks, [rk.Record(SAMPLES, 0.02)] * 2, levels, rk.Linear())
+    blocks = rk.blocks.draw_blocks(rk.Block.from_dimensions(0.4, 1.2), 6, alpha=0.4)
+    found = rk.hazard.simulated_fragility(blocks, [rk.Record(SAMPLES, 0.02)] * 2, levels, rk.Linear())
     _, rows = table_of(tmp_path / "out" / "fragility.csv")
     np.testing.assert_allclose(rows[:, 1], found.lower)
     assert (tmp_path / "out" / "stripes.csv").read_text().count("\n") == 25
     assert is_figure(tmp_path / "out" / "fragility.png")
     fit = found.fit("upper")
-    assert (status == 0) == (fit.status == rk.FitStatus.successful) == (tmp_path / "out" / "fragility.xml").exists()
+    assert (
+        (status == 0) == (fit.status == rk.hazard.FitStatus.successful) == (tmp_path / "out" / "fragility.xml").exists()
+    )
     assert status == 0 and f"{float(fit.fragility.median):.4f}" in table["median PGA"]
 
 

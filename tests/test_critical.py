@@ -68,7 +68,9 @@ def test_one_scene_and_its_durations():
     block = rk.Block(0.1, 2.0, 0.9)
     amplitudes = rk.critical_amplitudes(block, rk.SinePulse(1.0, 2.5), rk.Linear())
     assert amplitudes.value.shape == (int(amplitudes.count),)
-    durations = rk.critical_durations(block, rk.SinePulse(amplitudes.value[0], 2.5), rk.Linear(), factor=(0.2, 5.0))
+    durations = rk.studies.critical_durations(
+        block, rk.SinePulse(amplitudes.value[0], 2.5), rk.Linear(), factor=(0.2, 5.0)
+    )
     assert float(np.abs(np.asarray(durations.value) - 2.5).min()) < 1e-10
     at = int(np.abs(np.asarray(durations.value) - 2.5).argmin())
     named = dict(zip(durations.names, np.asarray(durations.derivative[at])))
@@ -138,7 +140,7 @@ def test_lowest_ends_are_those_of_all(known):
     block, pulse = rk.Block(0.1, 2.0, 0.9), rk.SinePulse(0.3, np.array([1.5, 2.5]))
     cases = [
         (rk.critical_amplitudes, rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.8), rk.Housner()),
-        (rk.critical_durations, block, pulse, rk.Linear()),
+        (rk.studies.critical_durations, block, pulse, rk.Linear()),
     ]
     for function, block, motion, model in cases:
         every = function(block, motion, model, progress=False)
@@ -181,6 +183,6 @@ def test_an_end_without_balance_has_no_derivatives():
     (value, found), slope = jax.value_and_grad(lowest, has_aux=True)(0.25)
     assert not found.balanced[0] and np.isnan(slope)
     scene = rk.Block(0.25, 1.5), rk.example_record()
-    factor = float(value) / float(rk.peak_acceleration(scene[1]))
+    factor = float(value) / float(rk.intensity.peak_acceleration(scene[1]))
     verdicts = [bool(rk.outcome(scene[0], x * factor * scene[1]).overturned) for x in (1 - 1e-12, 1 + 1e-12)]
     assert verdicts == [False, True]

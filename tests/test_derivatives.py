@@ -308,7 +308,7 @@ def test_distances_tell_how_far_is_too_far():
 
 @pytest.mark.slow
 def test_sensitivity_map():
-    found = rk.sensitivity_map([0.7, 0.9], [0.5, 1.0, 1.5], -1.0, model=rk.Linear(), restitution=0.9)
+    found = rk.studies.sensitivity_map([0.7, 0.9], [0.5, 1.0, 1.5], -1.0, model=rk.Linear(), restitution=0.9)
     single = rk.sensitivity(rk.Block(0.2, 1.0, 0.9), rk.ExponentialPulse(0.2 / 0.9, 1.0, -1.0), rk.Linear())
     assert found.sensitivity.max_rotation.elasticity.shape == (2, 3, 7)
     np.testing.assert_allclose(

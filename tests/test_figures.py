@@ -24,7 +24,7 @@ def sensitivity_of(elasticity):
     number = elasticity[..., 0]
     slopes = Slopes(number, elasticity, elasticity)
     good = jnp.ones_like(number, bool)
-    return rk.Sensitivity(
+    return rk.studies.Sensitivity(
         ("alpha", "amplitude"), elasticity, slopes, slopes, slopes, an_outcome(), good, number, number, number
     )
 
@@ -38,7 +38,7 @@ def test_tornado():
 def test_sensitivity_map():
     elasticity = np.random.default_rng(0).normal(size=(3, 4, 2))
     elasticity[0, 0] = np.nan
-    surface = rk.SensitivityMap(
+    surface = rk.studies.SensitivityMap(
         jnp.linspace(0.1, 0.9, 3), jnp.linspace(1, 4, 4), jnp.asarray(0.0), sensitivity_of(elasticity)
     )
     axis = rk.plot.sensitivity_map(surface, "amplitude", limit=2.0)
@@ -52,7 +52,7 @@ def test_critical():
     intensity = jnp.array([[1.5, 2.0, 3.0], [1.4, jnp.inf, jnp.inf]])
     rising = jnp.array([[True, False, True], [True, False, False]])
     impacts = jnp.array([[1, 1, 0], [0, 0, 0]])
-    ends = rk.Critical(
+    ends = rk.studies.Critical(
         count=jnp.array([3, 1]), value=intensity, intensity=intensity, rising=rising, impacts=impacts,
         balanced=rising, derivative=intensity[..., None], complete=jnp.array([True, True]), names=("alpha",),
     )  # fmt: skip
@@ -84,8 +84,10 @@ def test_found_record():
     number, start = jnp.zeros(()), rk.Record([0.1, 0.2, -0.3, 0.0], 0.5, "a start")
     change = np.array([0.0, 0.1, 0.0, -0.1])
     after = rk.Record(start.samples + change, 0.5)
-    status = rk.RecordStatus.successful
-    found = rk.FoundRecord(after, start, number, number, number[None], number, number[None], number[None], status)
+    status = rk.inverse.RecordStatus.successful
+    found = rk.inverse.FoundRecord(
+        after, start, number, number, number[None], number, number[None], number[None], status
+    )
     records, between, spectra = rk.plot.found_record(found)
     assert records.get_title() == "a start" and records.get_xlim() == between.get_xlim() == (0.0, 1.5)
     for line, expected in ((records.lines[0], start.samples), (records.lines[1], after.samples)):
@@ -98,8 +100,8 @@ def test_feasible_region():
     """The best is the top of the scale; axes are logarithmic and have the units of the parameters."""
     rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
     likelihood = -((jnp.log(rows / 0.4)[:, None]) ** 2) - jnp.log(columns / 0.7) ** 2
-    region = rk.FeasibleRegion(("amplitude", "period"), (rows, columns), likelihood, likelihood > -1)
-    wall = rk.Unexceeded(columns, jnp.full(5, 0.5), jnp.full((1, 5), 0.5), jnp.zeros(5, int), jnp.ones(5, bool))
+    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (rows, columns), likelihood, likelihood > -1)
+    wall = rk.inverse.Unexceeded(columns, jnp.full(5, 0.5), jnp.full((1, 5), 0.5), jnp.zeros(5, int), jnp.ones(5, bool))
     axis = rk.plot.feasible_region(region, wall=wall)
     assert (axis.get_ylabel(), axis.get_xlabel()) == ("amplitude [g]", "period [s]")
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")

@@ -98,7 +98,7 @@ def test_peaks_and_impacts(case):
 def test_against_an_independent_integration():
     """Histories to 1e-6 of the peak (the goal; 1e-8 here, the integrator's own), impacts to 1e-8 s."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.01, masses=4)
-    response = rk.simulate_flexible(block, PULSE, duration=10.0)
+    response = rk.responses.simulate_flexible(block, PULSE, duration=10.0)
     at, impacts = independent(block, PULSE, 10.0)
     times = np.linspace(0.01, 9.99, 300)
     theta, top = np.array([at(t) for t in times]).T
@@ -112,7 +112,7 @@ def test_against_an_independent_integration():
 def test_energy_is_conserved_between_impacts():
     """After the pulse, without damping: to 1e-10 of the whole between impacts; at an impact the kinetic part falls."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
-    response = rk.simulate_flexible(block, PULSE, duration=20.0, samples=2)
+    response = rk.responses.simulate_flexible(block, PULSE, duration=20.0, samples=2)
     edges = [1.6, *response.impact_times, 20.0]
     assert len(edges) == 5
     before = None
@@ -130,7 +130,7 @@ def test_energy_is_conserved_between_impacts():
 def test_the_work_of_the_ground_is_the_gain_of_energy():
     """Under the pulse: energy = - integral of the ground's force times velocity, by Gauss's quadrature."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
-    response = rk.simulate_flexible(block, PULSE, duration=20.0, samples=2)
+    response = rk.responses.simulate_flexible(block, PULSE, duration=20.0, samples=2)
     nodes, weights = np.polynomial.legendre.leggauss(40)
     edges = np.linspace(0, 1.6, 9)
     numbers, scene = response.scene.numbers, response.scene
@@ -203,7 +203,7 @@ def test_the_rigid_limit(amplitude, duration):
     def errors(moduli, damping):
         blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, damping) for E in moduli]
         rigid = rigid_peak(blocks[0], amplitude, 0.8)
-        found = [rk.outcome_flexible(b, pulse, duration=duration) for b in blocks]
+        found = [rk.responses.outcome_flexible(b, pulse, duration=duration) for b in blocks]
         assert all(f.status == rk.Status.successful for f in found)
         return np.array([float(f.max_rotation) / rigid - 1 for f in found])
 
@@ -218,7 +218,7 @@ def test_the_rigid_limit(amplitude, duration):
 def test_vibrations_do_not_hide_the_peak():
     """A million turns of the fastest mode within a step: the greatest rotation is found all the same."""
     block = rk.FlexibleBlock(1.0, 5.0, 1e16, 2500.0, 0.0)
-    found = rk.outcome_flexible(block, rk.SinePulse(0.3, 0.8), duration=1.6)
+    found = rk.responses.outcome_flexible(block, rk.SinePulse(0.3, 0.8), duration=1.6)
     assert float(found.max_rotation) == pytest.approx(rigid_peak(block, 0.3, 0.8), rel=1e-7)
     assert found.status == rk.Status.successful
 
@@ -232,7 +232,7 @@ def test_derivatives_and_finite_differences():
 
     def peaks(x):
         block = rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2])
-        found = rk.outcome_flexible(block, PULSE, duration=12.0)
+        found = rk.responses.outcome_flexible(block, PULSE, duration=12.0)
         return jnp.stack([found.max_rotation, found.max_displacement, found.max_bending])
 
     x = jnp.array([30.0, 2.5, 0.01, 5.0, 50.0])
@@ -275,7 +275,7 @@ def test_a_thousand_blocks_at_once():
     moduli = jnp.linspace(10e9, 60e9, 1000)
 
     def peak(E):
-        return rk.outcome_flexible(
+        return rk.responses.outcome_flexible(
             rk.FlexibleBlock(5.0, 50.0, E, 2500.0, 0.01), PULSE, duration=12.0
         )  # fmt: skip
 
@@ -297,7 +297,7 @@ def test_stiff_columns(damping):
     must not make the base chatter.
     """
     block = rk.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, damping, 20)
-    response = rk.simulate_flexible(block, rk.SinePulse(0.15, 0.8), duration=1.6, samples=2)
+    response = rk.responses.simulate_flexible(block, rk.SinePulse(0.15, 0.8), duration=1.6, samples=2)
     assert float(block.frequencies[-1]) > 1e5
     assert response.status == rk.Status.successful
     assert int(response.trajectory.nodes.steps.max()) < 200
@@ -305,7 +305,7 @@ def test_stiff_columns(damping):
     rigid = rigid_peak(block, 0.15, 0.8)
     off = float(response.max_rotation) / rigid - 1
     assert off == pytest.approx(0, abs=3e-3)
-    peak = rk.outcome_flexible(stiffer, rk.SinePulse(0.15, 0.8), duration=1.6).max_rotation
+    peak = rk.responses.outcome_flexible(stiffer, rk.SinePulse(0.15, 0.8), duration=1.6).max_rotation
     assert float(peak) / rigid - 1 == pytest.approx(off / 10, rel=0.25)
 
 
@@ -314,7 +314,9 @@ def test_stiff_columns(damping):
 
 @pytest.mark.slow
 def test_small_budgets_have_a_status():
-    found = rk.outcome_flexible(rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1)
+    found = rk.responses.outcome_flexible(
+        rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1
+    )
     assert found.status == rk.Status.step_budget_exhausted
 
 
@@ -339,9 +341,9 @@ def test_wrong_arguments(change, message):
 def test_wrong_durations():
     block = rk.FlexibleBlock(**TALL, damping_ratio=0.01)
     with pytest.raises(ValueError, match="`duration` must be positive"):
-        rk.simulate_flexible(block, PULSE, duration=0.0)
+        rk.responses.simulate_flexible(block, PULSE, duration=0.0)
     with pytest.raises(ValueError, match="`samples` must be a whole number from 2"):
-        rk.simulate_flexible(block, PULSE, samples=1)
+        rk.responses.simulate_flexible(block, PULSE, samples=1)
 
 
 def test_vertical_motions_raise():

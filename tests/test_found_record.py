@@ -44,7 +44,7 @@ def closed_form(band=None, baseline=False):
 
 @functools.cache
 def found(**given):
-    return rk.find_record(BLOCK, START, **LINEAR, **given)
+    return rk.inverse.find_record(BLOCK, START, **LINEAR, **given)
 
 
 SPACES = {"all": {"baseline": False}, "baseline kept": {"baseline": True}, "band": {"band": (0.5, 8.0)}}
@@ -61,7 +61,7 @@ def test_beside_the_closed_form(space):
     if space == SPACES["all"]:
         np.testing.assert_allclose(result.changes, expected, rtol=2e-6)
         assert result.change < result.scaling
-    assert bool(result.status == rk.RecordStatus.successful)
+    assert bool(result.status == rk.inverse.RecordStatus.successful)
     assert -1e-3 < result.margin[0] <= 0
     assert rk.outcome(BLOCK, result.record, **LINEAR).overturned
     np.testing.assert_allclose(size(result.record.samples - START.samples), result.change, rtol=1e-9)
@@ -130,36 +130,36 @@ TWO = rk.Block(np.array([ALPHA, 0.8 * ALPHA]), np.array([P, 1.5 * P]), 0.9)
 
 def test_a_block_that_falls_is_spared():
     toppled = 1.5 * found(starts=3, baseline=False).record.samples
-    result = rk.find_record(BLOCK, rk.Record(toppled, DT), "spare", starts=3, baseline=False, **LINEAR)
+    result = rk.inverse.find_record(BLOCK, rk.Record(toppled, DT), "spare", starts=3, baseline=False, **LINEAR)
     assert 0 <= result.margin[0] < 0.05 and result.change <= result.scaling
     assert not rk.outcome(BLOCK, result.record, **LINEAR).overturned
 
 
 @pytest.mark.parametrize("target", [0.6, 0.3])
 def test_a_margin_is_come_to(target):
-    result = rk.find_record(BLOCK, START, target, starts=2, **LINEAR)
+    result = rk.inverse.find_record(BLOCK, START, target, starts=2, **LINEAR)
     assert target - 0.05 < result.margin[0] <= target
 
 
 @pytest.mark.slow
 def test_two_blocks_at_once():
-    result = rk.find_record(TWO, START, ["topple", "spare"], starts=3, **LINEAR)
+    result = rk.inverse.find_record(TWO, START, ["topple", "spare"], starts=3, **LINEAR)
     fallen = jax.vmap(lambda block: rk.outcome(block, result.record, **LINEAR).overturned)(
         rk.Block(TWO.alpha, TWO.p, jnp.full(2, 0.9))
     )
-    assert fallen.tolist() == [True, False] or bool(result.status == rk.RecordStatus.not_reached)
+    assert fallen.tolist() == [True, False] or bool(result.status == rk.inverse.RecordStatus.not_reached)
 
 
 def test_what_is_there_already():
-    result = rk.find_record(BLOCK, START, "spare", **LINEAR)
-    assert result.change == 0 and bool(result.status == rk.RecordStatus.unchanged)
+    result = rk.inverse.find_record(BLOCK, START, "spare", **LINEAR)
+    assert result.change == 0 and bool(result.status == rk.inverse.RecordStatus.unchanged)
     np.testing.assert_array_equal(result.record.samples, START.samples)
 
 
 def test_where_nothing_may_change():
     """No frequency of a record of 0.8 s lies in the band."""
-    result = rk.find_record(BLOCK, START, band=(0.1, 0.5), starts=4, **LINEAR)
-    assert bool(result.status == rk.RecordStatus.not_reached) and jnp.isinf(result.change)
+    result = rk.inverse.find_record(BLOCK, START, band=(0.1, 0.5), starts=4, **LINEAR)
+    assert bool(result.status == rk.inverse.RecordStatus.not_reached) and jnp.isinf(result.change)
     np.testing.assert_array_equal(result.record.samples, START.samples)
     assert jnp.isfinite(result.scaling) and jnp.isinf(result.changes).all()
 
@@ -168,8 +168,8 @@ def test_where_nothing_may_change():
 def test_what_cannot_be():
     """The same block twice, toppled and spared."""
     twice = rk.Block(np.full(2, ALPHA), np.full(2, P), 0.9)
-    result = rk.find_record(twice, START, ["topple", "spare"], starts=2, **LINEAR)
-    assert bool(result.status == rk.RecordStatus.not_reached) and jnp.isinf(result.change)
+    result = rk.inverse.find_record(twice, START, ["topple", "spare"], starts=2, **LINEAR)
+    assert bool(result.status == rk.inverse.RecordStatus.not_reached) and jnp.isinf(result.change)
     np.testing.assert_array_equal(result.record.samples, START.samples)
 
 
@@ -186,13 +186,13 @@ BAD = {
 @pytest.mark.parametrize(("given", "words"), BAD.values(), ids=BAD)
 def test_what_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        rk.find_record(**{"block": BLOCK, "start": START, **LINEAR, **given})
+        rk.inverse.find_record(**{"block": BLOCK, "start": START, **LINEAR, **given})
 
 
 @pytest.mark.slow
 def test_under_the_built_in_record():
     """Half of the change that scaling takes, from any of some seeds."""
     block = rk.Block(0.2, 2.0)
-    result = rk.find_record(block, rk.example_record(), starts=3)
+    result = rk.inverse.find_record(block, rk.example_record(), starts=3)
     assert rk.outcome(block, result.record).overturned and result.margin[0] > -0.02
     assert result.change < 0.6 * result.scaling

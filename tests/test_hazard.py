@@ -20,11 +20,11 @@ def site_rate(level):
     return 0.3 * (1 + level / 0.03) ** -2.2 * np.exp(-1.5 * level)
 
 
-CURVE = rk.HazardCurve(LEVELS, site_rate(LEVELS), "PGA")
-ROCK, TOUGH = rk.LogNormalFragility(0.35, 0.4), rk.LogNormalFragility(0.6, 0.25)
+CURVE = rk.hazard.HazardCurve(LEVELS, site_rate(LEVELS), "PGA")
+ROCK, TOUGH = rk.hazard.LogNormalFragility(0.35, 0.4), rk.hazard.LogNormalFragility(0.6, 0.25)
 
 
-class Own(rk.AbstractFragility):
+class Own(rk.hazard.AbstractFragility):
     """A user's fragility: the lognormal one, written anew."""
 
     median: float = 0.35
@@ -34,7 +34,7 @@ class Own(rk.AbstractFragility):
         return jax.scipy.stats.norm.cdf(jnp.log(level), jnp.log(self.median), self.dispersion)
 
 
-class Step(rk.AbstractFragility):
+class Step(rk.hazard.AbstractFragility):
     """Topples with the probability `share` from `edge` on, and never below."""
 
     edge: float
@@ -87,7 +87,7 @@ def test_rates_between_levels_follow_power_laws():
     np.testing.assert_allclose(CURVE.rate(LEVELS), CURVE.rates, rtol=1e-14)
     middle = np.sqrt(LEVELS[1:] * LEVELS[:-1])
     np.testing.assert_allclose(CURVE.rate(middle), np.sqrt(CURVE.rates[1:] * CURVE.rates[:-1]), rtol=1e-13)
-    power = rk.HazardCurve([0.1, 0.3, 2.0], 1e-3 * np.array([0.1, 0.3, 2.0]) ** -1.7)
+    power = rk.hazard.HazardCurve([0.1, 0.3, 2.0], 1e-3 * np.array([0.1, 0.3, 2.0]) ** -1.7)
     x = np.geomspace(0.1, 2.0, 37)[1:-1]
     np.testing.assert_allclose(power.rate(x), 1e-3 * x**-1.7, rtol=1e-13)
 
@@ -108,22 +108,22 @@ def test_rates_between_levels_follow_power_laws():
     ],
 )
 def test_ends_of_a_curve(rates, level, expected):
-    np.testing.assert_allclose(rk.HazardCurve([0.1, 0.2, 0.4], rates).rate(level), expected, rtol=1e-13)
+    np.testing.assert_allclose(rk.hazard.HazardCurve([0.1, 0.2, 0.4], rates).rate(level), expected, rtol=1e-13)
 
 
 def test_probabilities_of_exceedance_are_those_of_a_poisson_process():
     probabilities = 1 - np.exp(-50 * site_rate(LEVELS))
-    curve = rk.HazardCurve.from_probabilities(LEVELS, probabilities, 50.0, "PGA")
+    curve = rk.hazard.HazardCurve.from_probabilities(LEVELS, probabilities, 50.0, "PGA")
     np.testing.assert_allclose(curve.rates, site_rate(LEVELS), rtol=1e-9)
     assert curve.measure == "PGA"
-    known = rk.HazardCurve.from_probabilities([0.1, 0.2, 0.4], [1.0, 0.1, 0.0], 50.0)
+    known = rk.hazard.HazardCurve.from_probabilities([0.1, 0.2, 0.4], [1.0, 0.1, 0.0], 50.0)
     np.testing.assert_allclose(known.rates, [np.inf, -np.log(0.9) / 50, 0.0], rtol=1e-14)
 
 
 def test_extended_curve_continues_the_power_laws():
     x = np.array([0.05, 0.1, 0.2, 0.4, 0.8, 1.6])
     rates = 1e-3 * x**-1.7
-    curve = rk.HazardCurve(x, np.where(x < 0.2, np.inf, np.where(x > 0.4, 0.0, rates)))
+    curve = rk.hazard.HazardCurve(x, np.where(x < 0.2, np.inf, np.where(x > 0.4, 0.0, rates)))
     extended = curve.extended(0.01, 5.0)
     np.testing.assert_allclose(extended.levels, [0.01, *x, 5.0])
     np.testing.assert_allclose(extended.rates, 1e-3 * np.array([0.01, *x, 5.0]) ** -1.7, rtol=1e-13)
@@ -132,17 +132,17 @@ def test_extended_curve_continues_the_power_laws():
 @pytest.mark.parametrize("median", [0.02, 0.1, 0.5, 1.5])
 def test_what_a_curve_leaves_open_is_bounded(median):
     """The rate under the full hazard lies between those under the curve that was cut, and under its power laws."""
-    fragility = rk.LogNormalFragility(median, 0.4)
+    fragility = rk.hazard.LogNormalFragility(median, 0.4)
     levels = np.geomspace(1e-4, 1e2, 400)
-    curve = lambda part: rk.HazardCurve(levels[part], site_rate(levels[part]))
-    full = float(rk.toppling_rate(fragility, curve(slice(None))))
+    curve = lambda part: rk.hazard.HazardCurve(levels[part], site_rate(levels[part]))
+    full = float(rk.hazard.toppling_rate(fragility, curve(slice(None))))
     cut = curve(slice(180, 260))  # 0.05 g to 0.8 g
-    below, above = (float(rk.toppling_rate(fragility, c)) for c in (cut, cut.extended(1e-4, 1e2)))
+    below, above = (float(rk.hazard.toppling_rate(fragility, c)) for c in (cut, cut.extended(1e-4, 1e2)))
     assert below < full < above
     # Above the last level, what is left open is at most its rate times the probability to withstand it.
     beyond = curve(slice(0, 260))
     most = float(beyond.rates[-1] * (1 - fragility(beyond.levels[-1])))
-    assert -1e-15 <= full - float(rk.toppling_rate(fragility, beyond)) <= most + 1e-15
+    assert -1e-15 <= full - float(rk.hazard.toppling_rate(fragility, beyond)) <= most + 1e-15
 
 
 # --------------------------------------------------------------------------------------- toppling rates
@@ -153,25 +153,25 @@ def test_what_a_curve_leaves_open_is_bounded(median):
 def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
     """Cornell et al. (2002): k0 m^-k exp(k^2 b^2/2), in closed form, by quadrature, and as a fragility of a user."""
     levels = np.geomspace(1e-7, 1e3, 80)
-    curve = rk.HazardCurve(levels, 1e-4 * levels**-k)
+    curve = rk.hazard.HazardCurve(levels, 1e-4 * levels**-k)
     exact = 1e-4 * median**-k * np.exp((k * dispersion) ** 2 / 2)
-    rock, own = rk.LogNormalFragility(median, dispersion), Own(median, dispersion)
-    np.testing.assert_allclose(rk.toppling_rate(rock, curve), exact, rtol=1e-12)
-    np.testing.assert_allclose(rk.toppling_rate(own, curve), exact, rtol=1e-10)
-    np.testing.assert_allclose(-jnp.log(rk.survival_probability(rock, 1.0, curve)), exact, rtol=1e-10)
+    rock, own = rk.hazard.LogNormalFragility(median, dispersion), Own(median, dispersion)
+    np.testing.assert_allclose(rk.hazard.toppling_rate(rock, curve), exact, rtol=1e-12)
+    np.testing.assert_allclose(rk.hazard.toppling_rate(own, curve), exact, rtol=1e-10)
+    np.testing.assert_allclose(-jnp.log(rk.hazard.survival_probability(rock, 1.0, curve)), exact, rtol=1e-10)
     # Of one power law, two levels say all.
-    two = rk.HazardCurve(levels[[0, -1]], 1e-4 * levels[[0, -1]] ** -k)
-    np.testing.assert_allclose(rk.toppling_rate(rock, two), exact, rtol=1e-11)
+    two = rk.hazard.HazardCurve(levels[[0, -1]], 1e-4 * levels[[0, -1]] ** -k)
+    np.testing.assert_allclose(rk.hazard.toppling_rate(rock, two), exact, rtol=1e-11)
 
 
 CURVES = {
     "site": CURVE,
-    "few levels": rk.HazardCurve([0.1, 0.4, 0.6], [2e-2, 1e-3, 2e-4]),
-    "flat at first": rk.HazardCurve([0.1, 0.2, 0.4], [1e-3, 1e-3, 1e-5]),
-    "steep": rk.HazardCurve([0.1, 0.3, 0.35, 0.4], [1e-2, 1e-3, 1e-9, 1e-12]),
-    "first unknown": rk.HazardCurve([0.05, 0.1, 0.3, 0.8], [np.inf, 1e-2, 1e-3, 1e-5]),
-    "last unknown": rk.HazardCurve([0.1, 0.3, 0.5, 0.8], [1e-2, 1e-3, 0.0, 0.0]),
-    "one known": rk.HazardCurve([0.1, 0.2, 0.3, 0.8], [np.inf, np.inf, 1e-3, 0.0]),
+    "few levels": rk.hazard.HazardCurve([0.1, 0.4, 0.6], [2e-2, 1e-3, 2e-4]),
+    "flat at first": rk.hazard.HazardCurve([0.1, 0.2, 0.4], [1e-3, 1e-3, 1e-5]),
+    "steep": rk.hazard.HazardCurve([0.1, 0.3, 0.35, 0.4], [1e-2, 1e-3, 1e-9, 1e-12]),
+    "first unknown": rk.hazard.HazardCurve([0.05, 0.1, 0.3, 0.8], [np.inf, 1e-2, 1e-3, 1e-5]),
+    "last unknown": rk.hazard.HazardCurve([0.1, 0.3, 0.5, 0.8], [1e-2, 1e-3, 0.0, 0.0]),
+    "one known": rk.hazard.HazardCurve([0.1, 0.2, 0.3, 0.8], [np.inf, np.inf, 1e-3, 0.0]),
 }
 
 
@@ -179,16 +179,18 @@ CURVES = {
 @pytest.mark.parametrize("median, dispersion", [(0.35, 0.4), (0.25, 0.02), (1.5, 0.2), (0.02, 0.5)])
 def test_toppling_rate_is_the_integral_over_the_curve(name, median, dispersion):
     """Both ways of integration against 30 digits, also where the fragility lies beyond the curve."""
-    rock, breaks = rk.LogNormalFragility(median, dispersion), median * np.exp(dispersion * np.arange(-8, 9, 2))
+    rock, breaks = rk.hazard.LogNormalFragility(median, dispersion), median * np.exp(dispersion * np.arange(-8, 9, 2))
     exact = float(integral(lognormal(median, dispersion), CURVES[name], breaks))
-    np.testing.assert_allclose(rk.toppling_rate(rock, CURVES[name]), exact, rtol=1e-11)
-    np.testing.assert_allclose(-jnp.log(rk.survival_probability(rock, 1.0, CURVES[name])), exact, rtol=1e-9, atol=1e-16)
+    np.testing.assert_allclose(rk.hazard.toppling_rate(rock, CURVES[name]), exact, rtol=1e-11)
+    np.testing.assert_allclose(
+        -jnp.log(rk.hazard.survival_probability(rock, 1.0, CURVES[name])), exact, rtol=1e-9, atol=1e-16
+    )
 
 
 def test_tabulated_fragility():
     """Straight lines over ln(level) between the table's levels, wherever these lie between those of the curve."""
     levels, values = np.array([0.12, 0.25, 0.33, 0.5]), np.array([0.1, 0.7, 0.3, 0.9])
-    table = rk.TabulatedFragility(levels, values)
+    table = rk.hazard.TabulatedFragility(levels, values)
     inside = np.geomspace(0.12, 0.5, 50)
     np.testing.assert_allclose(table(inside), np.interp(np.log(inside), np.log(levels), values), rtol=1e-13)
     np.testing.assert_allclose(table([0.119, 0.6]), [0.0, 0.9])
@@ -202,7 +204,7 @@ def test_tabulated_fragility():
 
     for curve in CURVES.values():
         exact = float(integral(line, curve, levels))
-        np.testing.assert_allclose(rk.toppling_rate(table, curve), exact, rtol=1e-12)
+        np.testing.assert_allclose(rk.hazard.toppling_rate(table, curve), exact, rtol=1e-12)
 
 
 # --------------------------------------------------------------------------------------- survival
@@ -218,7 +220,12 @@ def shakings(rng, curve, years):
 
 
 # Kinds in turn: rocks of one kind are computed together, and must get their own ages.
-ROCKS = [ROCK, rk.TabulatedFragility([0.1, 0.3, 0.5], [0.0, 0.6, 0.3]), TOUGH, rk.LogNormalFragility(0.3, 0.5)]
+ROCKS = [
+    ROCK,
+    rk.hazard.TabulatedFragility([0.1, 0.3, 0.5], [0.0, 0.6, 0.3]),
+    TOUGH,
+    rk.hazard.LogNormalFragility(0.3, 0.5),
+]
 AGES = [300.0, 200.0, 900.0, 100.0]
 
 
@@ -232,10 +239,10 @@ def test_survival_of_rocks_that_share_their_shakings():
     for rock, age in zip(ROCKS, AGES):
         toppled |= (rng.uniform(size=time.size) < rock(intensity)) & (ago < age)
     survived = 1 - np.unique(history[toppled]).size / histories
-    probability = float(rk.survival_probability(ROCKS, AGES, CURVE))
+    probability = float(rk.hazard.survival_probability(ROCKS, AGES, CURVE))
     error = np.sqrt(probability * (1 - probability) / histories)
     assert abs(survived - probability) < 3 * error
-    product = np.prod([rk.survival_probability(*pair, CURVE) for pair in zip(ROCKS, AGES)])
+    product = np.prod([rk.hazard.survival_probability(*pair, CURVE) for pair in zip(ROCKS, AGES)])
     assert 0.2 < product < probability - 10 * error < 0.8, "shared shakings are not independent ones"
 
 
@@ -249,26 +256,29 @@ def test_survival_against_direct_quadrature():
         there = [rock for rock, age in zip(ROCKS, AGES) if age >= end]
         joint = lambda level, there=there: 1 - np.prod([1 - np.asarray(rock(level)) for rock in there], axis=0)
         exponent += (end - start) * (np.sum(joint(middle) * falls) + rate[-1] * joint(x[-1:])[0])
-    np.testing.assert_allclose(rk.survival_probability(ROCKS, AGES, CURVE), np.exp(-exponent), rtol=1e-7)
+    np.testing.assert_allclose(rk.hazard.survival_probability(ROCKS, AGES, CURVE), np.exp(-exponent), rtol=1e-7)
 
 
 def test_limits_of_survival():
     rate = float(CURVE.rate(0.4))
     step = Step(0.4)
     # Rocks without scatter of their own topple together: any number of them is one, the weakest counts.
-    one = rk.survival_probability(step, 500.0, CURVE)
+    one = rk.hazard.survival_probability(step, 500.0, CURVE)
     np.testing.assert_allclose(one, np.exp(-500 * rate), rtol=1e-13)
-    np.testing.assert_allclose(rk.survival_probability([step] * 5, 500.0, CURVE), one, rtol=1e-13)
-    np.testing.assert_allclose(rk.survival_probability([step, Step(0.9), Step(0.5)], 500.0, CURVE), one, rtol=1e-13)
-    # Certain to topple in the weakest shaking that the curve knows; certain not to.
-    np.testing.assert_allclose(rk.survival_probability(Step(1e-3), 30.0, CURVE), np.exp(-30 * CURVE.rates[0]))
-    assert rk.survival_probability(Step(0.1, 0.0), 1e6, CURVE) == 1
-    assert rk.survival_probability(ROCK, 0.0, CURVE) == 1
+    np.testing.assert_allclose(rk.hazard.survival_probability([step] * 5, 500.0, CURVE), one, rtol=1e-13)
     np.testing.assert_allclose(
-        rk.survival_probability([ROCK, Step(0.1, 0.0)], 500.0, CURVE), rk.survival_probability(ROCK, 500.0, CURVE)
+        rk.hazard.survival_probability([step, Step(0.9), Step(0.5)], 500.0, CURVE), one, rtol=1e-13
+    )
+    # Certain to topple in the weakest shaking that the curve knows; certain not to.
+    np.testing.assert_allclose(rk.hazard.survival_probability(Step(1e-3), 30.0, CURVE), np.exp(-30 * CURVE.rates[0]))
+    assert rk.hazard.survival_probability(Step(0.1, 0.0), 1e6, CURVE) == 1
+    assert rk.hazard.survival_probability(ROCK, 0.0, CURVE) == 1
+    np.testing.assert_allclose(
+        rk.hazard.survival_probability([ROCK, Step(0.1, 0.0)], 500.0, CURVE),
+        rk.hazard.survival_probability(ROCK, 500.0, CURVE),
     )
     # Two rocks that withstand half of all shakings each, all by luck: half of a half remains.
-    halves = rk.survival_probability([Step(0.4, 0.5)] * 2, 500.0, CURVE)
+    halves = rk.hazard.survival_probability([Step(0.4, 0.5)] * 2, 500.0, CURVE)
     np.testing.assert_allclose(halves, np.exp(-500 * rate * 0.75), rtol=1e-13)
 
 
@@ -277,20 +287,22 @@ def test_a_rock_counts_since_it_became_fragile():
     low, high = float(CURVE.rate(0.2)), float(CURVE.rate(0.5))
     for rocks, ages in (([weak, strong], [300.0, 900.0]), ([strong, weak], [900.0, 300.0])):
         expected = np.exp(-300 * low - 600 * high)  # the weak one masks the strong one for as long as it is there
-        np.testing.assert_allclose(rk.survival_probability(rocks, ages, CURVE), expected, rtol=1e-13)
+        np.testing.assert_allclose(rk.hazard.survival_probability(rocks, ages, CURVE), expected, rtol=1e-13)
     np.testing.assert_allclose(
-        rk.survival_probability([weak, strong], [900.0, 300.0], CURVE), np.exp(-900 * low), rtol=1e-13
+        rk.hazard.survival_probability([weak, strong], [900.0, 300.0], CURVE), np.exp(-900 * low), rtol=1e-13
     )
     # Of rocks of one age, order does not matter.
-    forth, back = (rk.survival_probability(rocks, 400.0, CURVE) for rocks in (ROCKS, ROCKS[::-1]))
+    forth, back = (rk.hazard.survival_probability(rocks, 400.0, CURVE) for rocks in (ROCKS, ROCKS[::-1]))
     np.testing.assert_allclose(forth, back, rtol=1e-13)
 
 
 def test_uncertain_ages_are_a_mean_over_samples():
     samples = np.random.default_rng(1).uniform(100.0, 3000.0, (50, 2))
-    each = jax.vmap(lambda ages: rk.survival_probability([ROCK, TOUGH], ages, CURVE))(samples)
+    each = jax.vmap(lambda ages: rk.hazard.survival_probability([ROCK, TOUGH], ages, CURVE))(samples)
     for i in (0, 17, 49):
-        np.testing.assert_allclose(each[i], rk.survival_probability([ROCK, TOUGH], samples[i], CURVE), rtol=1e-13)
+        np.testing.assert_allclose(
+            each[i], rk.hazard.survival_probability([ROCK, TOUGH], samples[i], CURVE), rtol=1e-13
+        )
 
 
 # --------------------------------------------------------------------------------------- branches and scales
@@ -298,13 +310,17 @@ def test_uncertain_ages_are_a_mean_over_samples():
 
 def test_weights_of_branches():
     """Bayes by hand; and a branch under which the rock can hardly stand is left with nothing."""
-    np.testing.assert_allclose(rk.branch_weights([0.5, 0.3, 0.2], [0.1, 0.5, 0.0]), [0.25, 0.75, 0.0], rtol=1e-14)
-    np.testing.assert_allclose(rk.branch_weights([2.0, 1.0, 1.0], [0.3, 0.3, 0.3]), [0.5, 0.25, 0.25], rtol=1e-14)
-    branches = rk.HazardCurve(np.tile(LEVELS, (3, 1)), site_rate(LEVELS) * np.array([[0.3], [1.0], [10.0]]))
-    survival = jax.vmap(lambda curve: rk.survival_probability(ROCK, 2000.0, curve))(branches)
-    rate = rk.toppling_rate(ROCK, CURVE)
+    np.testing.assert_allclose(
+        rk.hazard.branch_weights([0.5, 0.3, 0.2], [0.1, 0.5, 0.0]), [0.25, 0.75, 0.0], rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        rk.hazard.branch_weights([2.0, 1.0, 1.0], [0.3, 0.3, 0.3]), [0.5, 0.25, 0.25], rtol=1e-14
+    )
+    branches = rk.hazard.HazardCurve(np.tile(LEVELS, (3, 1)), site_rate(LEVELS) * np.array([[0.3], [1.0], [10.0]]))
+    survival = jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 2000.0, curve))(branches)
+    rate = rk.hazard.toppling_rate(ROCK, CURVE)
     np.testing.assert_allclose(survival, np.exp(-2000 * rate * np.array([0.3, 1.0, 10.0])), rtol=1e-9)
-    weights = rk.branch_weights(np.full(3, 1 / 3), survival)
+    weights = rk.hazard.branch_weights(np.full(3, 1 / 3), survival)
     np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
     assert weights[0] > 0.8 and weights[2] < 1e-6
 
@@ -313,11 +329,11 @@ def test_allowed_scale_under_a_power_law():
     """Intensities times s raise the toppling rate of a power law by s^k: the factor in closed form."""
     k, age = 2.3, 2e4
     levels = np.geomspace(1e-5, 1e3, LEVELS.size)
-    curve = rk.HazardCurve(levels, 1e-5 * levels**-k, "PGA")
+    curve = rk.hazard.HazardCurve(levels, 1e-5 * levels**-k, "PGA")
     once = age * 1e-5 * 0.35**-k * np.exp((k * 0.4) ** 2 / 2)
     exact = lambda probability: (-np.log(probability) / once) ** (1 / k)
-    scale = lambda p: rk.allowed_scale(ROCK, age, curve, p)
-    np.testing.assert_allclose(rk.allowed_scale(ROCK, age, curve), exact(0.05), rtol=1e-12)
+    scale = lambda p: rk.hazard.allowed_scale(ROCK, age, curve, p)
+    np.testing.assert_allclose(rk.hazard.allowed_scale(ROCK, age, curve), exact(0.05), rtol=1e-12)
     # d s/d p = s/(k p ln p), and its derivative.
     p, slope = 0.2, exact(0.2) / (k * 0.2 * np.log(0.2))
     curvature = slope * (1 / (k * p * np.log(p)) - 1 / p - 1 / (p * np.log(p)))
@@ -327,8 +343,8 @@ def test_allowed_scale_under_a_power_law():
 
 def test_allowed_scale_brings_survival_to_the_probability():
     probabilities = np.array([0.01, 0.05, 0.5])
-    scales = jax.jit(jax.vmap(lambda p: rk.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities)
-    survival = lambda scale: float(rk.survival_probability(ROCKS, AGES, CURVE.scaled(scale)))
+    scales = jax.jit(jax.vmap(lambda p: rk.hazard.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities)
+    survival = lambda scale: float(rk.hazard.survival_probability(ROCKS, AGES, CURVE.scaled(scale)))
     np.testing.assert_allclose([survival(scale) for scale in scales], probabilities, rtol=1e-12)
     assert survival(1.001 * scales[1]) < 0.05
     np.testing.assert_allclose(CURVE.scaled(3.0).levels, 3 * LEVELS, rtol=1e-15)
@@ -338,31 +354,33 @@ def test_allowed_scale_brings_survival_to_the_probability():
 def test_no_factor_is_large_or_small_enough():
     """The curve knows 0.21 shakings a year: in 14 years the weakest rock stands with more than 5 %."""
     assert 14 * CURVE.rates[0] < -np.log(0.05) < 15 * CURVE.rates[0]
-    assert rk.allowed_scale(ROCK, 14.0, CURVE) == np.inf
-    assert 1 < rk.allowed_scale(ROCK, 15.0, CURVE) < np.inf
-    assert rk.allowed_scale(Step(1e-9), 2000.0, CURVE) == 0
-    slope = jax.jit(jax.grad(lambda age: rk.allowed_scale(ROCK, age, CURVE)))
+    assert rk.hazard.allowed_scale(ROCK, 14.0, CURVE) == np.inf
+    assert 1 < rk.hazard.allowed_scale(ROCK, 15.0, CURVE) < np.inf
+    assert rk.hazard.allowed_scale(Step(1e-9), 2000.0, CURVE) == 0
+    slope = jax.jit(jax.grad(lambda age: rk.hazard.allowed_scale(ROCK, age, CURVE)))
     assert slope(14.0) == 0
-    near = rk.allowed_scale(ROCK, 100.01, CURVE) - rk.allowed_scale(ROCK, 99.99, CURVE)
+    near = rk.hazard.allowed_scale(ROCK, 100.01, CURVE) - rk.hazard.allowed_scale(ROCK, 99.99, CURVE)
     np.testing.assert_allclose(slope(100.0), near / 0.02, rtol=1e-6)
 
 
 def test_allowed_scale_is_the_first_of_several():
     """A rock that only middling shakings topple stands under weak and under strong hazard."""
-    rock = rk.TabulatedFragility([0.2, 0.3, 0.5, 0.6], [0.0, 1.0, 1.0, 0.0])
-    curve = rk.HazardCurve([0.1, 0.11], [1e-3, 1e-3 * (1 - 1e-9)])
-    scale = rk.allowed_scale(rock, 6000.0, curve)
+    rock = rk.hazard.TabulatedFragility([0.2, 0.3, 0.5, 0.6], [0.0, 1.0, 1.0, 0.0])
+    curve = rk.hazard.HazardCurve([0.1, 0.11], [1e-3, 1e-3 * (1 - 1e-9)])
+    scale = rk.hazard.allowed_scale(rock, 6000.0, curve)
     assert 2.0 < scale / (0.1 / 0.11) and scale < 3.0
     for factor, probability in ((1.5, 1.0), (0.999 * scale, 0.0515), (1.001 * scale, 0.0485), (7.0, 1.0)):
-        np.testing.assert_allclose(rk.survival_probability(rock, 6000.0, curve.scaled(factor)), probability, rtol=0.03)
+        np.testing.assert_allclose(
+            rk.hazard.survival_probability(rock, 6000.0, curve.scaled(factor)), probability, rtol=0.03
+        )
 
 
 def rebuilt(numbers):
     """Rocks, ages and a curve from 9 numbers."""
     medians, dispersions, ages, rest = numbers[:2], numbers[2:4], numbers[4:6], numbers[6:]
-    rocks = [rk.LogNormalFragility(m, b) for m, b in zip(medians, dispersions)]
-    rocks += [rk.TabulatedFragility(jnp.append(rest[0], 0.5), jnp.append(0.2, rest[1]))]
-    curve = rk.HazardCurve(LEVELS, CURVE.rates * jnp.asarray(LEVELS) ** (rest[2] - 1))
+    rocks = [rk.hazard.LogNormalFragility(m, b) for m, b in zip(medians, dispersions)]
+    rocks += [rk.hazard.TabulatedFragility(jnp.append(rest[0], 0.5), jnp.append(0.2, rest[1]))]
+    curve = rk.hazard.HazardCurve(LEVELS, CURVE.rates * jnp.asarray(LEVELS) ** (rest[2] - 1))
     return rocks, jnp.append(ages, 80.0), curve
 
 
@@ -371,15 +389,17 @@ def test_derivatives():
 
     def results(numbers):
         rocks, ages, curve = rebuilt(numbers)
-        rates = [rk.toppling_rate(rock, curve) for rock in (rocks[0], rocks[2])]
-        return jnp.stack([*rates, rk.survival_probability(rocks, ages, curve), rk.allowed_scale(rocks, ages, curve)])
+        rates = [rk.hazard.toppling_rate(rock, curve) for rock in (rocks[0], rocks[2])]
+        return jnp.stack(
+            [*rates, rk.hazard.survival_probability(rocks, ages, curve), rk.hazard.allowed_scale(rocks, ages, curve)]
+        )
 
     assert_slopes(results, jnp.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05]))
 
 
 SLOPES = [
-    jax.jit(jax.value_and_grad(lambda curve: rk.toppling_rate(ROCK, curve))),
-    jax.jit(jax.value_and_grad(lambda curve: jnp.log(rk.survival_probability(ROCK, 50.0, curve)))),
+    jax.jit(jax.value_and_grad(lambda curve: rk.hazard.toppling_rate(ROCK, curve))),
+    jax.jit(jax.value_and_grad(lambda curve: jnp.log(rk.hazard.survival_probability(ROCK, 50.0, curve)))),
 ]
 
 
@@ -396,51 +416,80 @@ def test_derivatives_where_rates_are_unknown(name):
 @pytest.mark.parametrize(
     "call, error",
     [
-        (lambda: rk.HazardCurve([0.1, 0.1], [1e-2, 1e-3]), "`levels` must be positive and finite, and rise .* is 0.1"),
-        (lambda: rk.HazardCurve([0.0, 0.1], [1e-2, 1e-3]), "`levels` must be positive"),
-        (lambda: rk.HazardCurve([0.1], [1e-2]), r"`levels` must hold at least two levels, but has shape \(1,\)"),
-        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, 1e-2]), "`rates` must be 0 or more, never rise, .* but is 0.01"),
-        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, -1e-3]), "`rates` must be 0 or more"),
-        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, np.nan]), "`rates` must be 0 or more"),
-        (lambda: rk.HazardCurve([0.1, 0.2], [np.inf, 0.0]), "`rates` .* infinite only before a positive finite one"),
-        (lambda: rk.HazardCurve([0.1, 0.2], [1e-3, 1e-4, 1e-5]), r"`rates` must have the shape \(2,\) of `levels`"),
         (
-            lambda: rk.HazardCurve.from_probabilities([0.1, 0.2], [1.1, 0.1], 50.0),
+            lambda: rk.hazard.HazardCurve([0.1, 0.1], [1e-2, 1e-3]),
+            "`levels` must be positive and finite, and rise .* is 0.1",
+        ),
+        (lambda: rk.hazard.HazardCurve([0.0, 0.1], [1e-2, 1e-3]), "`levels` must be positive"),
+        (lambda: rk.hazard.HazardCurve([0.1], [1e-2]), r"`levels` must hold at least two levels, but has shape \(1,\)"),
+        (
+            lambda: rk.hazard.HazardCurve([0.1, 0.2], [1e-3, 1e-2]),
+            "`rates` must be 0 or more, never rise, .* but is 0.01",
+        ),
+        (lambda: rk.hazard.HazardCurve([0.1, 0.2], [1e-3, -1e-3]), "`rates` must be 0 or more"),
+        (lambda: rk.hazard.HazardCurve([0.1, 0.2], [1e-3, np.nan]), "`rates` must be 0 or more"),
+        (
+            lambda: rk.hazard.HazardCurve([0.1, 0.2], [np.inf, 0.0]),
+            "`rates` .* infinite only before a positive finite one",
+        ),
+        (
+            lambda: rk.hazard.HazardCurve([0.1, 0.2], [1e-3, 1e-4, 1e-5]),
+            r"`rates` must have the shape \(2,\) of `levels`",
+        ),
+        (
+            lambda: rk.hazard.HazardCurve.from_probabilities([0.1, 0.2], [1.1, 0.1], 50.0),
             r"`probabilities` must be in \[0, 1\], but is 1.1",
         ),
-        (lambda: rk.HazardCurve.from_probabilities([0.1, 0.2], [0.2, 0.1], 0.0), "`investigation_time` must be pos"),
+        (
+            lambda: rk.hazard.HazardCurve.from_probabilities([0.1, 0.2], [0.2, 0.1], 0.0),
+            "`investigation_time` must be pos",
+        ),
         (lambda: CURVE.extended(0.01, 5.0), "`lowest` must be positive and below the first level, but is 0.01"),
         (lambda: CURVE.extended(0.001, 1.0), "`highest` must be finite and above the last level, but is 1.0"),
         (lambda: CURVES["one known"].extended(0.01, 5.0), "`rates` must be known at two levels or more"),
         (lambda: CURVE.scaled(-1.0), "`factor` must be positive"),
-        (lambda: rk.LogNormalFragility(0.3, 0.0), "`dispersion` must be positive and finite, but is 0.0"),
-        (lambda: rk.LogNormalFragility(-0.3, 0.1), "`median` must be positive"),
-        (lambda: rk.TabulatedFragility([0.1, 0.2], [0.5, 1.2]), r"`probabilities` must be in \[0, 1\], but is 1.2"),
-        (lambda: rk.TabulatedFragility([0.2, 0.1], [0.5, 0.7]), "`levels` must be positive and finite, and rise"),
-        (lambda: rk.TabulatedFragility([0.1, 0.2], [0.5]), "`probabilities` must have the shape"),
+        (lambda: rk.hazard.LogNormalFragility(0.3, 0.0), "`dispersion` must be positive and finite, but is 0.0"),
+        (lambda: rk.hazard.LogNormalFragility(-0.3, 0.1), "`median` must be positive"),
         (
-            lambda: rk.survival_probability([ROCK], [1.0, 2.0], CURVE),
+            lambda: rk.hazard.TabulatedFragility([0.1, 0.2], [0.5, 1.2]),
+            r"`probabilities` must be in \[0, 1\], but is 1.2",
+        ),
+        (
+            lambda: rk.hazard.TabulatedFragility([0.2, 0.1], [0.5, 0.7]),
+            "`levels` must be positive and finite, and rise",
+        ),
+        (lambda: rk.hazard.TabulatedFragility([0.1, 0.2], [0.5]), "`probabilities` must have the shape"),
+        (
+            lambda: rk.hazard.survival_probability([ROCK], [1.0, 2.0], CURVE),
             r"`ages` must be one for each of 1 rocks, .*\(2,\)",
         ),
-        (lambda: rk.survival_probability([], 1.0, CURVE), "`ages` must be one for each of 0 rocks"),
-        (lambda: rk.survival_probability(ROCK, -1.0, CURVE), "`ages` must be 0 or more and finite, but is -1.0"),
+        (lambda: rk.hazard.survival_probability([], 1.0, CURVE), "`ages` must be one for each of 0 rocks"),
+        (lambda: rk.hazard.survival_probability(ROCK, -1.0, CURVE), "`ages` must be 0 or more and finite, but is -1.0"),
         (
-            lambda: rk.toppling_rate(rk.LogNormalFragility(np.array([0.3, 0.4]), 0.1), CURVE),
+            lambda: rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(np.array([0.3, 0.4]), 0.1), CURVE),
             r"`fragilities` must each be of one rock, but one has shape \(2,\)",
         ),
         (
-            lambda: rk.toppling_rate(ROCK, rk.HazardCurve(np.array([[0.1, 0.2]]), np.array([[1e-2, 1e-3]]))),
+            lambda: rk.hazard.toppling_rate(
+                ROCK, rk.hazard.HazardCurve(np.array([[0.1, 0.2]]), np.array([[1e-2, 1e-3]]))
+            ),
             r"`curve` must be one, but has levels of shape \(1, 2\). Use jax.vmap",
         ),
-        (lambda: rk.allowed_scale(ROCK, 1.0, CURVE, 1.0), r"`probability` must be in \(0, 1\), but is 1.0"),
-        (lambda: rk.branch_weights([1.0, 1.0], [0.5]), "`prior` and `survival` must be lists of one length"),
-        (lambda: rk.branch_weights([-1.0, 1.0], [0.5, 0.5]), "`prior` must be 0 or more and finite, but is -1.0"),
-        (lambda: rk.branch_weights([0.0, 1.0], [0.5, 0.0]), "`survival` must be above 0 for a branch that has weight"),
-        (lambda: rk.fit_fragility([0.1, 0.2], [0.0, 2.0]), "`toppled` must be from 0 to `trials`, but is 2.0"),
-        (lambda: rk.fit_fragility([0.1, 0.2], [0.0]), r"`toppled` must have the shape \(2,\) of `levels`"),
-        (lambda: rk.fit_fragility([0.1, 0.2], [0.0, 1.0], [1.0, 1.0, 1.0]), "`trials` must have shape"),
-        (lambda: rk.fit_fragility([0.1, -0.2], [0.0, 1.0]), "`levels` must be positive"),
-        (lambda: rk.fit_fragility([], []), "`levels` must be a list of at least one value"),
+        (lambda: rk.hazard.allowed_scale(ROCK, 1.0, CURVE, 1.0), r"`probability` must be in \(0, 1\), but is 1.0"),
+        (lambda: rk.hazard.branch_weights([1.0, 1.0], [0.5]), "`prior` and `survival` must be lists of one length"),
+        (
+            lambda: rk.hazard.branch_weights([-1.0, 1.0], [0.5, 0.5]),
+            "`prior` must be 0 or more and finite, but is -1.0",
+        ),
+        (
+            lambda: rk.hazard.branch_weights([0.0, 1.0], [0.5, 0.0]),
+            "`survival` must be above 0 for a branch that has weight",
+        ),
+        (lambda: rk.hazard.fit_fragility([0.1, 0.2], [0.0, 2.0]), "`toppled` must be from 0 to `trials`, but is 2.0"),
+        (lambda: rk.hazard.fit_fragility([0.1, 0.2], [0.0]), r"`toppled` must have the shape \(2,\) of `levels`"),
+        (lambda: rk.hazard.fit_fragility([0.1, 0.2], [0.0, 1.0], [1.0, 1.0, 1.0]), "`trials` must have shape"),
+        (lambda: rk.hazard.fit_fragility([0.1, -0.2], [0.0, 1.0]), "`levels` must be positive"),
+        (lambda: rk.hazard.fit_fragility([], []), "`levels` must be a list of at least one value"),
     ],
 )
 def test_wrong_arguments(call, error):
@@ -455,10 +504,10 @@ def test_fit_to_counts_at_two_levels():
     """Two counts fix the line: z = Phi^-1(share) at each level, with the variance p (1 - p)/(n phi^2)."""
     levels, toppled, trials = np.array([0.2, 0.5]), np.array([3, 17]), np.array([20, 25])
     # The levels without a trial say nothing.
-    fit = rk.fit_fragility(
+    fit = rk.hazard.fit_fragility(
         np.append(levels, [0.1, 0.3, 2.0]), np.append(toppled, [0, 0, 0]), np.append(trials, [0, 0, 0])
     )
-    assert fit.status == rk.FitStatus.successful
+    assert fit.status == rk.hazard.FitStatus.successful
     p, x = toppled / trials, np.log(levels)
     z = ndtri(p)
     line = lambda z: np.array([x[0] - z[0] * (x[1] - x[0]) / (z[1] - z[0]), np.log((x[1] - x[0]) / (z[1] - z[0]))])
@@ -476,8 +525,8 @@ def test_fit_recovers_a_fragility():
     rng = np.random.default_rng(3)
     levels = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (300, 200)))
     toppled = rng.uniform(size=levels.shape) < ndtr(np.log(levels / 0.35) / 0.4)
-    fits = jax.vmap(rk.fit_fragility)(levels, toppled)
-    assert np.all(fits.status == rk.FitStatus.successful)
+    fits = jax.vmap(rk.hazard.fit_fragility)(levels, toppled)
+    assert np.all(fits.status == rk.hazard.FitStatus.successful)
     off = np.log(np.stack([fits.fragility.median / 0.35, fits.fragility.dispersion / 0.4], -1))
     assert np.abs(off.mean(0)).max() < 0.03
     distance = np.einsum("ni,nij,nj->n", off, np.linalg.inv(fits.covariance), off)
@@ -488,7 +537,7 @@ def test_fit_to_single_outcomes_is_the_fit_to_their_counts():
     levels = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
     toppled, trials = np.array([1, 2, 4, 3, 5]), np.array([6, 6, 6, 4, 5])
     single = np.concatenate([np.arange(n) < k for k, n in zip(toppled, trials)])
-    a, b = rk.fit_fragility(levels, toppled, trials), rk.fit_fragility(np.repeat(levels, trials), single)
+    a, b = rk.hazard.fit_fragility(levels, toppled, trials), rk.hazard.fit_fragility(np.repeat(levels, trials), single)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)):
         np.testing.assert_allclose(x, y, rtol=1e-10)
     assert a.highest_survived == 0.4 and a.lowest_toppled == 0.1
@@ -513,10 +562,10 @@ def test_fit_to_single_outcomes_is_the_fit_to_their_counts():
 )
 def test_fit_says_what_the_data_do_not(levels, toppled, status, between):
     unused = 5 - len(levels)  # levels without a trial, so that all are compiled as one
-    fit = rk.fit_fragility(
+    fit = rk.hazard.fit_fragility(
         np.array(levels + [0.5] * unused), np.array(toppled + [0] * unused), np.array([1] * len(levels) + [0] * unused)
     )
-    assert fit.status == getattr(rk.FitStatus, status)
+    assert fit.status == getattr(rk.hazard.FitStatus, status)
     assert (fit.highest_survived, fit.lowest_toppled) == between
     numbers = [fit.fragility.median, fit.fragility.dispersion, fit.log_likelihood, *fit.covariance.ravel()]
     assert np.all(np.isfinite(numbers)) if status == "successful" else np.all(np.isnan(numbers))
@@ -526,7 +575,7 @@ def test_fit_has_derivatives():
     """How median and dispersion follow levels and counts."""
 
     def results(numbers):
-        fit = rk.fit_fragility(numbers[:4], numbers[4:], 8)
+        fit = rk.hazard.fit_fragility(numbers[:4], numbers[4:], 8)
         return jnp.stack([fit.fragility.median, fit.fragility.dispersion])
 
     assert_slopes(results, jnp.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
@@ -568,7 +617,7 @@ def file(tmp_path):
 
 
 def test_file_of_the_engine(file):
-    found = rk.read_hazard_curves(file(engine_file()))
+    found = rk.hazard.read_hazard_curves(file(engine_file()))
     np.testing.assert_allclose(found.longitude, [-122.5, -121.93])
     np.testing.assert_allclose(found.latitude, [38.1, 38.1])
     np.testing.assert_allclose(found.depth, [0.0, -0.1])
@@ -578,7 +627,7 @@ def test_file_of_the_engine(file):
     np.testing.assert_allclose(curve.levels, IMLS)
     np.testing.assert_allclose(curve.rates, -np.log1p(-np.array([0.87, 0.65, 0.06, 4e-4, 0.0])) / 50, rtol=1e-12)
     assert np.isinf(found.at(1, 0).rates[0]), "a probability printed as 1 tells no rate"
-    assert 0 < rk.survival_probability(ROCK, 1000.0, curve) < 1
+    assert 0 < rk.hazard.survival_probability(ROCK, 1000.0, curve) < 1
     assert found.at(1).rates.shape == (1, 5)
 
 
@@ -588,15 +637,15 @@ def test_files_of_several_branches(file):
     paths = [
         file(engine_file(kind, sites=more(1 - 0.1 * i)), f"hazard_curve-{kind}.csv") for i, kind in enumerate(kinds)
     ]
-    found = rk.read_hazard_curves(paths)
+    found = rk.hazard.read_hazard_curves(paths)
     assert found.kinds == tuple(kinds)
     assert found.curves.levels.shape == found.curves.rates.shape == (3, 2, 5)
     np.testing.assert_allclose(found.at(0, 2).rates[1], -np.log1p(-0.8 * 0.65) / 50, rtol=1e-12)
-    survival = jax.vmap(lambda curve: rk.survival_probability(ROCK, 1000.0, curve))(found.at(1))
-    single = [rk.survival_probability(ROCK, 1000.0, found.at(1, branch)) for branch in range(3)]
+    survival = jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 1000.0, curve))(found.at(1))
+    single = [rk.hazard.survival_probability(ROCK, 1000.0, found.at(1, branch)) for branch in range(3)]
     np.testing.assert_allclose(survival, single, rtol=1e-13)
-    sites = jax.vmap(jax.vmap(lambda curve: rk.toppling_rate(ROCK, curve)))(found.curves)
-    np.testing.assert_allclose(sites[2, 1], rk.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
+    sites = jax.vmap(jax.vmap(lambda curve: rk.hazard.toppling_rate(ROCK, curve)))(found.curves)
+    np.testing.assert_allclose(sites[2, 1], rk.hazard.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
 
 
 OLD = "lon,lat,depth,poe-0.1,poe-0.4,poe-1.0\n0.00000,0.00000,-0.10000,4.528811E-01,5.589804E-02,5.585141E-03\n"
@@ -632,7 +681,7 @@ OLD = "lon,lat,depth,poe-0.1,poe-0.4,poe-1.0\n0.00000,0.00000,-0.10000,4.528811E
     ],
 )
 def test_variants_of_files(file, content, kind, measure, names):
-    found = rk.read_hazard_curves(str(file(content)))
+    found = rk.hazard.read_hazard_curves(str(file(content)))
     assert (found.kinds, found.curves.measure, found.names) == ((kind,), measure, names)
     first = [0.005, 0.0192] if "0.0192" in content or "1.92" in content else [0.1, 0.4]
     np.testing.assert_allclose(found.at(0, 0).levels[:2], first)
@@ -642,7 +691,7 @@ def test_variants_of_files(file, content, kind, measure, names):
 
 def test_noise_of_single_precision_is_levelled(file):
     content = engine_file().replace("6.500000E-01", "8.700001E-01").replace("0.000000E+00", "4.000001E-04")
-    rates = rk.read_hazard_curves(file(content)).at(0, 0).rates
+    rates = rk.hazard.read_hazard_curves(file(content)).at(0, 0).rates
     assert rates[1] == rates[0] and rates[4] == rates[3]
 
 
@@ -674,7 +723,7 @@ def test_noise_of_single_precision_is_levelled(file):
 )
 def test_damaged_files(file, content, error):
     with pytest.raises(ValueError, match="File `broken.csv`: " + error.removeprefix("File `broken.csv`: ")):
-        rk.read_hazard_curves(file(content, "broken.csv"))
+        rk.hazard.read_hazard_curves(file(content, "broken.csv"))
 
 
 @pytest.mark.parametrize(
@@ -689,16 +738,16 @@ def test_damaged_files(file, content, error):
 )
 def test_files_that_do_not_belong_together(file, content, error):
     with pytest.raises(ValueError, match=error):
-        rk.read_hazard_curves([file(engine_file(), "first.csv"), file(content, "other.csv")])
+        rk.hazard.read_hazard_curves([file(engine_file(), "first.csv"), file(content, "other.csv")])
 
 
 def test_what_is_not_there(file):
-    found = rk.read_hazard_curves(file(engine_file()))
+    found = rk.hazard.read_hazard_curves(file(engine_file()))
     with pytest.raises(ValueError, match="`site` must be a whole number from 0 to 1, but is 2"):
         found.at(2)
     with pytest.raises(ValueError, match="`branch` must be a whole number from 0 to 0, but is -1"):
         found.at(0, -1)
     with pytest.raises(ValueError, match="`paths` must be a file or a list of files, but is empty"):
-        rk.read_hazard_curves([])
+        rk.hazard.read_hazard_curves([])
     with pytest.raises(FileNotFoundError):
-        rk.read_hazard_curves("nowhere.csv")
+        rk.hazard.read_hazard_curves("nowhere.csv")

@@ -40,7 +40,7 @@ def noise(seed, size=TIME.size, kept=0.0):
 
 
 def fit(rotation, time=TIME, block=GUESS, starts=4, **options):
-    return rk.fit_history(time, rotation, block, None, rk.Linear(), starts=starts, **options)
+    return rk.inverse.fit_history(time, rotation, block, None, rk.Linear(), starts=starts, **options)
 
 
 # --------------------------------------------------------------------------------------- free rocking
@@ -48,7 +48,7 @@ def fit(rotation, time=TIME, block=GUESS, starts=4, **options):
 
 def test_free_rocking_without_errors_is_recovered():
     found = fit(free_rocking(TIME))
-    assert found.status == rk.HistoryStatus.successful and found.warnings == ()
+    assert found.status == rk.inverse.HistoryStatus.successful and found.warnings == ()
     np.testing.assert_allclose(found.values, [ALPHA, P, RESTITUTION, TILT], rtol=1e-8)
     # The engine follows the closed form, so that what is fitted is the same model.
     np.testing.assert_allclose(found.rotation, free_rocking(TIME), atol=1e-10)
@@ -65,7 +65,7 @@ def test_covariance_is_that_of_the_closed_form():
     size = 1e-3
     found = fit(free_rocking(TIME) + size * noise(3))
     truth = np.array([ALPHA, P, RESTITUTION, TILT])
-    assert found.status == rk.HistoryStatus.successful and not found.correlated
+    assert found.status == rk.inverse.HistoryStatus.successful and not found.correlated
     assert found.scatter == pytest.approx(size, rel=0.15)
     steps = 1e-6 * np.diag(found.values)
     slopes = np.array(
@@ -90,7 +90,7 @@ def test_small_rotations_tell_alpha_and_p_only_together():
     found = fit(
         free_rocking(time, tilt=tilt) + 1e-2 * tilt * noise(5), time, block=rk.Block(0.19, 2.6, 0.9), spread=0.1
     )
-    assert found.status == rk.HistoryStatus.not_identified
+    assert found.status == rk.inverse.HistoryStatus.not_identified
     assert any("alpha" in warning and " p " in warning for warning in found.warnings)
     relative = found.covariance / np.outer(found.values, found.values)
     together = np.array([1.0, 2.0, 0.0, 0.0])
@@ -156,7 +156,7 @@ def test_what_a_history_does_not_show_has_no_interval(rotation, untold):
     """However well the rest fits, errors of measurement are none and their scatter is not known."""
     time = TIME if not rotation.any() else TIME / 20
     found = fit(rotation, time, rk.Block(ALPHA, P, RESTITUTION), starts=1)
-    assert bool(found.status == rk.HistoryStatus.not_identified)
+    assert bool(found.status == rk.inverse.HistoryStatus.not_identified)
     wide = dict(zip(found.names, np.diff(found.intervals())[:, 0]))
     assert all(wide[name] > 100 for name in untold)
 
@@ -223,7 +223,7 @@ DATA = free_rocking(TIME)
 def test_bad_input_is_refused(change, message):
     options = dict(time=TIME, rotation=DATA, block=GUESS) | change
     with pytest.raises(ValueError, match=message):
-        rk.fit_history(**options)
+        rk.inverse.fit_history(**options)
 
 
 # --------------------------------------------------------------------------------------- slow
@@ -250,9 +250,9 @@ def test_a_shaking_table():
     rotation = np.asarray(response(np.clip(time - 0.07, 0, 5))[0]) + 0.004 + 1e-4 * noise(2, 300)
     names = ("alpha", "restitution", "amplitude", "period", "delay", "offset")
     guess = rk.Block(0.22, 2.5, 0.93), rk.SinePulse(0.42, 0.95)
-    found = rk.fit_history(time, rotation, *guess, parameters=names, spread=0.1, scatter=1e-4)
+    found = rk.inverse.fit_history(time, rotation, *guess, parameters=names, spread=0.1, scatter=1e-4)
     truth = np.array([0.2, 0.9, 0.4, 0.9, 0.07, 0.004])
-    assert found.status == rk.HistoryStatus.successful
+    assert found.status == rk.inverse.HistoryStatus.successful
     assert np.all(np.abs(found.values - truth) < 4 * np.sqrt(np.diag(found.covariance)))
     assert np.all(np.sqrt(np.diag(found.covariance)) < 0.02 * truth)
     again = rk.simulate(found.block, found.motion, initial=found.initial, duration=5.0, samples=2)
@@ -263,8 +263,8 @@ def test_a_shaking_table():
 @pytest.mark.slow
 def test_no_history_no_result():
     engine = rk.Series(order=8, tolerance=1e-10, max_steps=3)
-    found = rk.fit_history(TIME, DATA, GUESS, engine=engine, starts=2)
-    assert found.status == rk.HistoryStatus.not_simulated
+    found = rk.inverse.fit_history(TIME, DATA, GUESS, engine=engine, starts=2)
+    assert found.status == rk.inverse.HistoryStatus.not_simulated
 
 
 @pytest.mark.slow
@@ -274,6 +274,8 @@ def test_a_scaled_record():
     time = np.linspace(0.0, 12.0, 300)
     rotation = np.asarray(rk.simulate(block, record, duration=12.0, samples=2)(time)[0])
     guess = rk.Block(0.21, 2.0)
-    found = rk.fit_history(time, rotation, guess, record, parameters=("alpha", "amplitude"), spread=0.03, starts=2)
+    found = rk.inverse.fit_history(
+        time, rotation, guess, record, parameters=("alpha", "amplitude"), spread=0.03, starts=2
+    )
     peak = float(jax.numpy.max(jax.numpy.abs(record.samples)))
     np.testing.assert_allclose(found.values, [0.2, peak], rtol=1e-6)

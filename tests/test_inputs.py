@@ -545,7 +545,7 @@ def test_only_motions_are_added(other):
 
 def test_an_array_times_a_motion_is_a_motion():
     found = np.array([1.0, 2.0]) * SINE
-    assert isinstance(found, rk.AbstractMotion)
+    assert isinstance(found, rk.motions.AbstractMotion)
     many = jax.vmap(lambda motion: rk.outcome(BLOCK, motion).max_rotation, in_axes=(found_axes(found),))(found)
     np.testing.assert_allclose(many, [rk.outcome(BLOCK, factor * SINE).max_rotation for factor in (1.0, 2.0)])
 
@@ -563,11 +563,11 @@ for make, words in (
     (lambda: rk.Series(order=8.0), "Argument `order` must be a whole number from 4 to 64, but is 8.0."),
     (lambda: rk.Series(order=math.nan), "Argument `order` must be a whole number from 4 to 64, but is nan."),
     (lambda: rk.Series(max_steps=1.5), "Argument `max_steps` must be a whole number from 1 to 1000000000, but is 1.5."),
-    (lambda: rk.Suite([1.0]), "Argument `motions` must be a list of motions, but holds 1.0."),
+    (lambda: rk.motions.Suite([1.0]), "Argument `motions` must be a list of motions, but holds 1.0."),
     (lambda: rk.SinePulse(0.3, 0.8).with_vertical(0.1), "Argument `vertical` must be a motion, but is 0.1."),
     (lambda: rk.Equation("x"), "Argument `restoring` must be a function, but is 'x'."),
     (lambda: rk.Diffrax(solver="x"), "Argument `solver` must be a solver, but is 'x'."),
-    (lambda: rk.Unknown(0.1, 1.0, log="no"), "Argument `log` must be True or False, but is 'no'."),
+    (lambda: rk.inverse.Unknown(0.1, 1.0, log="no"), "Argument `log` must be True or False, but is 'no'."),
     (lambda: rk.Block([], 1.0), "Argument `alpha` must hold at least one number, but has shape (0,)."),
     (lambda: rk.Block(0.1, True), "Argument `p` must be a number or an array of numbers, but is True."),
     (lambda: rk.Block(0.1, "2"), "Argument `p` must be a number or an array of numbers, but is '2'."),
@@ -586,8 +586,8 @@ for make, words in (
     (lambda: rk.sweep(abs, p=[1.0], block=1.5), "Argument `block` must be a whole number, at least 1, but is 1.5."),
     (lambda: rk.critical_amplitudes(block, 0 * pulse),
      "Argument `motion` must move the ground, but its peak is 0 g."),
-    (lambda: rk.LogNormalFragility(0.3, 0.4)(-1.0), "Argument `level` must be 0 or more, but is -1.0."),
-    (lambda: rk.HazardCurve([0.1, 0.2], [0.02, 0.01]).rate(math.nan),
+    (lambda: rk.hazard.LogNormalFragility(0.3, 0.4)(-1.0), "Argument `level` must be 0 or more, but is -1.0."),
+    (lambda: rk.hazard.HazardCurve([0.1, 0.2], [0.02, 0.01]).rate(math.nan),
      "Argument `level` must be 0 or more, but is nan."),
 ):
     try:
@@ -625,6 +625,6 @@ def test_a_length_of_time_is_no_number():
 
 
 def test_a_hazard_curve_is_not_extended_beyond_numbers():
-    curve = rk.HazardCurve(np.array([0.1, 0.2]), np.array([0.1, 0.01]))
+    curve = rk.hazard.HazardCurve(np.array([0.1, 0.2]), np.array([0.1, 0.01]))
     with pytest.raises(ValueError, match="Argument `lowest` and `highest` must be levels up to which"):
         curve.extended(1e-223, 1.0)

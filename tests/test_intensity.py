@@ -105,7 +105,7 @@ def test_residual_spectrum_of_a_half_sine(period):
 def test_long_and_short_oscillators():
     """A stiff one moves with the ground, of a soft one the mass stays where it is."""
     record = rk.example_record()
-    peak = float(rk.peak_acceleration(record))
+    peak = float(rk.intensity.peak_acceleration(record))
     assert rk.intensity.spectral_acceleration(record, 0.004) == pytest.approx(peak, rel=2e-3)
     soft = rk.intensity.spectral_velocity(rk.SinePulse(A, T), 1000.0, 0.0) * 1000.0 / (2 * np.pi)
     assert soft == pytest.approx(A * G * T**2 / (2 * np.pi), rel=1e-3)
@@ -135,14 +135,14 @@ def test_a_drifting_baseline_warns():
     steady = rk.example_record()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rk.peak_velocity(steady)
-        rk.peak_velocity(rk.HalfSinePulse(A, T))  # which is meant
+        rk.intensity.peak_velocity(steady)
+        rk.intensity.peak_velocity(rk.HalfSinePulse(A, T))  # which is meant
     drifting = rk.Record(steady.samples + 0.02, steady.dt, "off")
     with pytest.warns(UserWarning, match="The ground of off ends with .* its baseline drifts"):
-        rk.peak_velocity(drifting)
+        rk.intensity.peak_velocity(drifting)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rk.peak_velocity(rk.processing.baseline_corrected(drifting, 1))
+        rk.intensity.peak_velocity(rk.processing.baseline_corrected(drifting, 1))
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,12 @@ from jaxrock.numerics.climb import climb
 ALPHA = np.array([0.10, 0.12, 0.14, 0.16, 0.18, 0.20, 0.22, 0.24, 0.26, 0.28, 0.31, 0.34])
 P = np.array([3.0, 2.2, 3.6, 2.6, 4.2, 3.1, 2.4, 5.0, 3.4, 2.8, 4.5, 3.8])
 TRUTH = {"amplitude": 0.35, "period": 0.8}
-UNKNOWNS = {"amplitude": rk.Unknown(0.05, 2.0), "period": rk.Unknown(0.2, 3.0)}
+UNKNOWNS = {"amplitude": rk.inverse.Unknown(0.05, 2.0), "period": rk.inverse.Unknown(0.2, 3.0)}
 SCATTER = 0.2
 
 
 def rocks(seen, alpha=ALPHA, p=P, **more):
-    return rk.Observations(alpha, p, seen, **({"alpha_sd": 0.04 * alpha, "p_sd": 0.02 * p} | more))
+    return rk.inverse.Observations(alpha, p, seen, **({"alpha_sd": 0.04 * alpha, "p_sd": 0.02 * p} | more))
 
 
 def fallen(amplitude, period, alpha, p, restitution):
@@ -67,7 +67,7 @@ def test_probabilities_are_shares_of_verdicts(verdicts):
 
 
 def evaluator(seen, scatter=SCATTER):
-    return Evaluator(Problem(rk.Likelihood(seen, rk.SinePulse, scatter), UNKNOWNS))
+    return Evaluator(Problem(rk.inverse.Likelihood(seen, rk.SinePulse, scatter), UNKNOWNS))
 
 
 def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
@@ -95,14 +95,14 @@ def test_a_likelihood_is_smooth_in_the_amplitude():
 
 def log_terms(seen, scatter=SCATTER, **values):
     """Of rocks at motions (motions, rocks)."""
-    return np.asarray(rk.Likelihood(seen, rk.SinePulse, scatter).log_terms(values, slopes=False))
+    return np.asarray(rk.inverse.Likelihood(seen, rk.SinePulse, scatter).log_terms(values, slopes=False))
 
 
 def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
     """However little the rotation is uncertain: from node to node it goes from none to overturning."""
     alpha = np.array([0.2, 0.17, 0.23] * 4)
     p, peak, sd = np.array([3.0, 3.5, 2.5] * 4), np.repeat([0.1, 0.08, 0.12, 0.05], 3), np.repeat([0.01, 0.02], 6)
-    seen = rk.Observations(alpha, p, ["rotation"] * 12, rotation=peak, rotation_sd=sd)
+    seen = rk.inverse.Observations(alpha, p, ["rotation"] * 12, rotation=peak, rotation_sd=sd)
     amplitude = np.geomspace(0.12, 0.6, 80)
     found = log_terms(seen, 0.3, amplitude=amplitude, period=1.2)
     e = np.linspace(-4.5, 4.5, 3001)
@@ -136,14 +136,14 @@ def rotation_of(amplitude, alpha, p):
 def test_motions_that_there_are_not_are_impossible():
     terms = log_terms(rocks(["survived"] * 12), amplitude=np.array([0.2, 0.2, np.nan]), period=np.array([1, -1, 1]))
     assert np.isfinite(terms[0]).all() and (terms[1:] == -np.inf).all()
-    never = {"amplitude": UNKNOWNS["amplitude"], "period": rk.Unknown(-2.0, -1.0, log=False)}
+    never = {"amplitude": UNKNOWNS["amplitude"], "period": rk.inverse.Unknown(-2.0, -1.0, log=False)}
     with pytest.raises(ValueError, match="`unknowns` must have ranges in which there are motions"):
-        rk.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, never, SCATTER, starts=1)
+        rk.inverse.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, never, SCATTER, starts=1)
 
 
 @pytest.mark.parametrize("what", ["survival", "log_terms"])
 def test_slopes_that_were_not_computed_are_refused(what):
-    likelihood = rk.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
+    likelihood = rk.inverse.Likelihood(rocks(["survived"] * 12), rk.SinePulse, SCATTER)
     options = {} if what == "survival" else {"slopes": False}
     with pytest.raises(NotImplementedError, match="without derivatives"):
         jax.eval_shape(
@@ -162,13 +162,13 @@ def truth(seed, scatter=SCATTER):
 
 def along(seen, **over):
     """The log-likelihood over lists of both parameters, which neither climbs nor interpolates."""
-    found = rk.feasible_region(rk.Likelihood(seen, rk.SinePulse, SCATTER), over, progress=False)
+    found = rk.inverse.feasible_region(rk.inverse.Likelihood(seen, rk.SinePulse, SCATTER), over, progress=False)
     return np.asarray(found.log_likelihood)
 
 
 def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     seen = rocks(truth(3))
-    found = rk.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
     lists = {name: np.geomspace(float(x.low), float(x.high), 512) for name, x in UNKNOWNS.items()}
     assert along(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
     ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}
@@ -184,8 +184,8 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
 def test_a_posterior_is_that_of_a_grid():
     pytest.importorskip("numpyro", reason="samples need NumPyro")
     seen = rocks(truth(3))
-    found = rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, effective_size=2000)
-    assert found.status != rk.PosteriorStatus.not_converged
+    found = rk.inverse.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, effective_size=2000)
+    assert found.status != rk.inverse.PosteriorStatus.not_converged
     assert found.effective_size.min() > 2000 and found.r_hat.max() < 1.01
     # Uniform in logarithms: so is the grid, of middles of cells.
     axes = [np.linspace(np.log(float(x.low)), np.log(float(x.high)), 161) for x in UNKNOWNS.values()]
@@ -205,8 +205,8 @@ def test_a_posterior_is_that_of_a_grid():
             expected = 4 * np.sqrt(probability * (1 - probability) / float(found.effective_size[i]))
             assert abs(within - probability) < expected + 0.002
     with pytest.raises(ValueError, match="`estimate` must be of these unknowns"):
-        others = UNKNOWNS | {"amplitude": rk.Unknown(10.0, 20.0)}
-        rk.sample_motion(seen, rk.SinePulse, others, SCATTER, estimate=found.estimate)
+        others = UNKNOWNS | {"amplitude": rk.inverse.Unknown(10.0, 20.0)}
+        rk.inverse.sample_motion(seen, rk.SinePulse, others, SCATTER, estimate=found.estimate)
     top = values.max()
     assert top - 0.1 < float(found.log_density.max()) <= float(found.estimate.log_likelihood) + 1e-6
 
@@ -215,37 +215,37 @@ def test_samples_need_numpyro(monkeypatch):
     seen = rocks(["survived"] * 12)
     monkeypatch.setitem(sys.modules, "numpyro.diagnostics", None)
     with pytest.raises(ImportError, match=r"jaxrock\[posterior\]"):
-        rk.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER)
+        rk.inverse.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER)
 
 
 @pytest.mark.parametrize("name", ["effective_size", "steps"])
 def test_samples_need_good_arguments(name):
     pytest.importorskip("numpyro", reason="samples need NumPyro")
     with pytest.raises(ValueError, match=f"`{name}` must be a whole number from 1 to"):
-        rk.sample_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, **{name: 0})
+        rk.inverse.sample_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, **{name: 0})
 
 
 def test_survivors_bound_from_above_only():
-    found = rk.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
-    assert found.status == rk.EstimateStatus.open_interval
+    found = rk.inverse.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    assert found.status == rk.inverse.EstimateStatus.open_interval
     assert found.open[0, 0] and not found.open[0, 1] and found.open[1].all()
     assert "do not bound amplitude from below" in " ".join(found.remarks)
 
 
 def test_rocks_that_no_motion_moves_tell_nothing():
-    unknowns = {"amplitude": rk.Unknown(0.05, 0.3), "period": rk.Unknown(0.2, 3.0)}
+    unknowns = {"amplitude": rk.inverse.Unknown(0.05, 0.3), "period": rk.inverse.Unknown(0.2, 3.0)}
     seen = rocks(["survived"] * 12, alpha=ALPHA + 1.0, restitution=0.5)
-    found = rk.estimate_motion(seen, rk.SinePulse, unknowns, 0.1, starts=8)
-    assert found.status == rk.EstimateStatus.no_information
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns, 0.1, starts=8)
+    assert found.status == rk.inverse.EstimateStatus.no_information
     np.testing.assert_allclose(found.interval, [[0.05, 0.3], [0.2, 3.0]])
 
 
 @pytest.mark.slow
 def test_contradictions_have_no_intervals():
     # The sturdiest half fell, the slenderest stands.
-    found = rk.estimate_motion(rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0)), rk.SinePulse, UNKNOWNS,
+    found = rk.inverse.estimate_motion(rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0)), rk.SinePulse, UNKNOWNS,
                                0.05, starts=8)  # fmt: skip
-    assert found.status == rk.EstimateStatus.contradictory
+    assert found.status == rk.inverse.EstimateStatus.contradictory
     assert np.isnan(found.interval).all() and found.consistent_scatter > 0.05
     assert "rock" in " ".join(found.remarks)
 
@@ -271,7 +271,7 @@ def test_regions_agree_with_verdicts():
     known = {"alpha": ALPHA, "p": P, "restitution": np.asarray(rocks(WORDS).restitution)}
     words = overturned(amplitude=over["amplitude"][7], period=over["period"][6], **known)
     seen = rocks(["toppled" if x else "survived" for x in words], alpha_sd=0.0, p_sd=0.0)
-    found = rk.feasible_region(rk.Likelihood(seen, rk.SinePulse, scatter), over)
+    found = rk.inverse.feasible_region(rk.inverse.Likelihood(seen, rk.SinePulse, scatter), over)
     # Five standard deviations to both sides of the motion at each rock: (rows, columns, factors, rocks).
     factors = np.exp(np.linspace(-5, 5, 21) * scatter)
     lost = overturned(amplitude=over["amplitude"][:, None, None, None] * factors[:, None],
@@ -286,7 +286,7 @@ def test_regions_agree_with_verdicts():
 
 def test_up_to_the_unexceeded_motion_all_that_stand_stand():
     seen, durations = rocks(WORDS), np.array([0.02, 0.3, 0.5, 0.8, 1.2, 2.0])  # as many as below: one program
-    found = rk.unexceeded_motion(seen, rk.SinePulse, durations, progress=False)
+    found = rk.inverse.unexceeded_motion(seen, rk.SinePulse, durations, progress=False)
     assert np.isinf(found.amplitude[0]) and found.weakest[0] == -1 and found.complete.all()
     wall, weakest = np.asarray(found.amplitude[1:]), np.asarray(found.weakest[1:])
     assert (weakest >= 6).all()  # those that toppled do not count
@@ -307,7 +307,7 @@ def test_the_command_from_a_table_to_figures(tmp_path, capsys):
     printed, errors = capsys.readouterr()
     assert status == 0 and errors == ""
     assert printed.startswith("12 rocks: 6 survived, 6 toppled, 0 rotation\n  amplitude ")
-    found = rk.estimate_motion(rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    found = rk.inverse.estimate_motion(rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
     lines = (tmp_path / "estimate.csv").read_text().splitlines()
     for line, name, value, interval in zip(lines[1:], found.names, found.values, found.interval, strict=True):
         fields = line.split(",")
@@ -362,7 +362,7 @@ HEADER = (
 def test_a_file_of_rocks(tmp_path):
     path = tmp_path / "rocks.csv"
     path.write_text(f"# a comment\n{HEADER}\na,10,0.5,1.2,0.1,,toppled,,\n\nb,20,1,0.9,,0.8,rotation,3,0.5\n")
-    seen = rk.read_observations(path)
+    seen = rk.inverse.read_observations(path)
     np.testing.assert_allclose(seen.alpha, np.deg2rad([10, 20]))
     np.testing.assert_allclose(seen.p, np.sqrt(3 * 9.81 / 4 / np.array([1.2, 0.9])))
     np.testing.assert_allclose(seen.p_sd / seen.p, [0.1 / 2.4, 0])
@@ -376,7 +376,7 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
         main(["invert", "--example"])
     path = tmp_path / "rocks.csv"
     path.write_text(capsys.readouterr().out)
-    seen = rk.read_observations(path)
+    seen = rk.inverse.read_observations(path)
     assert [SEEN[k] for k in np.asarray(seen.seen)] == ["toppled", "rotation", "survived", "survived"]
     np.testing.assert_allclose(seen.rotation[1], np.deg2rad(5.1))
 
@@ -404,7 +404,7 @@ def refused(folder, header, line, message):
     path = folder / "rocks.csv"
     path.write_text(f"{header}\n{line}\n")
     with pytest.raises(ValueError, match=message):
-        rk.read_observations(path)
+        rk.inverse.read_observations(path)
 
 
 @pytest.mark.parametrize(
@@ -430,14 +430,14 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        (lambda: rk.Unknown(2.0, 1.0), "`high` must be above `low`"),
-        (lambda: rk.Unknown(0.0, 1.0), "`low` must be positive"),
-        (lambda: rk.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),
-        (lambda: rk.Unknown(-1.0, 1.0, log=False, prior=(-2.0, 0.1)), "`prior` must be within five"),
-        (lambda: rk.Observations([0.1], [2.0], ["flew"]), "`seen` must hold only"),
-        (lambda: rk.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
-        (lambda: rk.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
-        (lambda: rk.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),
+        (lambda: rk.inverse.Unknown(2.0, 1.0), "`high` must be above `low`"),
+        (lambda: rk.inverse.Unknown(0.0, 1.0), "`low` must be positive"),
+        (lambda: rk.inverse.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),
+        (lambda: rk.inverse.Unknown(-1.0, 1.0, log=False, prior=(-2.0, 0.1)), "`prior` must be within five"),
+        (lambda: rk.inverse.Observations([0.1], [2.0], ["flew"]), "`seen` must hold only"),
+        (lambda: rk.inverse.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
+        (lambda: rk.inverse.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
+        (lambda: rk.inverse.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),
     ],
 )
 def test_wrong_arguments_are_named(wrong, message):

@@ -39,7 +39,7 @@ def grid(density):
 
 def test_the_objective_is_that_of_the_likelihood(names, density):
     values = {"amplitude": np.array([0.2, 0.4]), "period": np.array([0.5, 1.1])}
-    likelihood = rk.Likelihood(names["rocks"], rk.SinePulse, 0.2)
+    likelihood = rk.inverse.Likelihood(names["rocks"], rk.SinePulse, 0.2)
     prior = sum(-((np.log(values[k] / m) / s) ** 2) / 2 for k, m, s in (("amplitude", 0.3, 0.4), ("period", 0.8, 0.4)))
     found = density.objective(density.point(values))
     np.testing.assert_allclose(found, likelihood.log_terms(values).sum(axis=-1) + prior, rtol=1e-12)
@@ -80,12 +80,14 @@ def test_second_derivatives(density):
 
 
 def test_a_motion_that_cannot_be_is_impossible():
-    rocks = rk.Observations([0.2], [2.0], ["survived"])
-    density = rk.log_density(rocks, rk.SinePulse, {"period": rk.Unknown(-1.0, 1.0, log=False)} | AMPLITUDE)
+    rocks = rk.inverse.Observations([0.2], [2.0], ["survived"])
+    density = rk.inverse.log_density(
+        rocks, rk.SinePulse, {"period": rk.inverse.Unknown(-1.0, 1.0, log=False)} | AMPLITUDE
+    )
     assert density(density.point({"period": -0.5, "amplitude": 0.3})) == -jnp.inf
 
 
-AMPLITUDE = {"amplitude": rk.Unknown(0.1, 1.0)}
+AMPLITUDE = {"amplitude": rk.inverse.Unknown(0.1, 1.0)}
 
 
 @pytest.mark.parametrize("words, point", [("`point` must end with an axis of 2", [1.0, 2.0, 3.0])])

@@ -55,7 +55,7 @@ def test_a_box_is_a_rectangle(azimuth, width):
 def test_a_box_askew():
     """Towards its corner it stands on that; the inertia is that about the axis across."""
     azimuth = np.arctan2(DEPTH, WIDTH)
-    section = rk.Rock.from_mesh(box()).section(azimuth)
+    section = rk.blocks.Rock.from_mesh(box()).section(azimuth)
     assert section.right[0] == pytest.approx(np.hypot(WIDTH, DEPTH) / 2, rel=1e-12)
     about = np.array([DEPTH**2 + HEIGHT**2, WIDTH**2 + HEIGHT**2]) / 12  # about the first, the second axis
     expected = about @ [np.sin(azimuth) ** 2, np.cos(azimuth) ** 2]
@@ -67,7 +67,7 @@ def test_files_and_units(tmp_path, suffix, unit, factor):
     mesh, path = box(), tmp_path / f"rock.{suffix}"
     mesh.apply_scale(factor)
     mesh.export(path)
-    rock = rk.Rock.from_mesh(path, unit=unit)
+    rock = rk.blocks.Rock.from_mesh(path, unit=unit)
     assert rock.volume == pytest.approx(WIDTH * DEPTH * HEIGHT, rel=1e-6)
     np.testing.assert_allclose(rock.slenderness([0.0]), np.arctan2(WIDTH, HEIGHT), rtol=1e-6)
 
@@ -85,7 +85,7 @@ def test_a_lopsided_prism_is_its_outline():
 
 def test_a_rounded_base_is_bounded_and_said():
     """It rolls on to its edge: the ground within the tolerance is narrower, and known in closed form."""
-    rock = rk.Rock.from_mesh(rounded(), tolerance=0.005)
+    rock = rk.blocks.Rock.from_mesh(rounded(), tolerance=0.005)
     with pytest.warns(UserWarning, match="The base is rounded: the rock rolls on"):
         narrow = rk.AsymmetricBlock.from_mesh(rock, 0.0)
     with pytest.warns(UserWarning, match="The base is rounded"):
@@ -103,7 +103,7 @@ def test_a_rounded_base_is_bounded_and_said():
 @pytest.mark.parametrize("rotation", np.linspace(0.0, 0.9, 7))
 def test_the_righting_moment_of_the_rolling_rock_lies_between(rotation):
     """Arm of the weight about the lowest vertex of the turned rock beyond its base, and about fixed ones."""
-    rock = rk.Rock.from_mesh(rounded(), tolerance=0.005)
+    rock = rk.blocks.Rock.from_mesh(rounded(), tolerance=0.005)
     narrow, wide = rock.section(0.0), rock.section(0.0, "wide")
     points = np.stack([rock.vertices[:, 0] - rock.centre[0], rock.vertices[:, 2]], 1) - narrow.centre
     points = points[points[:, 0] >= narrow.right[0] - 1e-12]
@@ -116,7 +116,7 @@ def test_the_righting_moment_of_the_rolling_rock_lies_between(rotation):
 
 
 def test_polar_plot():
-    axes = rk.plot.slenderness(rk.Rock.from_mesh(box()), points=24)
+    axes = rk.plot.slenderness(rk.blocks.Rock.from_mesh(box()), points=24)
     assert axes[0].lines[0].get_ydata()[0] == pytest.approx(np.arctan2(WIDTH, HEIGHT), rel=1e-9)
     plt.close("all")
 

@@ -111,16 +111,16 @@ def component(direction, factor=1):
 def test_components_are_known_by_what_they_say(file, order):
     factors = {"N-S": 1, "4": 1, "E-W": 2, "5": 2, "U-D": 3, "6": 3}
     paths = [file(component(each, factors[each]), f"motion{k}") for k, each in enumerate(order)]
-    found = rk.read_components(paths)
+    found = rk.motions.read_components(paths)
     one = rk.read_record(file(component("N-S"))).samples
     for part, factor in ((found.first, 1), (found.second, 2), (found.vertical, 3)):
         np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
 
 
 def test_two_components_and_columns_of_one_file(file):
-    assert rk.read_components([file(component("N-S"), "a"), file(component("E-W"), "b")]).vertical is None
+    assert rk.motions.read_components([file(component("N-S"), "a"), file(component("E-W"), "b")]).vertical is None
     text = "".join(f"{0.02 * k:.2f},{x!r},{2 * x!r},{3 * x!r}\n" for k, x in enumerate(SAMPLES.tolist()))
-    found = rk.read_components(file(text), columns=(1, 2, 3), unit="g")
+    found = rk.motions.read_components(file(text), columns=(1, 2, 3), unit="g")
     np.testing.assert_allclose(found.second.samples, 2 * SAMPLES)
     np.testing.assert_allclose(found.vertical.samples, 3 * SAMPLES)
 
@@ -135,7 +135,7 @@ def test_two_components_and_columns_of_one_file(file):
 )
 def test_components_that_do_not_go_together(file, second, message):
     with pytest.raises(ValueError, match=message):
-        rk.read_components([file(component("N-S"), "a"), file(second, "b")])
+        rk.motions.read_components([file(component("N-S"), "a"), file(second, "b")])
 
 
 # --------------------------------------------------------------------------------------- traces, writing
@@ -147,7 +147,7 @@ def trace(**changed):
 
 
 def test_a_trace_of_obspy():
-    record = rk.record_of_trace(trace(), "m/s2")
+    record = rk.motions.record_of_trace(trace(), "m/s2")
     np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-14)
     assert (record.name, record.origin.component, float(record.dt)) == ("US.ABC..HNZ", "HNZ", 0.02)
     assert rk.motions.components.is_vertical(record)
@@ -156,7 +156,7 @@ def test_a_trace_of_obspy():
 def test_a_real_trace_of_obspy():
     obspy = pytest.importorskip("obspy")
     made = obspy.Trace(SAMPLES * 9.80665, {"delta": 0.02, "station": "ABC", "channel": "HNE"})
-    record = rk.record_of_trace(made, "m/s2")
+    record = rk.motions.record_of_trace(made, "m/s2")
     np.testing.assert_allclose(record.samples, SAMPLES, rtol=1e-14)
     assert record.origin.start.startswith("1970-01-01")
 
@@ -168,28 +168,28 @@ def test_a_real_trace_of_obspy():
 )  # fmt: skip
 def test_traces_that_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        rk.record_of_trace(given, "g")
+        rk.motions.record_of_trace(given, "g")
 
 
 def test_what_is_written_is_read_again(tmp_path):
-    origin = rk.Origin("LOMA PRIETA", "WAHO", "090")
+    origin = rk.motions.Origin("LOMA PRIETA", "WAHO", "090")
     record = rk.Record(SAMPLES, 1 / 256, "some\nname", origin)
-    for write, given, digits in ((rk.write_at2, {}, 1e-8), (rk.write_csv, {"unit": "g"}, 0)):
+    for write, given, digits in ((rk.motions.write_at2, {}, 1e-8), (rk.motions.write_csv, {"unit": "g"}, 0)):
         path = tmp_path / "motion"
         write(record, path)
         found = rk.read_record(path, **given)
         np.testing.assert_allclose(found.samples, SAMPLES, rtol=digits)
         assert float(found.dt) == pytest.approx(1 / 256, rel=1e-11)
-    rk.write_at2(record, path)
+    rk.motions.write_at2(record, path)
     assert tuple(rk.read_record(path).origin)[:3] == origin[:3]
-    rk.write_csv(record, path, "cm/s2")
+    rk.motions.write_csv(record, path, "cm/s2")
     np.testing.assert_allclose(rk.read_record(path, unit="cm/s2").samples, SAMPLES, rtol=1e-15)
 
 
 @pytest.mark.parametrize("path", ["", "/"])
 def test_a_folder_is_no_file(path):
     with pytest.raises(IsADirectoryError):
-        rk.write_at2(rk.Record(SAMPLES, 0.01), path)
+        rk.motions.write_at2(rk.Record(SAMPLES, 0.01), path)
 
 
 @pytest.mark.parametrize("kind", ["AT2", "CSV", "V2"])

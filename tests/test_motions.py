@@ -395,7 +395,7 @@ ARITHMETIC = {
 
 @pytest.mark.parametrize("combined, rule", ARITHMETIC.values(), ids=ARITHMETIC)
 def test_arithmetic(combined, rule):
-    assert isinstance(combined, rk.AbstractMotion)
+    assert isinstance(combined, rk.motions.AbstractMotion)
     expected = rule(np.asarray(acceleration(A, TIMES)), np.asarray(acceleration(B, TIMES)))
     np.testing.assert_allclose(acceleration(combined, TIMES), expected, rtol=0, atol=2e-15)
 

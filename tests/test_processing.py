@@ -9,7 +9,7 @@ from jaxrock.motions.straight import straight
 
 G, DT = 9.81, 0.01
 TIME = DT * np.arange(1001)
-EVENT = rk.Origin(event="Made", station="Here", component="090")
+EVENT = rk.motions.Origin(event="Made", station="Here", component="090")
 SMOOTH = rk.Record(0.2 * np.sin(2 * np.pi * TIME) * np.exp(-((TIME - 4) ** 2)), DT, "made", EVENT)
 do = rk.processing
 
@@ -67,7 +67,7 @@ def test_a_taper_changes_the_ends_only():
 def test_a_shorter_step_is_the_same_motion():
     found = do.resampled(SMOOTH, DT / 4)
     assert found.samples.size == 4001
-    for measure in (rk.intensity.arias, rk.intensity.peak_displacement, rk.peak_velocity):
+    for measure in (rk.intensity.arias, rk.intensity.peak_displacement, rk.intensity.peak_velocity):
         assert float(measure(found)) == pytest.approx(float(measure(SMOOTH)), rel=1e-10)
     uneven = do.resampled(SMOOTH, 0.007)
     np.testing.assert_allclose(uneven.samples, np.interp(0.007 * np.arange(1429), TIME, SMOOTH.samples), atol=1e-15)
@@ -85,8 +85,8 @@ def test_cut_and_scaled():
     np.testing.assert_array_equal(part.samples, SMOOTH.samples[200:601])
     np.testing.assert_array_equal(do.cut(SMOOTH, 2.003, 5.997).samples, SMOOTH.samples[201:600])
     np.testing.assert_array_equal(do.cut(SMOOTH).samples, SMOOTH.samples)
-    assert float(rk.peak_acceleration(do.scaled(SMOOTH, acceleration=0.4))) == pytest.approx(0.4, rel=1e-14)
-    assert float(rk.peak_velocity(do.scaled(SMOOTH, velocity=0.3))) == pytest.approx(0.3, rel=1e-12)
+    assert float(rk.intensity.peak_acceleration(do.scaled(SMOOTH, acceleration=0.4))) == pytest.approx(0.4, rel=1e-14)
+    assert float(rk.intensity.peak_velocity(do.scaled(SMOOTH, velocity=0.3))) == pytest.approx(0.3, rel=1e-12)
     np.testing.assert_array_equal(do.scaled(SMOOTH, -2.0).samples, -2 * SMOOTH.samples)
 
 
@@ -120,7 +120,7 @@ def test_name_and_origin_are_kept(step):
         (lambda: do.from_displacement([0.0, 1.0], DT), "at least 4 samples"),
         (lambda: do.from_displacement(np.zeros(9), DT, unit="km"), "`unit` must be one of 'm', 'cm', 'mm'"),
         (lambda: do.baseline_corrected(rk.Record([1.0], DT)), "more samples than `degree`"),
-        (lambda: rk.Components(SMOOTH, rk.Record(SMOOTH.samples, 0.02)), "must have one time step"),
+        (lambda: rk.motions.Components(SMOOTH, rk.Record(SMOOTH.samples, 0.02)), "must have one time step"),
     ],
 )
 def test_what_is_refused(call, message):
@@ -130,7 +130,7 @@ def test_what_is_refused(call, message):
 
 def test_components_turn():
     other = rk.Record(np.cos(TIME), DT)
-    pair = rk.Components(SMOOTH, other)
+    pair = rk.motions.Components(SMOOTH, other)
     np.testing.assert_allclose(pair.along(0.0).samples, SMOOTH.samples)
     np.testing.assert_allclose(pair.along(np.pi / 2).samples, other.samples, atol=1e-15)
     turned = jax.vmap(lambda angle: pair.along(angle).samples)(np.array([0.3, 0.3 + np.pi / 2]))

@@ -50,7 +50,7 @@ def under(pulse, model):
     return one
 
 
-def compare(quick: rk.Outcome, careful: rk.Outcome, alpha):
+def compare(quick: rk.responses.Outcome, careful: rk.responses.Outcome, alpha):
     np.testing.assert_array_equal(quick.status._value, careful.status._value)
     for name in ("overturned", "impact_count", "differentiable"):
         np.testing.assert_array_equal(getattr(quick, name), getattr(careful, name), name)

@@ -266,7 +266,7 @@ def test_friction_at_impacts():
         np.testing.assert_allclose(float(friction), (1 - e) / (1 + e) / np.tan(0.2), rtol=1e-9)
 
 
-class Base(rk.AbstractEquation):
+class Base(rk.models.AbstractEquation):
     """A rigid column on the base of a flexible one: small rotations."""
 
     kind: str = eqx.field(static=True)
@@ -274,7 +274,9 @@ class Base(rk.AbstractEquation):
     def moments(self, block):
         sine, one = jnp.sin(block.alpha), jnp.ones_like(block.alpha)
         slope = -sine / block.alpha if self.kind == "linear" else -one
-        return rk.Coefficients(rk.Terms(constant=sine, line=slope), rk.Terms(constant=jnp.cos(block.alpha)))
+        return rk.models.Coefficients(
+            rk.models.Terms(constant=sine, line=slope), rk.models.Terms(constant=jnp.cos(block.alpha))
+        )
 
 
 @pytest.mark.parametrize(
@@ -291,7 +293,7 @@ def test_a_stiff_column_rocks_as_the_rigid_block_on_its_base(law, base):
     """The base's speed sets the ratio, and its law the moment: as the series engine has it of the rigid block."""
     motion = rk.SinePulse(0.3, 0.8)
     column = rk.FlexibleBlock(5.0, 25.0, 1e18, 2500.0, 0.01, restitution=law, base=base)
-    found = rk.outcome_flexible(column, motion, duration=6.0)
+    found = rk.responses.outcome_flexible(column, motion, duration=6.0)
     p = float(column.p) / np.sqrt(1 + 1 / (2 * 5**2))  # the lumped masses' moment of inertia
     rigid = rk.simulate(rk.Block(float(column.alpha), p, law), motion, Base(base), duration=6.0, samples=2)
     assert found.status == rk.Status.successful
@@ -302,8 +304,8 @@ def test_a_stiff_column_rocks_as_the_rigid_block_on_its_base(law, base):
 @pytest.mark.parametrize(
     "refused",
     [
-        lambda: rk.draw_blocks(rk.Block(0.2, 2.0, SOFT), 3, restitution=0.1),
-        lambda: rk.critical_durations(rk.Block(0.2, 2.0, SOFT), PULSE),
+        lambda: rk.blocks.draw_blocks(rk.Block(0.2, 2.0, SOFT), 3, restitution=0.1),
+        lambda: rk.studies.critical_durations(rk.Block(0.2, 2.0, SOFT), PULSE),
         lambda: rk.similarity.groups(rk.Block(0.2, 2.0, SOFT), 0.3, 6.0),
     ],
     ids=["drawn", "longer motions", "similarity"],

@@ -13,10 +13,10 @@ import pytest
 ASKED = {
     "sensitivity": "rk.sensitivity(column, pulse)",
     "critical amplitudes": "rk.critical_amplitudes(column, pulse)",
-    "critical durations": "rk.critical_durations(column, pulse)",
-    "fragility": "rk.simulated_fragility(column, [pulse], [0.1, 0.2])",
-    "fragility surface": "rk.simulated_surface(column, [pulse], [0.1, 0.2], [0.5, 1.0])",
-    "random blocks": "rk.draw_blocks(column, 3, alpha=0.1)",
+    "critical durations": "rk.studies.critical_durations(column, pulse)",
+    "fragility": "rk.hazard.simulated_fragility(column, [pulse], [0.1, 0.2])",
+    "fragility surface": "rk.hazard.simulated_surface(column, [pulse], [0.1, 0.2], [0.5, 1.0])",
+    "random blocks": "rk.blocks.draw_blocks(column, 3, alpha=0.1)",
     "contact forces": "rk.contact_forces(response, column)",
     "phase plane": "rk.plot.phase(response)",
 }
@@ -26,7 +26,7 @@ matplotlib.use("Agg")
 import jaxrock as rk
 column = rk.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, masses=2)
 pulse = rk.SinePulse(0.5, 1.6)
-response = object.__new__(rk.FlexibleResponse)
+response = object.__new__(rk.responses.FlexibleResponse)
 for words in {words!r}:
     try:
         eval(words)

@@ -95,8 +95,11 @@ def test_own_chains_in_the_manner_of_blackjax():
 
 
 ALPHA, P = np.array([0.12, 0.16, 0.20, 0.26]), np.array([3.0, 2.2, 3.6, 2.6])
-ROCKS = rk.Observations(ALPHA, P, ["toppled", "toppled", "survived", "survived"], alpha_sd=0.04 * ALPHA)
-UNKNOWNS = {"amplitude": rk.Unknown(0.05, 1.0, prior=(0.3, 0.5)), "period": rk.Unknown(0.3, 1.5, prior=(0.8, 0.3))}
+ROCKS = rk.inverse.Observations(ALPHA, P, ["toppled", "toppled", "survived", "survived"], alpha_sd=0.04 * ALPHA)
+UNKNOWNS = {
+    "amplitude": rk.inverse.Unknown(0.05, 1.0, prior=(0.3, 0.5)),
+    "period": rk.inverse.Unknown(0.3, 1.5, prior=(0.8, 0.3)),
+}
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}
 
 
@@ -107,9 +110,9 @@ def moved(key, point):
 @pytest.mark.slow
 def test_motions():
     """Means of own chains, within their errors; densities are those of the samples."""
-    estimate = rk.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, starts=4, **QUICK)
+    estimate = rk.inverse.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, starts=4, **QUICK)
     own, other = (
-        rk.sample_motion(
+        rk.inverse.sample_motion(
             ROCKS, rk.SinePulse, UNKNOWNS, 0.2, estimate=estimate, effective_size=400, steps=2000, sampler=each, **QUICK
         )
         for each in (None, lambda density: blackjax.rmh(density, moved))
@@ -118,16 +121,16 @@ def test_motions():
     for name in UNKNOWNS:
         error = float(own[name].std()) * np.sqrt(2 / 400)
         assert abs(float(own[name].mean() - other[name].mean())) < 4 * error
-    density = rk.log_density(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, model=QUICK["model"], engine=QUICK["engine"])
+    density = rk.inverse.log_density(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, model=QUICK["model"], engine=QUICK["engine"])
     values = {name: other.samples[:, -1, i] for i, name in enumerate(UNKNOWNS)}
     np.testing.assert_allclose(density.objective(density.point(values)), other.log_density[:, -1], atol=1e-8)
-    assert bool(other.status != rk.PosteriorStatus.not_converged)
+    assert bool(other.status != rk.inverse.PosteriorStatus.not_converged)
 
 
 def posterior():
     """A posterior made by hand."""
     samples = jnp.arange(12.0).reshape(2, 3, 2)
-    made = object.__new__(rk.Posterior)
+    made = object.__new__(rk.inverse.Posterior)
     for name, value in {
         "names": ("amplitude", "period"),
         "samples": samples,

@@ -12,8 +12,8 @@ optax = pytest.importorskip("optax")
 optimistix = pytest.importorskip("optimistix")
 
 ALPHA, P = np.array([0.12, 0.16, 0.20, 0.26]), np.array([3.0, 2.2, 3.6, 2.6])
-ROCKS = rk.Observations(ALPHA, P, ["toppled", "toppled", "survived", "survived"], alpha_sd=0.04 * ALPHA)
-UNKNOWNS = {"amplitude": rk.Unknown(0.05, 1.0), "period": rk.Unknown(0.3, 1.5, prior=(0.8, 0.3))}
+ROCKS = rk.inverse.Observations(ALPHA, P, ["toppled", "toppled", "survived", "survived"], alpha_sd=0.04 * ALPHA)
+UNKNOWNS = {"amplitude": rk.inverse.Unknown(0.05, 1.0), "period": rk.inverse.Unknown(0.3, 1.5, prior=(0.8, 0.3))}
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}
 
 OPTIMIZERS = {
@@ -30,7 +30,9 @@ rows = [pytest.param(name, marks=() if name in QUICKLY else pytest.mark.slow) fo
 
 @functools.cache
 def found(name):
-    return rk.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, starts=4, optimizer=OPTIMIZERS[name](), **QUICK)
+    return rk.inverse.estimate_motion(
+        ROCKS, rk.SinePulse, UNKNOWNS, 0.2, starts=4, optimizer=OPTIMIZERS[name](), **QUICK
+    )
 
 
 @pytest.mark.parametrize("name", rows)
@@ -59,7 +61,7 @@ def test_traces(name):
     assert (known >= np.array(low) * (1 - 1e-12)).all() and (known <= np.array(high) * (1 + 1e-12)).all()
     step = len(heights) // 2
     at = {name: values[step, ~gone[step], i] for i, name in enumerate(UNKNOWNS)}
-    density = rk.log_density(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, model=QUICK["model"], engine=QUICK["engine"])
+    density = rk.inverse.log_density(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, model=QUICK["model"], engine=QUICK["engine"])
     np.testing.assert_allclose(density.objective(density.point(at)), heights[step, ~gone[step]], atol=1e-9)
 
 
@@ -75,4 +77,4 @@ def test_the_picture_of_a_search():
 @pytest.mark.parametrize("optimizer", [0.1, "adam", dict, np.ones(3)])
 def test_what_is_no_optimiser(optimizer):
     with pytest.raises(ValueError, match="`optimizer` must be an optax.GradientTransformation or an optimistix"):
-        rk.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, optimizer=optimizer)
+        rk.inverse.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, optimizer=optimizer)

@@ -262,7 +262,7 @@ def test_maps_go_through_forward_mode():
 def test_borders_cannot_be_traced():
     def found(alpha):
         surface = rk.overturning_map([1.0, 2.0], [2.0, 3.0], alpha=alpha, model=rk.Linear(), restitution=0.9)
-        return rk.overturning_borders(surface).crowded
+        return rk.studies.overturning_borders(surface).crowded
 
     with pytest.raises(TypeError, match="Borders are searched .* they cannot be traced"):
         jax.jit(found)(0.2)

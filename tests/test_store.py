@@ -159,7 +159,7 @@ def test_outcomes_come_back(tmp_path):
     assert set(data) >= {"max_rotation", "status"} and data["margin"].dims == ("k",)
     grid.save(tmp_path / "a.nc")
     again = rk.Grid.load(tmp_path / "a.nc").values
-    assert isinstance(again, rk.Outcome)
+    assert isinstance(again, rk.responses.Outcome)
     np.testing.assert_array_equal(again.status == rk.Status.undecided, [False, True])
     np.testing.assert_array_equal(again.impact_count, [0, 1])
 
@@ -167,7 +167,7 @@ def test_outcomes_come_back(tmp_path):
 def _outcome(k):
     x = 1.0 * k
     status = rk.Status.where(k == 1, rk.Status.undecided, rk.Status.successful)
-    return rk.Outcome(x, x, x, k, x > 0, x, x > 0, x, x, status)
+    return rk.responses.Outcome(x, x, x, k, x > 0, x, x > 0, x, x, status)
 
 
 def test_another_ending_is_refused():

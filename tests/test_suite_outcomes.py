@@ -27,7 +27,7 @@ ROCKS = rk.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.3, 0.2]), np.arra
 @pytest.fixture(scope="module")
 def found():
     """Two lopsided rocks under all motions, at three scales, both ways round."""
-    return rk.suite_outcomes(ROCKS, MOTIONS, SCALE, facing="both", progress=False)
+    return rk.hazard.suite_outcomes(ROCKS, MOTIONS, SCALE, facing="both", progress=False)
 
 
 def test_every_scene_is_one_of_its_own(found):
@@ -44,10 +44,12 @@ def test_every_scene_is_one_of_its_own(found):
 
 
 def test_turning_round_a_symmetric_block_changes_nothing():
-    found = rk.suite_outcomes(rk.Block(0.2, 2.5), RECORDS, facing="both", progress=False)
+    found = rk.hazard.suite_outcomes(rk.Block(0.2, 2.5), RECORDS, facing="both", progress=False)
     assert found.verdict.shape == (4, 1, 2, 1)
     np.testing.assert_array_equal(found.verdict[:, :, 0], found.verdict[:, :, 1])
-    turned = rk.suite_outcomes(rk.Block(0.2, 2.5), [rk.Record(-m.samples, m.dt) for m in RECORDS], progress=False)
+    turned = rk.hazard.suite_outcomes(
+        rk.Block(0.2, 2.5), [rk.Record(-m.samples, m.dt) for m in RECORDS], progress=False
+    )
     np.testing.assert_allclose(turned.rotation[:, 0, 0, 0], found.rotation[:, 0, 1, 0], rtol=1e-9)
 
 
@@ -55,9 +57,11 @@ def by_hand():
     """A block that comes back, one that does not topple, one undecided."""
     verdict = np.array([[0, 1, 0, 1], [0, 0, 0, 0], [0, -1, 1, 1]], np.int8)[:, :, None, None]
     rotation = np.where(verdict == 1, np.inf, np.where(verdict == 0, 0.5, np.nan))
-    suite = rk.Suite([rk.SinePulse(0.5, each) for each in (0.5, 1.0, 2.0)])
+    suite = rk.motions.Suite([rk.SinePulse(0.5, each) for each in (0.5, 1.0, 2.0)])
     scale = np.array([0.5, 1.0, 2.0, 4.0])
-    return rk.SuiteOutcomes(suite, rk.Block(np.array([0.2]), np.array([2.0])), scale, (1,), verdict, rotation, rotation)
+    return rk.hazard.SuiteOutcomes(
+        suite, rk.Block(np.array([0.2]), np.array([2.0])), scale, (1,), verdict, rotation, rotation
+    )
 
 
 def test_capacities_are_never_forced_to_rise():
@@ -82,7 +86,7 @@ def test_long_table(found):
     assert row.size == 2
     np.testing.assert_array_equal(table["verdict"][row], found.verdict[2, 2, 1])
     np.testing.assert_allclose(table["alpha1"][row], ROCKS.alpha1)
-    np.testing.assert_allclose(table["PGA"][row], 2.5 * float(rk.peak_acceleration(RECORDS[2])))
+    np.testing.assert_allclose(table["PGA"][row], 2.5 * float(rk.intensity.peak_acceleration(RECORDS[2])))
     np.testing.assert_allclose(table["Arias"][row], 2.5**2 * rk.intensity.arias(RECORDS[2]), rtol=1e-12)
     frame = pytest.importorskip("pandas").DataFrame(table)
     assert frame.groupby("motion").size().eq(12).all()
@@ -99,7 +103,7 @@ def test_long_table(found):
 )
 def test_what_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        rk.suite_outcomes(**{"block": rk.Block(0.2, 2.0), "motions": [MOTIONS[0]]} | given)
+        rk.hazard.suite_outcomes(**{"block": rk.Block(0.2, 2.0), "motions": [MOTIONS[0]]} | given)
 
 
 # ---------------------------------------------------------------------------------------------- probit fits
@@ -118,7 +122,7 @@ def test_a_probit_of_two_measures_by_another_optimiser():
         return -scipy.stats.norm.logcdf(np.where(FELL == 1, 1, -1) * (line @ DESIGN)).sum()
 
     best = scipy.optimize.minimize(height, TRUTH, method="BFGS", options={"gtol": 1e-9}).x
-    fit = rk.fit_probit(MEASURES, FELL)
+    fit = rk.hazard.fit_probit(MEASURES, FELL)
     np.testing.assert_allclose([fit.intercept, *fit.slopes], best, rtol=1e-6)
     step, curvature = 1e-4, np.zeros((3, 3))
     for i, j in np.ndindex(3, 3):
@@ -134,7 +138,7 @@ def test_a_probit_of_two_measures_by_another_optimiser():
 @pytest.mark.parametrize("clusters", [None, np.arange(N) // 5])
 def test_against_an_established_package(clusters):
     statsmodels = pytest.importorskip("statsmodels.api")
-    fit = rk.fit_probit(MEASURES, FELL, clusters=clusters)
+    fit = rk.hazard.fit_probit(MEASURES, FELL, clusters=clusters)
     kind = (
         {} if clusters is None else {"cov_type": "cluster", "cov_kwds": {"groups": clusters, "use_correction": False}}
     )
@@ -155,8 +159,8 @@ def test_errors_for_few_motions():
         capacity = random.normal(0, 0.6, 15)[labels] + random.normal(0, 0.3, labels.size)
         fell = np.log(level) > capacity
         for kind in inside:
-            fit = rk.fit_probit({"PGA": level}, fell, clusters=labels, errors=kind)
-            assert fit.status == rk.FitStatus.successful
+            fit = rk.hazard.fit_probit({"PGA": level}, fell, clusters=labels, errors=kind)
+            assert fit.status == rk.hazard.FitStatus.successful
             # P = Phi(ln level/sqrt(0.6^2 + 0.3^2)): the intercept is 0.
             inside[kind] += abs(float(fit.intercept)) < 1.96 * float(fit.standard_errors[0])
     shares = {kind: count / repetitions for kind, count in inside.items()}
@@ -166,7 +170,7 @@ def test_errors_for_few_motions():
 def test_a_single_measure_is_the_lognormal_fit():
     levels, trials = jnp.array([0.1, 0.2, 0.3, 0.5, 0.8]), 20.0
     fell = [1, 4, 11, 15, 19]
-    one, other = rk.fit_probit({"PGA": levels}, fell, trials), rk.fit_fragility(levels, fell, trials)
+    one, other = rk.hazard.fit_probit({"PGA": levels}, fell, trials), rk.hazard.fit_fragility(levels, fell, trials)
     assert float(one.fragility.median) == pytest.approx(float(other.fragility.median), rel=1e-9)
     assert float(one.fragility.dispersion) == pytest.approx(float(other.fragility.dispersion), rel=1e-9)
 
@@ -174,20 +178,20 @@ def test_a_single_measure_is_the_lognormal_fit():
 @pytest.mark.parametrize(
     "measures, fell, status",
     [
-        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [0, 0, 1, 1], rk.FitStatus.separable),
-        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [1, 1, 1, 1], rk.FitStatus.separable),
-        ({"PGA": [0.2, 0.2, 0.2, 0.2]}, [0, 1, 0, 1], rk.FitStatus.not_converged),
+        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [0, 0, 1, 1], rk.hazard.FitStatus.separable),
+        ({"PGA": [0.1, 0.2, 0.3, 0.4]}, [1, 1, 1, 1], rk.hazard.FitStatus.separable),
+        ({"PGA": [0.2, 0.2, 0.2, 0.2]}, [0, 1, 0, 1], rk.hazard.FitStatus.not_converged),
     ],
 )
 def test_fits_that_fail_say_so(measures, fell, status):
-    fit = rk.fit_probit(measures, fell)
+    fit = rk.hazard.fit_probit(measures, fell)
     assert fit.status == status
     assert np.isnan(fit.slopes).all() and np.isnan(fit.covariance).all()
 
 
 def test_trials_of_another_number():
     with pytest.raises(ValueError, match=r"`trials` must have shape \(3,\) or \(\), but has shape \(2,\)"):
-        rk.fit_probit({"PGA": [0.1, 0.2, 0.3]}, [0, 1, 1], [1, 2])
+        rk.hazard.fit_probit({"PGA": [0.1, 0.2, 0.3]}, [0, 1, 1], [1, 2])
 
 
 # ----------------------------------------------------------------------------------------------------- NRML
@@ -195,16 +199,18 @@ def test_trials_of_another_number():
 
 def test_nrml(tmp_path):
     path, space = tmp_path / "f.xml", {"n": "http://openquake.org/xmlns/nrml/0.5"}
-    rk.write_nrml({"uplift": rk.LogNormalFragility(0.2, 0.1), "topples": rk.LogNormalFragility(0.4, 0.3)}, path)
+    rk.hazard.write_nrml(
+        {"uplift": rk.hazard.LogNormalFragility(0.2, 0.1), "topples": rk.hazard.LogNormalFragility(0.4, 0.3)}, path
+    )
     root = ElementTree.parse(path).getroot()
     assert root.find(".//n:limitStates", space).text == "uplift topples"
     last = root.findall(".//n:params", space)[1].attrib
     law = scipy.stats.lognorm(0.3, scale=0.4)
     assert float(last["mean"]) == pytest.approx(law.mean(), rel=1e-9)
     assert float(last["stddev"]) == pytest.approx(law.std(), rel=1e-9)
-    rk.write_nrml({"topples": rk.TabulatedFragility([0.1, 0.2, 0.4], [0.0, 0.7, 0.6])}, path, "PGV")
+    rk.hazard.write_nrml({"topples": rk.hazard.TabulatedFragility([0.1, 0.2, 0.4], [0.0, 0.7, 0.6])}, path, "PGV")
     root = ElementTree.parse(path).getroot()
     assert root.find(".//n:imls", space).text == "0.1 0.2 0.4"
     assert root.find(".//n:poes", space).text == "0 0.7 0.6"
     with pytest.raises(ValueError, match="`fragilities` must hold lognormal or tabulated"):
-        rk.write_nrml({}, path)
+        rk.hazard.write_nrml({}, path)

@@ -35,26 +35,26 @@ WALL = rk.closed_form.single_lobe.safety_wall
         # Its top is where no part ends: (y^3 - 3y) e^(-y^2/2) has the integral (1 - y^2) e^(-y^2/2), 1 at its largest.
         (rk.RickerPulse(0.3, 0.8, "antisymmetric"), 0.3, 0.3 * 0.8 * np.sqrt(3) / (2 * np.pi) / RICKER_TOP),
     ],
-    ids=lambda x: type(x).__name__ if isinstance(x, rk.AbstractMotion) else "",
+    ids=lambda x: type(x).__name__ if isinstance(x, rk.motions.AbstractMotion) else "",
 )
 def test_peaks_of_motions(motion, peak, speed):
     """Peak acceleration [g] and peak velocity [m/s] by hand."""
     if peak is not None:
-        np.testing.assert_allclose(rk.peak_acceleration(motion), peak, rtol=1e-9)
-    np.testing.assert_allclose(rk.peak_velocity(motion), G * speed, rtol=1e-9)
+        np.testing.assert_allclose(rk.intensity.peak_acceleration(motion), peak, rtol=1e-9)
+    np.testing.assert_allclose(rk.intensity.peak_velocity(motion), G * speed, rtol=1e-9)
 
 
 # --------------------------------------------------------------------------------------- verdicts
 
 DURATIONS = jnp.array([0.1, 0.3, 0.5, 0.8, 1.3])
-BLOCKS = rk.draw_blocks(rk.Block(0.2, 2.0, 0.9), 12, alpha=0.1, p=0.1, restitution=0.03, seed=4)
+BLOCKS = rk.blocks.draw_blocks(rk.Block(0.2, 2.0, 0.9), 12, alpha=0.1, p=0.1, restitution=0.03, seed=4)
 
 
 def test_every_verdict_under_rectangular_pulses():
     """Slender blocks topple above the safety wall in closed form, each above its own; PGV is PGA times duration."""
     motions = [rk.RectangularPulse(jnp.ones(5), DURATIONS)]
     levels = np.geomspace(0.1, 2.0, 16)
-    found = rk.simulated_fragility(BLOCKS, motions, levels, rk.Linear())
+    found = rk.hazard.simulated_fragility(BLOCKS, motions, levels, rk.Linear())
     wall = np.asarray(BLOCKS.alpha / WALL(BLOCKS.p * DURATIONS[:, None], -jnp.inf))
     topples = levels[:, None] > wall[:, None, :]
     assert found.undecided == 0 and 0.3 < np.mean(topples) < 0.9
@@ -64,11 +64,11 @@ def test_every_verdict_under_rectangular_pulses():
     below, above = np.moveaxis(found.capacities, -1, 0)
     assert np.all((below < wall) & (wall < above))
     # By velocity the same blocks topple at level = wall g duration.
-    by_velocity = rk.simulated_fragility(BLOCKS, motions, levels, rk.Linear(), measure="PGV")
+    by_velocity = rk.hazard.simulated_fragility(BLOCKS, motions, levels, rk.Linear(), measure="PGV")
     speeds = wall * G * np.asarray(DURATIONS)[:, None]
     np.testing.assert_array_equal(by_velocity.verdict, levels[:, None] > speeds[:, None, :])
     # And over both measures.
-    grid = rk.simulated_surface(BLOCKS, [rk.RectangularPulse], levels, DURATIONS, rk.Linear())
+    grid = rk.hazard.simulated_surface(BLOCKS, [rk.RectangularPulse], levels, DURATIONS, rk.Linear())
     np.testing.assert_array_equal(grid.verdict[0], np.swapaxes(topples, 0, 1))
     middle = grid.at(0.5)
     np.testing.assert_allclose(middle.probabilities, topples[2].mean(axis=1))
@@ -78,16 +78,16 @@ def test_every_verdict_under_rectangular_pulses():
 
 def test_draws_are_what_they_say():
     block = rk.Block(0.2, 2.0, 0.95)
-    many = rk.draw_blocks(block, 20000, alpha=0.1, p=0.05, restitution=0.05, seed=1)
+    many = rk.blocks.draw_blocks(block, 20000, alpha=0.1, p=0.05, restitution=0.05, seed=1)
     assert np.median(many.alpha) == pytest.approx(0.2, rel=0.005) and np.std(np.log(many.p)) == pytest.approx(
         0.05, rel=0.03
     )
     assert float(many.restitution.max()) <= 1 and np.mean(many.restitution > 0.95) == pytest.approx(
         (ndtr(1) - 0.5) / ndtr(1), abs=0.02
     )
-    follows = rk.draw_blocks(rk.Block(0.2, 2.0), 5, alpha=0.1)
+    follows = rk.blocks.draw_blocks(rk.Block(0.2, 2.0), 5, alpha=0.1)
     np.testing.assert_allclose(follows.restitution, 1 - 1.5 * np.sin(follows.alpha) ** 2)
-    np.testing.assert_array_equal(rk.draw_blocks(block, 3, p=0.1).p, rk.draw_blocks(block, 3, p=0.1).p)
+    np.testing.assert_array_equal(rk.blocks.draw_blocks(block, 3, p=0.1).p, rk.blocks.draw_blocks(block, 3, p=0.1).p)
 
 
 # --------------------------------------------------------------------------------------- tables and fits
@@ -99,7 +99,7 @@ def table(verdict, levels=None):
     motions, count, _ = verdict.shape
     levels = jnp.arange(1.0, count + 1) if levels is None else jnp.asarray(levels)
     ones, names = jnp.ones(motions), tuple(f"motion {k}" for k in range(motions))
-    return rk.SimulatedFragility(levels, verdict, ones, ones, names, "PGA")
+    return rk.hazard.SimulatedFragility(levels, verdict, ones, ones, names, "PGA")
 
 
 def test_what_is_undecided_bounds_the_probability():
@@ -140,7 +140,7 @@ def stripes(seed, motions=80, levels=LEVELS):
 def test_fits_of_stripes_and_their_errors():
     """Medians and dispersions of 80 suites scatter as the covariance of clusters says."""
     fits = [stripes(seed).fit() for seed in range(80)]
-    assert all(fit.status == rk.FitStatus.successful for fit in fits)
+    assert all(fit.status == rk.hazard.FitStatus.successful for fit in fits)
     logarithms = np.array([np.log([fit.fragility.median, fit.fragility.dispersion]) for fit in fits])
     # Few motions make the dispersion a little small: the likelihood by SciPy has its maxima in the same places.
     np.testing.assert_allclose(logarithms.mean(axis=0), [-0.91503151, -1.08819027], atol=1e-6)
@@ -148,23 +148,23 @@ def test_fits_of_stripes_and_their_errors():
     stated = np.mean([np.sqrt(np.diag(fit.covariance)) for fit in fits], axis=0)
     np.testing.assert_allclose(stated, logarithms.std(axis=0), rtol=0.25)
     # As if levels were independent, it would be too sure.
-    plain = [rk.fit_fragility(LEVELS, stripes(seed).counts().sum(axis=0), 80.0) for seed in range(80)]
+    plain = [rk.hazard.fit_fragility(LEVELS, stripes(seed).counts().sum(axis=0), 80.0) for seed in range(80)]
     assert np.all(np.mean([np.sqrt(np.diag(fit.covariance)) for fit in plain], axis=0) < 0.75 * logarithms.std(axis=0))
     found, independent = stripes(0), plain[0]
     np.testing.assert_allclose(independent.fragility.median, fits[0].fragility.median)
     rows = found.table()
-    same = rk.fit_fragility(rows["level"], rows["toppled"], rows["trials"])
+    same = rk.hazard.fit_fragility(rows["level"], rows["toppled"], rows["trials"])
     np.testing.assert_allclose(same.fragility.dispersion, independent.fragility.dispersion, rtol=1e-9)
 
 
 def test_fit_of_a_surface():
     """Outcomes drawn from a surface: its numbers within four standard errors, its contours by their definition."""
-    truth = rk.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
+    truth = rk.hazard.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
     random = np.random.default_rng(2)
     acceleration, ratio = random.uniform(0.1, 1.5, 4000), random.uniform(0.03, 0.3, 4000)
     toppled = random.uniform(size=4000) < truth(acceleration, ratio)
-    found = rk.fit_surface(acceleration, ratio, toppled)
-    assert found.status == rk.FitStatus.successful
+    found = rk.hazard.fit_surface(acceleration, ratio, toppled)
+    assert found.status == rk.hazard.FitStatus.successful
     numbers = lambda f: np.array([np.log(f.median), f.exponent, np.log(f.dispersion)])
     errors = np.sqrt(np.diag(found.covariance))
     assert np.all(np.abs(numbers(found.fragility) - numbers(truth)) < 4 * errors) and np.all(errors < 0.1)
@@ -172,22 +172,22 @@ def test_fit_of_a_surface():
     np.testing.assert_allclose(truth(contour, 0.1), [0.05, 0.5, 0.95], rtol=1e-12)
     np.testing.assert_allclose(truth.at(0.1)(contour), [0.05, 0.5, 0.95], rtol=1e-12)
     np.testing.assert_allclose(contour[1], 0.15 * 0.1**-0.6)
-    one = rk.fit_surface(acceleration, np.full(4000, 0.1), toppled)
-    assert one.status == rk.FitStatus.not_converged
-    safe = rk.fit_surface(acceleration, ratio, np.zeros(4000))
-    assert safe.status != rk.FitStatus.successful and np.isnan(safe.fragility.median)
+    one = rk.hazard.fit_surface(acceleration, np.full(4000, 0.1), toppled)
+    assert one.status == rk.hazard.FitStatus.not_converged
+    safe = rk.hazard.fit_surface(acceleration, ratio, np.zeros(4000))
+    assert safe.status != rk.hazard.FitStatus.successful and np.isnan(safe.fragility.median)
 
 
 def test_fit_of_a_simulated_surface():
     """All cells of a grid, draws as clusters: nearly as certain as independent outcomes, which these are."""
-    truth = rk.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
+    truth = rk.hazard.SurfaceFragility(*map(jnp.asarray, (0.15, -0.6, 0.3)))
     acceleration, ratio = jnp.geomspace(0.1, 1.5, 20), jnp.geomspace(0.03, 0.3, 20)
     share = np.asarray(truth(acceleration[:, None], ratio))
     verdict = (np.random.default_rng(3).uniform(size=(1, 20, 20, 10)) < share[:, :, None]).astype(np.int8)
-    found = rk.SimulatedSurface(acceleration, ratio, verdict)
+    found = rk.hazard.SimulatedSurface(acceleration, ratio, verdict)
     np.testing.assert_array_equal(found.lower, verdict[0].mean(axis=-1))
     fit, table_ = found.fit(), np.meshgrid(acceleration, ratio, np.arange(10), indexing="ij")
-    plain = rk.fit_surface(table_[0].ravel(), table_[1].ravel(), verdict.ravel())
+    plain = rk.hazard.fit_surface(table_[0].ravel(), table_[1].ravel(), verdict.ravel())
     assert fit.fragility.median == plain.fragility.median == pytest.approx(0.15, rel=0.05)
     errors = np.sqrt(np.diag(fit.covariance) / np.diag(plain.covariance))
     assert np.all((0.5 < errors) & (errors < 2.0))
@@ -200,7 +200,7 @@ def test_fit_of_a_simulated_surface():
 
 def test_figure_of_a_fragility():
     found = table([[[0, 0], [1, -1], [1, 1]], [[0, 0], [0, 0], [-1, 1]]])
-    axis = rk.plot.fragility(found, rk.LogNormalFragility(2.0, 0.3))
+    axis = rk.plot.fragility(found, rk.hazard.LogNormalFragility(2.0, 0.3))
     assert [text.get_text() for text in axis.get_legend().get_texts()] == [
         "simulated",
         "undecided",
@@ -214,24 +214,33 @@ RECORD = rk.Record([0.0, 0.3, 0.0], 0.4)
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: rk.Suite([]), "`motions` must hold at least one motion"),
-        (lambda: rk.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
+        (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
+        (lambda: rk.motions.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
         (
-            lambda: rk.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
+            lambda: rk.motions.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
             "`motions` must move the ground, but 'quiet' does not",
         ),
-        (lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
+        (lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
         (
-            lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.2, 0.1]),
+            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2, 0.1]),
             "`levels` must be positive and finite, and rise",
         ),
-        (lambda: rk.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], measure="SA"), "`measure` must be one of 'PGA'"),
-        (lambda: rk.draw_blocks(rk.Block(0.2, 2.0), 0), "`draws` must be a whole number from 1"),
-        (lambda: rk.draw_blocks(rk.Block(0.2, 2.0), 9, p=-1.0), "`p` must be 0 or more"),
-        (lambda: rk.simulated_surface(BLOCKS, [], [0.1, 0.2], [0.1, 0.2]), "`pulses` must hold at least one pulse"),
+        (
+            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], measure="SA"),
+            "`measure` must be one of 'PGA'",
+        ),
+        (lambda: rk.blocks.draw_blocks(rk.Block(0.2, 2.0), 0), "`draws` must be a whole number from 1"),
+        (lambda: rk.blocks.draw_blocks(rk.Block(0.2, 2.0), 9, p=-1.0), "`p` must be 0 or more"),
+        (
+            lambda: rk.hazard.simulated_surface(BLOCKS, [], [0.1, 0.2], [0.1, 0.2]),
+            "`pulses` must hold at least one pulse",
+        ),
         (lambda: table(np.zeros((1, 2, 1))).counts("middle"), "`bound` must be one of 'lower', 'upper'"),
-        (lambda: rk.fit_surface([0.1, 0.2], [0.1, 0.2], [0.0, 1.0]), "must be lists of one length above 2"),
-        (lambda: rk.fit_surface([0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.0, 1.0, 0.0], clusters=[1, 2]), r"shape \(3,\)"),
+        (lambda: rk.hazard.fit_surface([0.1, 0.2], [0.1, 0.2], [0.0, 1.0]), "must be lists of one length above 2"),
+        (
+            lambda: rk.hazard.fit_surface([0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.0, 1.0, 0.0], clusters=[1, 2]),
+            r"shape \(3,\)",
+        ),
     ],
 )
 def test_bad_input_is_refused(call, message):
@@ -248,7 +257,7 @@ def test_records_of_unlike_length():
     record = rk.example_record()
     short = rk.Record(np.append(record.samples[400:1600], 0.0), 1.5 * record.dt, "a part")
     levels, blocks = np.array([0.3, 0.6, 1.2, 2.4]), rk.Block(jnp.array([0.15, 0.2]), jnp.array([2.0, 3.0]))
-    found = rk.simulated_fragility(blocks, [record, short], levels)
+    found = rk.hazard.simulated_fragility(blocks, [record, short], levels)
     assert found.names == (record.name, "a part") and 0 < np.mean(found.verdict) < 1
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -262,7 +271,7 @@ def test_records_of_unlike_length():
                 assert verdict == alone(motion.samples.size, motion.samples, motion.dt, level, alpha, p)
     columns = found.table()
     np.testing.assert_allclose(columns["peak_acceleration"], np.tile(levels, 2), rtol=1e-12)
-    fitted = rk.surface_of(found)
+    fitted = rk.hazard.surface_of(found)
     assert fitted.covariance.shape == (3, 3)
 
 
@@ -273,6 +282,6 @@ def test_a_sine_pulse_topples_and_spares_again():
     no_impact = float(rk.closed_form.sine_pulse.no_impact_limit(ratio))
     block = rk.Block(0.1, 1.0, restitution)
     levels = 0.1 * np.linspace(1.0, 1.2 * no_impact, 200)
-    found = rk.simulated_fragility(block, [rk.SinePulse(1.0, 2 * np.pi / ratio)], levels, rk.Linear())
+    found = rk.hazard.simulated_fragility(block, [rk.SinePulse(1.0, 2 * np.pi / ratio)], levels, rk.Linear())
     assert not found.monotone[0, 0] and found.falls.max() == 1
     np.testing.assert_array_equal(found.verdict[0, levels > 0.1 * no_impact * 1.0001, 0], 1)

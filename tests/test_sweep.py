@@ -77,7 +77,7 @@ def test_sweep_is_made_of_outcomes():
         lambda alpha, p: rk.outcome(rk.Block(alpha, p), record, rk.Linear()), alpha=[0.1, 0.2], p=np.linspace(1, 9, 40)
     )
     single = jax.jit(jax.vmap(lambda p: rk.outcome(rk.Block(0.2, p), record, rk.Linear())))(grid.axes["p"])
-    assert isinstance(grid.values, rk.Outcome) and np.all(grid.values.status == rk.Status.successful)
+    assert isinstance(grid.values, rk.responses.Outcome) and np.all(grid.values.status == rk.Status.successful)
     assert 0 < np.sum(grid.values.overturned) < grid.values.overturned.size
     np.testing.assert_array_equal(grid.values.impact_count[1], single.impact_count)
     np.testing.assert_allclose(grid.values.max_rotation[1], single.max_rotation, rtol=1e-11)

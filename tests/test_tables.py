@@ -26,49 +26,49 @@ def made(kind, **fields):
 
 TABLES = {
     "spectrum": made(
-        rk.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0), max_velocity=jnp.ones(3),
+        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0), max_velocity=jnp.ones(3),
         impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3), status=STATUS, intensity=None,
         parameters={},
     ),
     "self-similar spectrum": made(
-        rk.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.ones((2, 1, 3)),
+        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.ones((2, 1, 3)),
         max_velocity=jnp.ones((2, 1, 3)), impact_count=jnp.ones((2, 1, 3)), overturned=jnp.zeros((2, 1, 3), bool),
         margin=jnp.ones((2, 1, 3)), status=jax.tree.map(lambda x: jnp.tile(x, (2, 1, 1)), STATUS),
         intensity=jnp.array([1.5]), parameters={"shape": jnp.array([0.0, 1.0])},
     ),
     "map": made(
-        rk.OverturningMap, frequency_ratio=jnp.array([1.0, 2.0, 3.0]), intensity=jnp.array([2.0]),
+        rk.studies.OverturningMap, frequency_ratio=jnp.array([1.0, 2.0, 3.0]), intensity=jnp.array([2.0]),
         state=jnp.ones((1, 3)), max_rotation=jnp.ones((1, 3)), impact_count=jnp.ones((1, 3)), margin=jnp.ones((1, 3)),
         status=jax.tree.map(lambda x: x[None], STATUS), parameters={},
     ),
     "critical amplitudes": made(
-        rk.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)), rising=jnp.ones((1, 2)),
+        rk.studies.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)), rising=jnp.ones((1, 2)),
         impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
         complete=jnp.array([True]), names=("alpha",),
     ),
     "estimate": made(
-        rk.Estimate, names=("amplitude", "period"), values=jnp.array([0.3, 0.8]), interval=jnp.ones((2, 2)),
+        rk.inverse.Estimate, names=("amplitude", "period"), values=jnp.array([0.3, 0.8]), interval=jnp.ones((2, 2)),
         open=jnp.zeros((2, 2), bool), log_likelihood=ONE, surprise=ONE, scatter=ONE,
-        status=rk.EstimateStatus.open_interval,
+        status=rk.inverse.EstimateStatus.open_interval,
     ),
     "posterior": made(
-        rk.Posterior, names=("amplitude",), samples=jnp.ones((2, 3, 1)), log_density=jnp.ones((2, 3)),
-        status=rk.PosteriorStatus.not_converged,
+        rk.inverse.Posterior, names=("amplitude",), samples=jnp.ones((2, 3, 1)), log_density=jnp.ones((2, 3)),
+        status=rk.inverse.PosteriorStatus.not_converged,
     ),
     "region": made(
-        rk.FeasibleRegion, names=("amplitude", "period"), values=(jnp.ones(2), jnp.ones(3)),
+        rk.inverse.FeasibleRegion, names=("amplitude", "period"), values=(jnp.ones(2), jnp.ones(3)),
         log_likelihood=jnp.ones((2, 3)), allowed=jnp.ones((2, 3), bool),
     ),
     "unexceeded": made(
-        rk.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)), weakest=jnp.ones(3),
+        rk.inverse.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)), weakest=jnp.ones(3),
         complete=jnp.ones(3, bool),
     ),
     "found record": made(
-        rk.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE, status=rk.RecordStatus.useless_slopes
+        rk.inverse.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE, status=rk.inverse.RecordStatus.useless_slopes
     ),
     "history fit": made(
-        rk.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1), scatter=0.1,
-        residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.HistoryStatus.not_identified,
+        rk.inverse.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1), scatter=0.1,
+        residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.inverse.HistoryStatus.not_identified,
     ),
 }  # fmt: skip
 
@@ -98,7 +98,7 @@ def test_the_words_of_a_status():
     assert data["status"].values.tolist() == ["successful", "undecided", "not_finite"]
     assert data["abscissa"].attrs["units"] == "s" and "intensity" not in data
     assert TABLES["estimate"].to_xarray()["status"].item() == "open_interval"
-    for kind in (rk.Status, rk.EstimateStatus, rk.RecordStatus):
+    for kind in (rk.Status, rk.inverse.EstimateStatus, rk.inverse.RecordStatus):
         for name in items_of(kind.successful):
             item = getattr(kind, name)
             assert items_of(item)[int(item._value)] == name

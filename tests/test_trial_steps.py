@@ -70,7 +70,7 @@ def test_all_that_makes_a_scene_takes_throw():
     classes = [kind for kind in named if isinstance(kind, type)]
     made = [kind for kind in classes if not inspect.isabstract(kind)]
     made += [getattr(kind, name) for kind in classes for name in dir(kind) if name.startswith("from_")]
-    made += [rk.outcome, rk.simulate, rk.outcome_flexible, rk.simulate_flexible]
+    made += [rk.outcome, rk.simulate, rk.responses.outcome_flexible, rk.responses.simulate_flexible]
     assert len(made) > 18
     for each in made:
         assert "throw" in inspect.signature(each).parameters, each
@@ -155,9 +155,9 @@ def test_an_optimiser_without_bounds():
 
 def test_the_log_density_of_any_point():
     """Infinite ones are ends of ranges; for what is not a number nothing is likely."""
-    rocks = rk.Observations([0.2], [2.0], ["survived"])
-    unknowns = {"amplitude": rk.Unknown(0.1, 1.0), "period": rk.Unknown(-0.5, 1.0, log=False)}
-    density = rk.log_density(rocks, rk.SinePulse, unknowns, model=rk.Linear(), engine=rk.Series(order=4))
+    rocks = rk.inverse.Observations([0.2], [2.0], ["survived"])
+    unknowns = {"amplitude": rk.inverse.Unknown(0.1, 1.0), "period": rk.inverse.Unknown(-0.5, 1.0, log=False)}
+    density = rk.inverse.log_density(rocks, rk.SinePulse, unknowns, model=rk.Linear(), engine=rk.Series(order=4))
     points = jnp.array([[0.0, 0.5], [0.0, -3.0], [INF, 1.0], [0.0, -INF], [NAN, 0.0], [1e9, -1e9]])
     for found in (density.objective(points), jax.jit(lambda x: density(x))(points)):
         assert jnp.isfinite(found[0])

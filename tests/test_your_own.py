@@ -16,7 +16,7 @@ BLOCK = rk.Block(0.2, 2.0)
 CORNERS = np.array([0.0, 0.3, -0.25, 0.35, -0.1, 0.0])
 
 
-class Ramps(rk.AbstractMotion):
+class Ramps(rk.motions.AbstractMotion):
     """Straight lines between corners at equal times, times a height; an array that nobody declares."""
 
     height: jax.Array = rk.parameter("g")
@@ -43,7 +43,7 @@ class Ramps(rk.AbstractMotion):
         return [self.height * (left + slope * local), self.height * slope * unit][: order + 1]
 
 
-class Damped(rk.AbstractEquation):
+class Damped(rk.models.AbstractEquation):
     """Housner's equation with a damper, as functions."""
 
     damping: jax.Array
@@ -58,15 +58,15 @@ class Damped(rk.AbstractEquation):
         return False
 
 
-class Softer(rk.AbstractEquation):
+class Softer(rk.models.AbstractEquation):
     """A sinusoid that is weaker than the block's own, by a number: the series engine solves it."""
 
     strength: jax.Array = rk.parameter("-", "share")
 
     def moments(self, block):
         sine, cosine = jnp.sin(block.alpha), jnp.cos(block.alpha)
-        restoring = rk.Terms(sine=-self.strength * cosine, cosine=self.strength * sine)
-        return rk.Coefficients(restoring, rk.Terms(sine=sine, cosine=cosine))
+        restoring = rk.models.Terms(sine=-self.strength * cosine, cosine=self.strength * sine)
+        return rk.models.Coefficients(restoring, rk.models.Terms(sine=sine, cosine=cosine))
 
 
 def ramps(height=1.0):
@@ -139,7 +139,7 @@ def test_critical_amplitudes_of_many_blocks_and_derivatives():
 
 
 def test_a_suite_of_ones_own():
-    suite = rk.Suite([Ramps(jnp.array([0.5, 1.0]), jnp.asarray(CORNERS), jnp.asarray(0.25), jnp.asarray(1.0))])
+    suite = rk.motions.Suite([Ramps(jnp.array([0.5, 1.0]), jnp.asarray(CORNERS), jnp.asarray(0.25), jnp.asarray(1.0))])
     np.testing.assert_allclose(suite.peak_acceleration, [0.175, 0.35], rtol=1e-12)
 
 
@@ -179,33 +179,38 @@ def test_a_model_of_ones_own_as_functions():
 
 @pytest.mark.parametrize(
     "terms",
-    [rk.Terms(constant=1.0), rk.Terms(cosine=1.0), rk.Terms(line=-1.0, sine=1.0), rk.Terms()],
+    [
+        rk.models.Terms(constant=1.0),
+        rk.models.Terms(cosine=1.0),
+        rk.models.Terms(line=-1.0, sine=1.0),
+        rk.models.Terms(),
+    ],
     ids=["constant", "cosine", "line and sine", "nothing"],
 )
 def test_moments_whose_balance_is_not_known_are_refused(terms):
     with pytest.raises(ValueError, match="`restoring_terms` must be"):
-        rk.Coefficients(terms, rk.Terms(constant=1.0))
+        rk.models.Coefficients(terms, rk.models.Terms(constant=1.0))
 
 
 @pytest.mark.parametrize(
     "arm",
     [
-        pytest.param(rk.Terms(constant=1.0), marks=pytest.mark.slow),
-        pytest.param(rk.Terms(constant=1.0, line=-0.3), marks=pytest.mark.slow),
-        rk.Terms(cosine=0.9, line=0.1),
-        pytest.param(rk.Terms(cosine=1.0), marks=pytest.mark.slow),
+        pytest.param(rk.models.Terms(constant=1.0), marks=pytest.mark.slow),
+        pytest.param(rk.models.Terms(constant=1.0, line=-0.3), marks=pytest.mark.slow),
+        rk.models.Terms(cosine=0.9, line=0.1),
+        pytest.param(rk.models.Terms(cosine=1.0), marks=pytest.mark.slow),
     ],
     ids=["constant", "line", "cosine and line", "cosine"],
 )
 def test_any_arm_in_both_engines(arm):
     """Arms that no model of the package has, with their derivatives."""
 
-    class WithArm(rk.AbstractEquation):
+    class WithArm(rk.models.AbstractEquation):
         strength: jax.Array
 
         def moments(self, block):
-            restoring = rk.Terms(sine=-jnp.cos(block.alpha), cosine=jnp.sin(block.alpha))
-            return rk.Coefficients(restoring, jax.tree.map(lambda c: self.strength * c, arm))
+            restoring = rk.models.Terms(sine=-jnp.cos(block.alpha), cosine=jnp.sin(block.alpha))
+            return rk.models.Coefficients(restoring, jax.tree.map(lambda c: self.strength * c, arm))
 
     def peak(strength, engine):
         return rk.outcome(BLOCK, rk.SinePulse(0.3, 0.9), WithArm(strength), engine=engine).max_rotation

@@ -31,23 +31,23 @@ def _run(arguments: argparse.Namespace) -> int:
     check_points(arguments.points, 3)
     check_range("--levels", arguments.levels)
     given = {"dt": arguments.dt, "unit": arguments.unit, "column": arguments.column}
-    suite = rk.Suite([rk.read_record(path, **given) for path in arguments.records])
+    suite = rk.motions.Suite([rk.read_record(path, **given) for path in arguments.records])
     block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
     if arguments.scatter != 0:
-        block = rk.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
+        block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
     levels = np.geomspace(*arguments.levels, arguments.points)
-    found = rk.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure)
+    found = rk.hazard.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure)
     fits = {bound: found.fit(bound) for bound in ("lower", "upper")}
     print(f"{len(suite)} records\n{table(_rows(found, fits))}")
-    good = all(fit.status == rk.FitStatus.successful for fit in fits.values())
+    good = all(fit.status == rk.hazard.FitStatus.successful for fit in fits.values())
     if not good:
-        worse = next(fit for fit in fits.values() if fit.status != rk.FitStatus.successful)
-        print(f"jaxrock: no lognormal fit: {rk.FitStatus[worse.status]}", file=sys.stderr)
+        worse = next(fit for fit in fits.values() if fit.status != rk.hazard.FitStatus.successful)
+        print(f"jaxrock: no lognormal fit: {rk.hazard.FitStatus[worse.status]}", file=sys.stderr)
     _write(arguments, found, fits["upper"].fragility if good else None)
     return 0 if good else 1
 
 
-def _rows(found: rk.SimulatedFragility, fits: dict) -> list[tuple[str, str, str]]:
+def _rows(found: rk.hazard.SimulatedFragility, fits: dict) -> list[tuple[str, str, str]]:
     """Lines of the table that is printed."""
     unit = {"PGA": "g", "PGV": "m/s"}[found.measure]
     rows = [
@@ -68,7 +68,9 @@ def _rows(found: rk.SimulatedFragility, fits: dict) -> list[tuple[str, str, str]
     return rows
 
 
-def _write(arguments: argparse.Namespace, found: rk.SimulatedFragility, fit: rk.LogNormalFragility | None) -> None:
+def _write(
+    arguments: argparse.Namespace, found: rk.hazard.SimulatedFragility, fit: rk.hazard.LogNormalFragility | None
+) -> None:
     """Tables, the figure, and NRML where there is a fit."""
     folder = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,7 +83,7 @@ def _write(arguments: argparse.Namespace, found: rk.SimulatedFragility, fit: rk.
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
     print(f"wrote {folder / 'stripes.csv'}")
     if fit is not None:
-        rk.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
+        rk.hazard.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
         print(f"wrote {folder / 'fragility.xml'}")
     save(rk.plot.fragility(found, fit).figure, folder / "fragility.png")
 

@@ -78,45 +78,49 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    observations, model = rk.read_observations(arguments.rocks), model_of(arguments)
+    observations, model = rk.inverse.read_observations(arguments.rocks), model_of(arguments)
     check_points(arguments.points, 2)
     pulse, scatter, lapse = PULSES[arguments.pulse], arguments.scatter, arguments.lapse
     extent = extent_of(pulse)
     priors = _priors(arguments.prior, arguments.pulse)
     unknowns = _unknowns(arguments, priors)
     starts = arguments.starts
-    estimate = rk.estimate_motion(observations, pulse, unknowns, scatter, lapse=lapse, starts=starts, model=model)
+    estimate = rk.inverse.estimate_motion(
+        observations, pulse, unknowns, scatter, lapse=lapse, starts=starts, model=model
+    )
     fixed = {name: estimate[name] for name in estimate.names[2:]}
     axes = {
         "amplitude": np.geomspace(*arguments.amplitude, arguments.points),
         extent: np.geomspace(*arguments.duration, arguments.points),
     }
-    region = rk.feasible_region(rk.Likelihood(observations, pulse, scatter, model, lapse=lapse), axes, fixed)
+    region = rk.inverse.feasible_region(
+        rk.inverse.Likelihood(observations, pulse, scatter, model, lapse=lapse), axes, fixed
+    )
     wall = None
     if bool(jnp.any(observations.seen != TOPPLED)):
-        wall = rk.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
+        wall = rk.inverse.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
     files = _write(arguments.out, observations, estimate, region, wall)
     print(_text(observations, estimate, ", with the priors" if priors else ""))
     return _reported(estimate.status, files)
 
 
-def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.Unknown]:
+def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.inverse.Unknown]:
     """What is estimated."""
     unknowns = {
-        "amplitude": rk.Unknown(*arguments.amplitude, prior=priors.get("amplitude")),
-        extent_of(PULSES[arguments.pulse]): rk.Unknown(*arguments.duration, prior=priors.get("duration")),
+        "amplitude": rk.inverse.Unknown(*arguments.amplitude, prior=priors.get("amplitude")),
+        extent_of(PULSES[arguments.pulse]): rk.inverse.Unknown(*arguments.duration, prior=priors.get("duration")),
     }
     for name in _estimated(arguments.pulse):
         ends = getattr(arguments, name)
         if ends is None:
             raise ValueError(f"Argument `--{name}` must be given for the pulse {arguments.pulse}, but is None.")
-        unknowns[name] = rk.Unknown(*ends, log=False, prior=priors.get(name))
+        unknowns[name] = rk.inverse.Unknown(*ends, log=False, prior=priors.get(name))
     return unknowns
 
 
-def _reported(status: rk.EstimateStatus, files: list[Path]) -> int:
+def _reported(status: rk.inverse.EstimateStatus, files: list[Path]) -> int:
     """Print what became of an estimate, and the files; the exit status is 1 where there is no result."""
-    kinds = rk.EstimateStatus
+    kinds = rk.inverse.EstimateStatus
     if status != kinds.successful:
         print(kinds[status])
     for path in files:
@@ -144,10 +148,10 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
 
 def _write(
     folder: Path,
-    observations: rk.Observations,
-    estimate: rk.Estimate,
-    region: rk.FeasibleRegion,
-    wall: rk.Unexceeded | None,
+    observations: rk.inverse.Observations,
+    estimate: rk.inverse.Estimate,
+    region: rk.inverse.FeasibleRegion,
+    wall: rk.inverse.Unexceeded | None,
 ) -> list[Path]:
     """Tables and the figure; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -180,7 +184,7 @@ def _write(
     return files
 
 
-def _shapes(observations: rk.Observations) -> dict[str, np.ndarray]:
+def _shapes(observations: rk.inverse.Observations) -> dict[str, np.ndarray]:
     """Slenderness angles and frequency parameters by column."""
     blocks = observations.blocks
     names = ("alpha", "p") if observations.other is None else ("alpha1", "alpha2", "p1", "p2")
@@ -193,7 +197,7 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def _text(observations: rk.Observations, estimate: rk.Estimate, more: str) -> str:
+def _text(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate, more: str) -> str:
     seen = np.asarray(observations.seen)
     lines = [f"{seen.size} rocks: " + ", ".join(f"{int(np.sum(seen == k))} {word}" for k, word in enumerate(SEEN))]
     unknown = int(np.sum(observations.ways[0] != observations.ways[-1]))

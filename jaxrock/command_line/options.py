@@ -18,7 +18,7 @@ def number(text: str) -> float:
     return float(text)
 
 
-def model_of(arguments: argparse.Namespace) -> rk.AbstractEquation:
+def model_of(arguments: argparse.Namespace) -> rk.models.AbstractEquation:
     """The equation of motion."""
     return rk.Linear() if arguments.model == "linear" else rk.Housner()
 

@@ -44,7 +44,7 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0 if good else 1
 
 
-def _rows(size: tuple[str, str, str], block: rk.Block, record: rk.Record, model, result: rk.Outcome) -> list:
+def _rows(size: tuple[str, str, str], block: rk.Block, record: rk.Record, model, result: rk.responses.Outcome) -> list:
     """Lines of the table that is printed."""
     alpha, lost = float(block.alpha), bool(result.overturned)
     peak = float(np.max(np.abs(record.samples)))
@@ -69,7 +69,7 @@ def _rows(size: tuple[str, str, str], block: rk.Block, record: rk.Record, model,
     ]
 
 
-def _write(folder: Path, response: rk.Response) -> None:
+def _write(folder: Path, response: rk.responses.Response) -> None:
     """Files and figures of the response."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,

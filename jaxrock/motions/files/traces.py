@@ -12,7 +12,7 @@ from jaxrock.motions.record import Origin, Record
 
 @arguments
 def record_of_trace(trace: Any, unit: Annotated[str, word_of(*PER_G)]) -> Record:
-    """A trace of ObsPy as a record: `[rk.record_of_trace(trace, "m/s2") for trace in stream]`.
+    """A trace of ObsPy as a record: `[rk.motions.record_of_trace(trace, "m/s2") for trace in stream]`.
 
     **Arguments:**
 
