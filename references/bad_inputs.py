@@ -696,8 +696,9 @@ WRONG = [
 OURS = [
     block(), rk.Block([0.2, 0.3], 2.0), pulse(), rk.SinePulse([0.5, 0.6], 1.0), 0.0 * pulse(), 1e-300 * pulse(),
     rk.Record([0.0], 0.01), rk.Linear(), rk.Series(), rk.Spring(), rock(), flexible(), rocks(), curve(), fragility(),
-    rk.motions.Suite([pulse()]), rk.inverse.Unknown(0.1, 1.0), rk.Status.successful, rk.restitution.Constant(0.5), [pulse()],
-    [fragility()], rk.hazard.HazardCurve([LEVELS], [RATES]), pulse().with_vertical(pulse()), rk.similarity.scales(block()),
+    rk.motions.Suite([pulse()]), rk.inverse.Unknown(0.1, 1.0), rk.Status.successful, rk.restitution.Constant(0.5),
+    [pulse()], [fragility()], rk.hazard.HazardCurve([LEVELS], [RATES]), pulse().with_vertical(pulse()),
+    rk.similarity.scales(block()),
 ]  # fmt: skip
 
 strange = st.one_of(

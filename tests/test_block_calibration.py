@@ -92,8 +92,10 @@ def test_diagnostics(found):
 def test_rotations_say_more_than_verdicts(found):
     noisy = ROTATION * np.exp(0.2 * RANDOM.normal(size=COUNT))
     seen = np.where(FELL, np.nan, np.where(noisy < 0.01, 0.0, noisy))
-    more = rk.inverse.calibrate_block(lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
-                              cells=128, rotation=seen, rotation_sd=0.2, progress=False)  # fmt: skip
+    more = rk.inverse.calibrate_block(
+        lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
+        cells=128, rotation=seen, rotation_sd=0.2, progress=False,
+    )  # fmt: skip
     assert more.status == rk.inverse.CalibrationStatus.successful
     for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
         assert float(more.standard_errors[name]) < float(found.standard_errors[name])

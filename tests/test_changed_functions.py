@@ -209,7 +209,9 @@ SLOW = {
         lambda m: rk.rocking_spectrum(0.2, PULSE, [3.0, 4.0], model=m, engine=ENGINE, progress=False).margin
     ),
     "sensitivity_map": of_model(
-        lambda m: rk.studies.sensitivity_map([0.5], [1.0], model=m, engine=ENGINE, progress=False).sensitivity.margin.value
+        lambda m: rk.studies.sensitivity_map(
+            [0.5], [1.0], model=m, engine=ENGINE, progress=False
+        ).sensitivity.margin.value
     ),
     "critical_amplitudes": of_model(
         lambda m: rk.critical_amplitudes(

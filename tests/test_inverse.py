@@ -243,8 +243,8 @@ def test_rocks_that_no_motion_moves_tell_nothing():
 @pytest.mark.slow
 def test_contradictions_have_no_intervals():
     # The sturdiest half fell, the slenderest stands.
-    found = rk.inverse.estimate_motion(rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0)), rk.SinePulse, UNKNOWNS,
-                               0.05, starts=8)  # fmt: skip
+    seen = rocks(["survived"] * 6 + ["toppled"] * 6, p=np.full(12, 3.0))
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, 0.05, starts=8)
     assert found.status == rk.inverse.EstimateStatus.contradictory
     assert np.isnan(found.interval).all() and found.consistent_scatter > 0.05
     assert "rock" in " ".join(found.remarks)

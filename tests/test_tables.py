@@ -26,8 +26,8 @@ def made(kind, **fields):
 
 TABLES = {
     "spectrum": made(
-        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0), max_velocity=jnp.ones(3),
-        impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3), status=STATUS, intensity=None,
+        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0),
+        max_velocity=jnp.ones(3), impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3), status=STATUS, intensity=None,
         parameters={},
     ),
     "self-similar spectrum": made(
@@ -42,8 +42,8 @@ TABLES = {
         status=jax.tree.map(lambda x: x[None], STATUS), parameters={},
     ),
     "critical amplitudes": made(
-        rk.studies.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)), rising=jnp.ones((1, 2)),
-        impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
+        rk.studies.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)),
+        rising=jnp.ones((1, 2)), impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
         complete=jnp.array([True]), names=("alpha",),
     ),
     "estimate": made(
@@ -60,15 +60,16 @@ TABLES = {
         log_likelihood=jnp.ones((2, 3)), allowed=jnp.ones((2, 3), bool),
     ),
     "unexceeded": made(
-        rk.inverse.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)), weakest=jnp.ones(3),
-        complete=jnp.ones(3, bool),
+        rk.inverse.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)),
+        weakest=jnp.ones(3), complete=jnp.ones(3, bool),
     ),
     "found record": made(
-        rk.inverse.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE, status=rk.inverse.RecordStatus.useless_slopes
+        rk.inverse.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE,
+        status=rk.inverse.RecordStatus.useless_slopes,
     ),
     "history fit": made(
-        rk.inverse.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1), scatter=0.1,
-        residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.inverse.HistoryStatus.not_identified,
+        rk.inverse.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1),
+        scatter=0.1, residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.inverse.HistoryStatus.not_identified,
     ),
 }  # fmt: skip
 

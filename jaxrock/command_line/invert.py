@@ -93,9 +93,8 @@ def _run(arguments: argparse.Namespace) -> int:
         "amplitude": np.geomspace(*arguments.amplitude, arguments.points),
         extent: np.geomspace(*arguments.duration, arguments.points),
     }
-    region = rk.inverse.feasible_region(
-        rk.inverse.Likelihood(observations, pulse, scatter, model, lapse=lapse), axes, fixed
-    )
+    likelihood = rk.inverse.Likelihood(observations, pulse, scatter, model, lapse=lapse)
+    region = rk.inverse.feasible_region(likelihood, axes, fixed)
     wall = None
     if bool(jnp.any(observations.seen != TOPPLED)):
         wall = rk.inverse.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
