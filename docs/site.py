@@ -6,7 +6,10 @@ from pathlib import Path
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
-PATTERNS = ("benchmarks/*.md", "benchmarks/*.png", "notebooks/*.ipynb", "notebooks/*.md", "notebooks/*.png", "*.md")
+PATTERNS = (
+    "benchmarks/*.md", "benchmarks/*.png", "notebooks/*.ipynb", "notebooks/*.md", "notebooks/*.png",
+    "notebooks/pictures/*.png", "*.md",
+)  # fmt: skip
 
 
 def on_files(files, config):

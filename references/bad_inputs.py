@@ -666,9 +666,10 @@ NOT_CALLED = {
 
 def public_names() -> set[str]:
     """All that `import jaxrock` offers."""
-    names = {name for name in vars(rk) if not name.startswith("_")} - {"TYPE_CHECKING"} | {"Diffrax", "plot"}
-    spaces = {"closed_form", "intensity", "plot", "processing", "restitution", "similarity"}
-    return {name for name in names if not inspect.ismodule(getattr(rk, name))} | (names | {"processing"}) & spaces
+    homes = [rk, rk.blocks, rk.hazard, rk.inverse, rk.models, rk.motions, rk.responses, rk.studies]
+    names = {name: home for home in homes for name in dir(home) if not name.startswith("_")}
+    functions = {"closed_form", "intensity", "plot", "processing", "restitution", "similarity"}  # modules
+    return {name for name, home in names.items() if not inspect.ismodule(getattr(home, name))} | functions
 
 
 # What nobody means.

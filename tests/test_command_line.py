@@ -1,6 +1,8 @@
 """The command line: what it writes and prints, and one clear line where the input is bad."""
 
 import argparse
+import json
+import logging
 import os
 import re
 import subprocess
@@ -14,6 +16,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, pulse_of
+from jaxrock.command_line.output import Entry, heard
 from jaxrock.motions.pulses import PULSES
 
 STEPS = np.arange(60)
@@ -398,6 +401,61 @@ def test_bad_words(capsys, words, error):
     assert re.match(r"jaxrock( run| map)?: error: ", last) and error in last
 
 
+def test_programs_read_what_people_do(capsys, command, at2, tmp_path):
+    """One object on the standard output, with the numbers of the table; what is no number is null."""
+    for scale in ("1", "8"):
+        _, table, _ = command("run", at2, *GIVEN, "--scale", scale)
+        assert main(["run", at2, *GIVEN, "--scale", scale, "--json", "--out", str(tmp_path / "out")]) == 0
+        told = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+        found = told["results"]
+        assert (told["command"], told["version"], told["title"], told["exit_status"]) == (
+            "run",
+            rk.__version__,
+            "motion",
+            0,
+        )
+        assert {Path(path).name for path in told["files"]} == {"history.csv", "impacts.csv", "history.png", "phase.png"}
+        assert found["overturned"] == (table["verdict"] == "OVERTURNS") == (found["peak_rotation"] is None)
+        assert f"{found['margin']:+.4f}" == table["margin (0: boundary)"]
+        assert f"{found['p']:.4f}" == table["frequency parameter p"] and told["units"]["p"] == "rad/s"
+
+
+def test_what_failed_is_told_to_programs(capsys, at2, tmp_path):
+    words = ["run", at2, "--restitution", "1", "--duration", "1e6", "--json", "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["exit_status"] == 1 and re.match("these are not results: The step budget", told["failures"][0])
+
+
+def test_quiet(capsys, at2, tmp_path):
+    """Only what went wrong is said."""
+    out = ["--quiet", "--out", str(tmp_path / "out")]
+    assert main(["run", at2, *GIVEN, *out]) == 0
+    assert capsys.readouterr() == ("", "") and is_figure(tmp_path / "out" / "history.png")
+    assert main(["run", at2, "--restitution", "1", "--duration", "1e6", *out]) == 1
+    assert capsys.readouterr().err.startswith("jaxrock: these are not results: ")
+
+
+def test_the_package_is_heard_once_and_only_within_a_command(capsys):
+    logger = logging.getLogger("jaxrock")
+    for quiet, verbose, heard_there in [(False, False, "ab"), (True, False, "a"), (False, True, "abc")]:
+        with heard(quiet, verbose):
+            for _ in range(2):
+                logger.warning("a")
+                logger.info("b")
+                logger.debug("c")
+        assert capsys.readouterr().err == "".join(f"jaxrock: {word}\n" for word in heard_there)
+    logger.warning("d")
+    assert "jaxrock: " not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "value, form, text", [(-0.0, "+.4f", "+0.0000"), (-4e-5, ".3f", "0.000"), (-0.0, "g", "0"), (-0.1, ".1f", "-0.1")]
+)
+def test_zero_has_no_sign(value, form, text):
+    assert Entry("key", "label", value, form).text == text
+
+
 def test_version(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["--version"])
@@ -420,7 +478,10 @@ def test_compiled_programs_are_kept(tmp_path):
             [sys.executable, "-m", "jaxrock", *words], env=environment, capture_output=True, text=True, timeout=300
         )
         assert done.returncode == 0, done.stderr
+        said.append(done.stderr)
         return done.stdout
+
+    said = []
 
     def kept():
         files = (path for path in (tmp_path / "kept").rglob("*") if path.is_file())
@@ -429,6 +490,7 @@ def test_compiled_programs_are_kept(tmp_path):
     call("map", "--points", "4", "--pixels", "--out", str(tmp_path / "first"))
     first = kept()
     call("map", "--points", "4", "--pixels", "--out", str(tmp_path / "second"))
+    assert said == ["jaxrock: compiling, once for this machine\n", ""]
     # What XLA compiles is kept if that takes long enough: now and then one more.
     assert first and first <= kept()
     assert {name for name in kept() - first if not name.endswith("-cache")} == set()

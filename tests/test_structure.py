@@ -1,6 +1,7 @@
 """The shape of the package: imports go downward, files and functions stay short, importing has no side effects."""
 
 import ast
+import operator
 import os
 import re
 import subprocess
@@ -213,23 +214,30 @@ def test_restitution_is_not_called_eta():
     assert not found
 
 
+SPACES = ("blocks", "hazard", "inverse", "models", "motions", "responses", "studies")
+
+
 def exports() -> dict[str, tuple[str, str]]:
-    """Public names of the package: the module that each comes from, and its name there."""
+    """Public names of the package and its namespaces: the module that each comes from, and its name there."""
     return {
-        alias.asname or alias.name: (node.module.removeprefix("jaxrock."), alias.name)
-        for node in TREES["__init__"].body
-        if isinstance(node, ast.ImportFrom) and node.module.startswith("jaxrock.") and node.names[0].name != "*"
+        (f"{space}." if space in SPACES else "") + (alias.asname or alias.name): (
+            node.module.removeprefix("jaxrock").removeprefix("."), alias.name
+        )
+        for space in ("__init__", *SPACES)
+        for node in TREES[space].body
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("jaxrock") and node.names[0].name != "*"
         for alias in node.names
-    }
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", exports())
 def test_what_is_public_has_a_docstring(name):
     # In the source: at run time a dataclass without a docstring has one made of its arguments.
-    assert getattr(jaxrock, name) is not None
+    assert operator.attrgetter(name)(jaxrock) is not None or name[0] == "_"
     module, origin = exports()[name]
-    if module + "." + origin in TREES:  # a module
-        assert ast.get_docstring(TREES[module + "." + origin])
+    home = f"{module}.{origin}".removeprefix(".")
+    if home in TREES:  # a module
+        assert ast.get_docstring(TREES[home])
         return
     definitions = [
         node for node in TREES[module].body if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == origin
@@ -239,7 +247,33 @@ def test_what_is_public_has_a_docstring(name):
 
 
 def test_the_public_names_are_found():
-    assert {"Block", "Record", "outcome", "simulate", "overturning_map", "Status"} <= set(exports())
+    assert {"Block", "Record", "outcome", "simulate", "hazard.HazardCurve", "studies.Critical"} <= set(exports())
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_a_namespace_offers_no_module_and_another_thing_by_one_name(space):
+    """The one would hide the other."""
+    own = {name.split(".")[1] for name in exports() if name.startswith(f"{space}.")}
+    modules = {name.split(".")[1] for name in TREES if name.startswith(f"{space}.")}
+    assert own & modules <= {"restitution", "intensity"}
+
+
+@pytest.mark.parametrize(
+    "name", ["Observations", "HazardCurve", "Suite", "Outcome", "critical_durations", "peak_velocity"]
+)
+def test_old_names_say_where_they_are(name):
+    with pytest.warns(DeprecationWarning, match=rf"^`jaxrock.{name}` is `jaxrock.[a-z]+.{name}` now; ") as told:
+        old = getattr(jaxrock, name)
+    place = str(told[0].message).split("`")[3].removeprefix("jaxrock.")
+    assert old is operator.attrgetter(place)(jaxrock) and told[0].filename == __file__
+
+
+def test_importing_takes_little():
+    """SciPy's optimisers, filters and the rest come with what needs them."""
+    assert (
+        fresh("import sys, jaxrock; print([name for name in ('scipy', 'optax', 'diffrax') if name in sys.modules])")
+        == "[]"
+    )
 
 
 ROOT = PACKAGE.parent

@@ -27,7 +27,8 @@ def made(kind, **fields):
 TABLES = {
     "spectrum": made(
         rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0),
-        max_velocity=jnp.ones(3), impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3), status=STATUS, intensity=None,
+        max_velocity=jnp.ones(3), impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool),
+        margin=jnp.ones(3), status=STATUS, intensity=None,
         parameters={},
     ),
     "self-similar spectrum": made(

@@ -2,3 +2,10 @@
 
 Imports `numerics`. Start with `rigid`; another law of restitution is a class like those in `restitution`.
 """
+
+from jaxrock.blocks import restitution as restitution
+from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
+from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
+from jaxrock.blocks.mesh import Rock as Rock
+from jaxrock.blocks.random import draw_blocks as draw_blocks
+from jaxrock.blocks.rigid import Block as Block

@@ -4,6 +4,7 @@ import argparse
 import shutil
 
 from jaxrock.command_line.command import Command
+from jaxrock.command_line.output import Report
 from jaxrock.keeping.folder import OF_JAX, folder, kept
 
 
@@ -11,18 +12,18 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clear", action="store_true", help="delete them")
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     place = folder()
     if place is None:
-        print("nothing is kept: JAXROCK_CACHE is off")
-        return 0
+        report.results |= {"folder": None, "programs": 0, "mebibytes": 0.0}
+        return report.say("nothing is kept: JAXROCK_CACHE is off")
     files = [file for file in kept() if file.exists()]
     size = sum(file.stat().st_size for file in files) / 2**20
     programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
     if arguments.clear:
         shutil.rmtree(place, ignore_errors=True)
-    print(f"{programs} compiled programs, {size:.1f} MiB, {'deleted from' if arguments.clear else 'in'} {place}")
-    return 0
+    report.results |= {"folder": str(place), "programs": programs, "mebibytes": size, "deleted": arguments.clear}
+    report.say(f"{programs} compiled programs, {size:.1f} MiB, {'deleted from' if arguments.clear else 'in'} {place}")
 
 
 CACHE = Command("cache", "compiled programs that are kept between calls", _add_options, _run, computes=False)

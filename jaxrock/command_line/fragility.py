@@ -2,14 +2,13 @@
 
 import argparse
 import csv
-import sys
 
 import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_description, add_restitution, check_points, check_range, model_of, number
-from jaxrock.command_line.output import save, table, write_csv
+from jaxrock.command_line.output import Entry, Report, save, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +26,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_description(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     check_points(arguments.points, 3)
     check_range("--levels", arguments.levels)
     given = {"dt": arguments.dt, "unit": arguments.unit, "column": arguments.column}
@@ -38,54 +37,59 @@ def _run(arguments: argparse.Namespace) -> int:
     levels = np.geomspace(*arguments.levels, arguments.points)
     found = rk.hazard.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure)
     fits = {bound: found.fit(bound) for bound in ("lower", "upper")}
-    print(f"{len(suite)} records\n{table(_rows(found, fits))}")
+    report.title(f"{len(suite)} records")
+    report.table(_entries(found, fits))
     good = all(fit.status == rk.hazard.FitStatus.successful for fit in fits.values())
     if not good:
         worse = next(fit for fit in fits.values() if fit.status != rk.hazard.FitStatus.successful)
-        print(f"jaxrock: no lognormal fit: {rk.hazard.FitStatus[worse.status]}", file=sys.stderr)
-    _write(arguments, found, fits["upper"].fragility if good else None)
-    return 0 if good else 1
+        report.failed(f"no lognormal fit: {rk.hazard.FitStatus[worse.status]}")
+    _write(report, arguments, found, fits["upper"].fragility if good else None)
 
 
-def _rows(found: rk.hazard.SimulatedFragility, fits: dict) -> list[tuple[str, str, str]]:
-    """Lines of the table that is printed."""
+def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
+    """Lines of the table."""
     unit = {"PGA": "g", "PGV": "m/s"}[found.measure]
-    rows = [
-        ("scenes", f"{found.verdict.size}", ""),
-        ("of these undecided", f"{found.undecided}", ""),
-        ("blocks that stand again at a higher level", f"{int(np.sum(~found.monotone))}", ""),
+    again = int(np.sum(~found.monotone))
+    entries = [
+        Entry("scenes", "scenes", found.verdict.size),
+        Entry("undecided", "of these undecided", found.undecided),
+        Entry("stand_again", "blocks that stand again at a higher level", again),
     ]
     for bound, fit in fits.items():
         if bound == "upper" and not found.undecided:
             continue
         errors = np.sqrt(np.diag(np.asarray(fit.covariance)))
-        words = "" if not found.undecided else f", {bound} bound"
-        rows += [
-            (f"median {found.measure}{words}", f"{float(fit.fragility.median):.4f}", unit),
-            (f"dispersion{words}", f"{float(fit.fragility.dispersion):.4f}", ""),
-            (f"standard errors of their logarithms{words}", f"{errors[0]:.3f}, {errors[1]:.3f}", ""),
+        words, key = ("", "") if not found.undecided else (f", {bound} bound", f"_{bound}")
+        said = "standard errors of their logarithms"
+        entries += [
+            Entry(f"median{key}", f"median {found.measure}{words}", float(fit.fragility.median), ".4f", unit),
+            Entry(f"dispersion{key}", f"dispersion{words}", float(fit.fragility.dispersion), ".4f"),
+            Entry(f"standard_errors{key}", f"{said}{words}", errors, shown=f"{errors[0]:.3f}, {errors[1]:.3f}"),
         ]
-    return rows
+    return entries
 
 
 def _write(
-    arguments: argparse.Namespace, found: rk.hazard.SimulatedFragility, fit: rk.hazard.LogNormalFragility | None
+    report: Report,
+    arguments: argparse.Namespace,
+    found: rk.hazard.SimulatedFragility,
+    fit: rk.hazard.LogNormalFragility | None,
 ) -> None:
     """Tables, the figure, and NRML where there is a fit."""
     folder = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "fragility.csv", f"{found.measure},lower,upper", found.levels, found.lower, found.upper)
-    print(f"wrote {folder / 'fragility.csv'}")
+    header = f"{found.measure},lower,upper"
+    write_csv(report, folder / "fragility.csv", header, found.levels, found.lower, found.upper)
     columns = found.table()
     with (folder / "stripes.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
-    print(f"wrote {folder / 'stripes.csv'}")
+    report.wrote(folder / "stripes.csv")
     if fit is not None:
         rk.hazard.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
-        print(f"wrote {folder / 'fragility.xml'}")
-    save(rk.plot.fragility(found, fit).figure, folder / "fragility.png")
+        report.wrote(folder / "fragility.xml")
+    save(report, rk.plot.fragility(found, fit).figure, folder / "fragility.png")
 
 
 FRAGILITY = Command("fragility", "how probable it is that a block topples under scaled records", _add_options, _run)

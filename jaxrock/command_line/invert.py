@@ -1,7 +1,6 @@
 """The command `jaxrock invert`: from a table of rocks to the pulse that they allow, with figures and tables."""
 
 import argparse
-import sys
 from inspect import Parameter
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import check_points, extent_of, model_of, number, other_parameters
+from jaxrock.command_line.output import Report, plain
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
@@ -77,7 +77,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", type=int, default=48, help="points along each axis of the map (default 48)")
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     observations, model = rk.inverse.read_observations(arguments.rocks), model_of(arguments)
     check_points(arguments.points, 2)
     pulse, scatter, lapse = PULSES[arguments.pulse], arguments.scatter, arguments.lapse
@@ -99,8 +99,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if bool(jnp.any(observations.seen != TOPPLED)):
         wall = rk.inverse.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
     files = _write(arguments.out, observations, estimate, region, wall)
-    print(_text(observations, estimate, ", with the priors" if priors else ""))
-    return _reported(estimate.status, files)
+    report.say(_text(observations, estimate, ", with the priors" if priors else ""))
+    report.results |= _results(observations, estimate)
+    _report_rest(report, estimate.status, files)
 
 
 def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.inverse.Unknown]:
@@ -117,17 +118,15 @@ def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.inver
     return unknowns
 
 
-def _reported(status: rk.inverse.EstimateStatus, files: list[Path]) -> int:
-    """Print what became of an estimate, and the files; the exit status is 1 where there is no result."""
+def _report_rest(report: Report, status: rk.inverse.EstimateStatus, files: list[Path]) -> None:
+    """Tell what became of an estimate, and the files; without a result it has failed."""
     kinds = rk.inverse.EstimateStatus
     if status != kinds.successful:
-        print(kinds[status])
+        report.say(kinds[status])
     for path in files:
-        print(f"wrote {path}")
-    if not any(bool(status == kind) for kind in (kinds.contradictory, kinds.not_converged, kinds.not_computed)):
-        return 0
-    print(f"jaxrock: {kinds[status]}", file=sys.stderr)
-    return 1
+        report.wrote(path)
+    if any(bool(status == kind) for kind in (kinds.contradictory, kinds.not_converged, kinds.not_computed)):
+        report.failed(kinds[status])
 
 
 def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]]:
@@ -209,6 +208,24 @@ def _text(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate, 
         lines.append(f"  {name:<10} {float(value):10.4g} {UNITS.get(name, ''):<2}  95 %: {ends}")
     lines.append(f"  log-likelihood {float(estimate.log_likelihood):.3f}{more}, scatter {float(estimate.scatter):g}")
     return "\n".join([*lines, *estimate.remarks])
+
+
+def _results(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate) -> dict:
+    """The same for programs."""
+    seen = np.asarray(observations.seen)
+    rows = zip(estimate.names, estimate.values, estimate.interval, estimate.open)
+    parameters = {
+        name: {"value": value, "unit": UNITS.get(name, ""), "interval_95": interval, "open": open_}
+        for name, value, interval, open_ in rows
+    }
+    return plain({
+        "rocks": {word: int(np.sum(seen == k)) for k, word in enumerate(SEEN)},
+        "parameters": parameters,
+        "log_likelihood": estimate.log_likelihood,
+        "scatter": estimate.scatter,
+        "status": rk.inverse.EstimateStatus[estimate.status],
+        "remarks": estimate.remarks,
+    })  # fmt: skip
 
 
 INVERT = Command(

@@ -12,6 +12,7 @@ from jaxrock.command_line.cache import CACHE
 from jaxrock.command_line.fragility import FRAGILITY
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
+from jaxrock.command_line.output import Report, heard
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
 from jaxrock.keeping.compiled import keep_compiled
@@ -30,6 +31,8 @@ _EPILOG = """examples:
   jaxrock fragility motions/*.AT2 --width 0.5     how probable it is that a block topples
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
+
+exit status: 0 good, 1 something was not computed, 2 bad input
 """
 
 
@@ -41,6 +44,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():
         sub = commands.add_parser(command.name, help=command.purpose, description=command.purpose, **shared)
+        sub.add_argument("--json", action="store_true", help="print one JSON object, for programs")
+        sub.add_argument("-q", "--quiet", action="store_true", help="print nothing but what went wrong")
+        sub.add_argument("-v", "--verbose", action="store_true", help="also say what the package does")
         if command.computes:
             sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
             sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
@@ -59,8 +65,20 @@ def main(words: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(words)
     command = _COMMANDS[arguments.command]
-    if not command.computes:
-        return command.run(arguments)
+    report = Report(command.name, arguments.json, arguments.quiet)
+    with heard(arguments.quiet, arguments.verbose):
+        try:
+            if command.computes:
+                _prepare(arguments)
+            command.run(arguments, report)
+        except (ValueError, OSError) as error:
+            print(f"jaxrock: error: {error}", file=sys.stderr)
+            return 2
+        return report.finished()
+
+
+def _prepare(arguments: argparse.Namespace) -> None:
+    """What commands that compute need."""
     keep_compiled()
     jax.config.update("jax_enable_x64", True)
     import matplotlib
@@ -68,10 +86,5 @@ def main(words: list[str] | None = None) -> int:
     matplotlib.use("Agg")
     with contextlib.suppress(RuntimeError):  # called by a program that computes already
         use_cpu_devices()
-    try:
-        if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
-            raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
-        return command.run(arguments)
-    except (ValueError, OSError) as error:
-        print(f"jaxrock: error: {error}", file=sys.stderr)
-        return 2
+    if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
+        raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")

@@ -15,7 +15,7 @@ from jaxrock.command_line.options import (
     number,
     pulse_of,
 )
-from jaxrock.command_line.output import save, status_of_surface, table, write_csv
+from jaxrock.command_line.output import Entry, Report, check_surface, save, write_csv
 
 # Across and up, and whether they are those of single lobes; the range that is drawn, and what it is.
 _AXES = {
@@ -37,7 +37,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_pulse(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     check_points(arguments.points, 2)
     by_duration, axes = _axes(arguments)
     result = rk.overturning_map(
@@ -49,16 +49,16 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     state = np.asarray(result.state)
     names = {0: "safe", 1: "overturned without impact", 2: "overturned after impacts", -1: "not computed"}
-    print(table([(name, f"{int((state == key).sum())}", "scenes") for key, name in names.items()]))
+    counts = {name: int((state == key).sum()) for key, name in names.items()}
+    report.table([Entry(name.replace(" ", "_"), name, count, unit="scenes") for name, count in counts.items()])
     arguments.out.mkdir(parents=True, exist_ok=True)
     columns, rows = np.meshgrid(*axes.values())
-    write_csv(arguments.out / "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
+    write_csv(report, arguments.out / "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
               *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
               )  # fmt: skip
-    print(f"wrote {arguments.out / 'map.csv'}")
     exact = False if arguments.pixels else None
-    save(rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure, arguments.out / "map.png")
-    return status_of_surface(result.status)
+    save(report, rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure, arguments.out / "map.png")
+    check_surface(report, result.status)
 
 
 def _axes(arguments: argparse.Namespace) -> tuple[bool, dict[str, np.ndarray]]:

@@ -1,7 +1,6 @@
 """The command `jaxrock run`: one block under a record, with its history, impacts and figures."""
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_record, add_restitution, model_of, number, record_of
-from jaxrock.command_line.output import save, table, write_csv
+from jaxrock.command_line.output import Entry, Report, save, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -25,60 +24,59 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_record(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     record, model = record_of(arguments), model_of(arguments)
     block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
     response = rk.simulate(block, record, model, duration=arguments.duration)
     result = rk.outcome(block, record, model)
-    size = ("block, width x height", f"{arguments.width:g} x {arguments.height:g}", "m")
-    print(f"{record.name or 'unnamed record'}\n{table(_rows(size, block, record, model, result))}")
-    _write(arguments.out, response)
+    report.title(record.name or "unnamed record")
+    size = Entry("width_and_height", "block, width x height", (arguments.width, arguments.height), unit="m",
+                 shown=f"{arguments.width:g} x {arguments.height:g}")  # fmt: skip
+    report.table(_entries(size, block, record, model, result))
+    _write(report, arguments.out, response)
     if arguments.animate:
         path = arguments.out / f"animation.{arguments.animate}"
         rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
-        print(f"wrote {path}")
-    good = (result.status == rk.Status.successful) & (response.status == rk.Status.successful)
-    if not good:
-        worse = response.status if response.status != rk.Status.successful else result.status
-        print(f"jaxrock: these are not results: {rk.Status[worse]}", file=sys.stderr)
-    return 0 if good else 1
+        report.wrote(path)
+    for status in (response.status, result.status):
+        if status != rk.Status.successful:
+            return report.failed(f"these are not results: {rk.Status[status]}")
 
 
-def _rows(size: tuple[str, str, str], block: rk.Block, record: rk.Record, model, result: rk.responses.Outcome) -> list:
-    """Lines of the table that is printed."""
+def _entries(size: Entry, block: rk.Block, record: rk.Record, model, result: rk.responses.Outcome) -> list[Entry]:
+    """Lines of the table."""
     alpha, lost = float(block.alpha), bool(result.overturned)
-    peak = float(np.max(np.abs(record.samples)))
+    ratio, instead = float(result.max_rotation) / alpha, "overturned" if lost else None
 
-    def unless_lost(value: str, unit: str, otherwise: str = "overturned") -> tuple[str, str]:
-        return (otherwise, "") if lost else (value, unit)
+    def unless_lost(x) -> float | None:
+        return None if lost else float(x)
 
     return [
-        ("peak ground acceleration", f"{peak:.4f}", "g"),
+        Entry("peak_ground_acceleration", "peak ground acceleration", float(np.abs(record.samples).max()), ".4f", "g"),
         size,
-        ("slenderness alpha", f"{alpha:.4f}", "rad"),
-        ("frequency parameter p", f"{float(block.p):.4f}", "rad/s"),
-        ("restitution", f"{float(block.restitution):.4f}", ""),
-        ("uplift threshold", f"{float(model.moments(block).threshold):.4f}", "g"),
-        ("impacts", f"{int(result.impact_count)}", ""),
-        ("peak rotation", *unless_lost(f"{float(result.max_rotation):.6f}", "rad")),
-        ("peak rotation / alpha", *unless_lost(f"{float(result.max_rotation) / alpha:.6f}", "")),
-        ("at time", *unless_lost(f"{float(result.time_of_max):.4f}", "s", otherwise="-")),
-        ("peak angular velocity", *unless_lost(f"{float(result.max_velocity):.6f}", "rad/s")),
-        ("margin (0: boundary)", f"{float(result.margin):+.4f}", ""),
-        ("verdict", "OVERTURNS" if lost else "stands", ""),
+        Entry("alpha", "slenderness alpha", alpha, ".4f", "rad"),
+        Entry("p", "frequency parameter p", float(block.p), ".4f", "rad/s"),
+        Entry("restitution", "restitution", float(block.restitution), ".4f"),
+        Entry("uplift_threshold", "uplift threshold", float(model.moments(block).threshold), ".4f", "g"),
+        Entry("impacts", "impacts", int(result.impact_count)),
+        Entry("peak_rotation", "peak rotation", unless_lost(result.max_rotation), ".6f", "rad", instead),
+        Entry("peak_rotation_over_alpha", "peak rotation / alpha", unless_lost(ratio), ".6f", shown=instead),
+        Entry("time_of_peak", "at time", unless_lost(result.time_of_max), ".4f", "s", "-" if lost else None),
+        Entry("peak_velocity", "peak angular velocity", unless_lost(result.max_velocity), ".6f", "rad/s", instead),
+        Entry("margin", "margin (0: boundary)", float(result.margin), "+.4f"),
+        Entry("overturned", "verdict", lost, shown="OVERTURNS" if lost else "stands"),
     ]
 
 
-def _write(folder: Path, response: rk.responses.Response) -> None:
+def _write(report: Report, folder: Path, response: rk.responses.Response) -> None:
     """Files and figures of the response."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
+    write_csv(report, folder / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
-    write_csv(folder / "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
+    write_csv(report, folder / "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
               response.impact_velocities)  # fmt: skip
-    print(f"wrote {folder / 'history.csv'}\nwrote {folder / 'impacts.csv'}")
-    save(rk.plot.history(response)[0].figure, folder / "history.png")
-    save(rk.plot.phase(response).figure, folder / "phase.png")
+    save(report, rk.plot.history(response)[0].figure, folder / "history.png")
+    save(report, rk.plot.phase(response).figure, folder / "phase.png")
 
 
 RUN = Command("run", "simulate one block under a record", _add_options, _run)

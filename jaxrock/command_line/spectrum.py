@@ -15,7 +15,7 @@ from jaxrock.command_line.options import (
     number,
     record_of,
 )
-from jaxrock.command_line.output import save, status_of_surface, table, write_csv
+from jaxrock.command_line.output import Entry, Report, check_surface, save, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_record(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, report: Report) -> None:
     check_points(arguments.points, 1)
     if not arguments.slenderness > 0:
         raise ValueError(f"Argument `--slenderness` must be positive, but is {arguments.slenderness}.")
@@ -37,22 +37,22 @@ def _run(arguments: argparse.Namespace) -> int:
     alpha = np.arctan(1 / arguments.slenderness)
     result = rk.rocking_spectrum(alpha, record, period, arguments.restitution, model_of(arguments))
     lost = np.asarray(result.overturned)
-    longest = (f"{period[lost].max():.3f}", "s") if lost.any() else ("none", "")
-    rows = [
-        ("slenderness, height/width", f"{arguments.slenderness:g}", ""),
-        ("block sizes", f"{period.size}", ""),
-        ("of these overturn", f"{int(lost.sum())}", ""),
-        ("longest 2 pi/p that overturns", *longest),
-        ("not computed", f"{int(np.sum(~np.asarray(result.status == rk.Status.successful)))}", ""),
-    ]
-    print(f"{record.name or 'unnamed record'}\n{table(rows)}")
+    longest, instead = (period[lost].max(), None) if lost.any() else (None, "none")
+    failed = int(np.sum(~np.asarray(result.status == rk.Status.successful)))
+    report.title(record.name or "unnamed record")
+    report.table([
+        Entry("slenderness", "slenderness, height/width", arguments.slenderness, "g"),
+        Entry("block_sizes", "block sizes", period.size),
+        Entry("overturned", "of these overturn", int(lost.sum())),
+        Entry("longest_overturned", "longest 2 pi/p that overturns", longest, ".3f", "s", instead),
+        Entry("not_computed", "not computed", failed),
+    ])  # fmt: skip
     arguments.out.mkdir(parents=True, exist_ok=True)
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
-    write_csv(arguments.out / "spectrum.csv", header, period, result.max_rotation, result.max_velocity,
+    write_csv(report, arguments.out / "spectrum.csv", header, period, result.max_rotation, result.max_velocity,
               result.impact_count, lost, result.margin)  # fmt: skip
-    print(f"wrote {arguments.out / 'spectrum.csv'}")
-    save(rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
-    return status_of_surface(result.status)
+    save(report, rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
+    check_surface(report, result.status)
 
 
 SPECTRUM = Command("spectrum", "rocking spectrum of a record: peak response against block size", _add_options, _run)

@@ -47,7 +47,7 @@ class FlexibleResponse(eqx.Module):
 
         **Arguments:**
 
-        - `time`: any shape, in [0, duration] [s].
+        - `time`: any shape, between 0 and duration [s].
 
         **Returns:** three arrays of the shape of `time`. A block that has fallen lies still.
 
@@ -60,7 +60,7 @@ class FlexibleResponse(eqx.Module):
 
         **Arguments:**
 
-        - `time`: any shape, in [0, duration] [s].
+        - `time`: any shape, between 0 and duration [s].
 
         **Returns:** an array of one axis more than `time`, of length `masses`.
 

@@ -39,7 +39,7 @@ from jaxrock.hazard.fragility import (
     probit_line,
     rising_list,
 )
-from jaxrock.hazard.simulated_fragility import SimulatedFragility, counts
+from jaxrock.hazard.simulation import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity

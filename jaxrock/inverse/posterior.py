@@ -20,9 +20,9 @@ from jaxrock._checks import inner_share, scalar
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.densities import LogDensity
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
 from jaxrock.inverse.likelihood import Likelihood
-from jaxrock.inverse.log_density import LogDensity
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.samplers import rounds_of
 from jaxrock.inverse.scatter import NODES

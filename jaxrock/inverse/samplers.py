@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._checks import shown
-from jaxrock.inverse.log_density import LogDensity
+from jaxrock.inverse.densities import LogDensity
 
 _ROUND = 250  # steps after which it is asked whether they are enough
 _WARM_UP = 2  # rounds that are not kept; a kernel of NumPyro adapts in them

@@ -2,3 +2,15 @@
 
 Imports `blocks` and `numerics`. Start with `equation`, what every model must tell, then `rigid`.
 """
+
+from jaxrock.models.coefficients import (
+    Coefficients as Coefficients,
+    Terms as Terms,
+)
+from jaxrock.models.equation import AbstractEquation as AbstractEquation
+from jaxrock.models.rigid import (
+    Housner as Housner,
+    Linear as Linear,
+)
+from jaxrock.models.spring import Spring as Spring
+from jaxrock.models.user_equation import Equation as Equation

@@ -3,3 +3,38 @@
 Imports `numerics` and `blocks`. Start with `motion`; another pulse is a file in `pulses`, another format
 one in `files`.
 """
+
+from jaxrock.motions import intensity as intensity
+from jaxrock.motions.components import (
+    Components as Components,
+    read_components as read_components,
+)
+from jaxrock.motions.files.example import example_record as example_record
+from jaxrock.motions.files.reading import read_record as read_record
+from jaxrock.motions.files.traces import record_of_trace as record_of_trace
+from jaxrock.motions.files.writing import (
+    write_at2 as write_at2,
+    write_csv as write_csv,
+)
+from jaxrock.motions.motion import (
+    AbstractMotion as AbstractMotion,
+    WithVertical as WithVertical,
+)
+from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)
+from jaxrock.motions.pulses.exponential import (
+    ExponentialPulse as ExponentialPulse,
+    RectangularPulse as RectangularPulse,
+    TriangularPulse as TriangularPulse,
+)
+from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgiouPulse as MavroeidisPapageorgiouPulse
+from jaxrock.motions.pulses.ricker import RickerPulse as RickerPulse
+from jaxrock.motions.pulses.sinusoidal import (
+    CosinePulse as CosinePulse,
+    HalfSinePulse as HalfSinePulse,
+    SinePulse as SinePulse,
+)
+from jaxrock.motions.record import (
+    Origin as Origin,
+    Record as Record,
+)
+from jaxrock.motions.suite import Suite as Suite

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxrock.hazard.fragility import LogNormalFragility
-from jaxrock.hazard.simulated_fragility import SimulatedFragility
+from jaxrock.hazard.simulation import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
 from jaxrock.plot.style import BLUE, RED, SAND, log_ticks
 

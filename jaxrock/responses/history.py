@@ -69,7 +69,7 @@ class Response(eqx.Module):
 
         **Arguments:**
 
-        - `time`: any shape, in [0, duration] [s].
+        - `time`: any shape, between 0 and duration [s].
 
         **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the
         steps themselves; at an impact the velocity after it. A block that has fallen lies still.

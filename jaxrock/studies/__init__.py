@@ -2,3 +2,27 @@
 
 Imports `responses` and `sweeps`. Start with `spectra`.
 """
+
+from jaxrock.studies.borders import (
+    Borders as Borders,
+    Region as Region,
+    overturning_borders as overturning_borders,
+)
+from jaxrock.studies.critical import (
+    Critical as Critical,
+    critical_amplitudes as critical_amplitudes,
+    critical_durations as critical_durations,
+)
+from jaxrock.studies.sensitivities import (
+    Sensitivity as Sensitivity,
+    SensitivityMap as SensitivityMap,
+    sensitivity as sensitivity,
+    sensitivity_map as sensitivity_map,
+)
+from jaxrock.studies.spectra import (
+    OverturningMap as OverturningMap,
+    Spectrum as Spectrum,
+    overturning_map as overturning_map,
+    rocking_spectrum as rocking_spectrum,
+    self_similar_spectrum as self_similar_spectrum,
+)

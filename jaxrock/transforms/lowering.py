@@ -50,6 +50,7 @@ def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
         codes = json.loads(told)
         if all(map(lanes.found, codes)):
             return jax.export.deserialize(bytearray(program)).call, codes
+    _LOG.info("compiling, once for this machine")
     try:
         exported, codes = _exported(lanes, shapes)
         folder.write("lowered", name, json.dumps(codes).encode() + b"\n" + exported.serialize())
