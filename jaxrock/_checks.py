@@ -18,9 +18,14 @@ from jaxrock._guard import guarded
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
 
+def is_traced(tree: Any) -> bool:
+    """Whether any array in it is traced: within `jax.jit`, `jax.vmap` or a derivative."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as a floating-point array, or say what it is instead; what is known stays so within `jax.jit`."""
-    if any(isinstance(part, jax.core.Tracer) for part in jax.tree.leaves(value)):
+    if is_traced(value):
         return _as_real(name, value)
     with jax.ensure_compile_time_eval():
         return _as_real(name, value)

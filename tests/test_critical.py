@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -93,6 +94,95 @@ def test_a_motion_too_weak_has_no_ends():
     )
 
 
-def test_a_search_cannot_be_traced():
-    with pytest.raises(TypeError, match="give all scenes in one call, and take `derivative`"):
+def least(numbers):
+    """The three lowest ends of a block under a sine, by slenderness, frequency parameter, restitution and period."""
+    alpha, p, restitution, period = numbers
+    pulse = rk.SinePulse(1.0, period)
+    return rk.critical_amplitudes(rk.Block(alpha, p, restitution), pulse, intensity=(1.001, 12.0), max_ends=3)
+
+
+def test_lowest_ends_within_transformations():
+    """jit, vmap and reverse mode: ends and their derivatives in 40 digits, and nothing where there are fewer."""
+    scenes = [scene for scene in SCENES if scene["kind"] == "sine"]
+    numbers = np.array([[*scene["block"], scene["length"]] for scene in scenes])
+
+    def told(numbers):
+        found = least(numbers)
+        return found.value, found
+
+    slopes, found = jax.jit(jax.vmap(jax.jacrev(told, has_aux=True)))(numbers)
+    assert np.all(found.complete) and found.derivative.shape == (len(scenes), 3, 4)
+    fewer, derivatives = 0, 0
+    for k, scene in enumerate(scenes):
+        ends = scene["ends"][:3]
+        count, fewer = len(ends), fewer + (len(ends) < 3)
+        assert found.count[k] == count
+        np.testing.assert_allclose(found.value[k, :count], [float(end["amplitude"]) for end in ends], rtol=1e-12)
+        assert found.impacts[k, :count].tolist() == [end["impacts"] for end in ends]
+        assert np.all(np.isinf(found.value[k, count:])) and not np.any(slopes[k, count:])
+        for row, end in zip(slopes[k], ends):
+            if "gradient" in end:
+                exact = np.array([float(c) for c in end["gradient"]])
+                np.testing.assert_allclose(row, exact, rtol=1e-8, atol=1e-9 * np.abs(exact).max())
+                derivatives += 1
+    assert fewer >= 1 and derivatives >= 2
+
+
+def test_traced_arguments_need_a_number_of_ends():
+    with pytest.raises(ValueError, match="Argument `max_ends` must be given where arguments are traced"):
         jax.jit(lambda alpha: rk.critical_amplitudes(rk.Block(alpha, 2.0), rk.SinePulse(0.3, 0.8)).value)(0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_lowest_ends_are_those_of_all(known):
+    """Of known and of traced arguments, with the same derivatives; of one block, of many, and of durations."""
+    block, pulse = rk.Block(0.1, 2.0, 0.9), rk.SinePulse(0.3, np.array([1.5, 2.5]))
+    cases = [
+        (rk.critical_amplitudes, rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.8), rk.Housner()),
+        (rk.studies.critical_durations, block, pulse, rk.Linear()),
+    ]
+    for function, block, motion, model in cases:
+        every = function(block, motion, model, progress=False)
+
+        def lowest(p, function=function, motion=motion, model=model, block=block):
+            scene = rk.Block(block.alpha, p, block.restitution), motion
+            return function(*scene, model, max_ends=2, derivatives=True, progress=False)
+
+        found = lowest(2.0) if known else jax.jit(lowest)(2.0)
+        for name in ("value", "intensity", "rising", "impacts", "balanced", "derivative"):
+            part = np.asarray(getattr(every, name))
+            part = part[:2] if np.ndim(every.count) == 0 else part[:, :2]
+            np.testing.assert_allclose(getattr(found, name), part, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.slow
+def test_derivatives_of_lowest_ends_against_a_closed_form():
+    """Linear block without impact (Dimitrakopoulos & DeJong 3.10): forward mode, twice, and reverse over it."""
+
+    def third(ratio):
+        block, pulse = rk.Block(0.1, 1.0, 0.9), rk.SinePulse(1.0, 2 * jnp.pi / ratio)
+        return rk.critical_amplitudes(block, pulse, rk.Linear(), intensity=(1.001, 10.0), max_ends=3).intensity[2]
+
+    exact = rk.closed_form.sine_pulse.no_impact_limit
+    assert float(third(5.0)) == pytest.approx(float(exact(5.0)), rel=1e-12)
+    assert float(jax.jacfwd(third)(5.0)) == pytest.approx(float(jax.grad(exact)(5.0)), rel=1e-9)
+    second = float(jax.grad(jax.grad(exact))(5.0))
+    for derivative in (jax.jacfwd(jax.jacfwd(third)), jax.hessian(third)):
+        assert float(derivative(5.0)) == pytest.approx(second, rel=1e-7)
+
+
+@pytest.mark.slow
+def test_an_end_without_balance_has_no_derivatives():
+    """Under a record the verdict jumps: the amplitude is found, and its slope is not a number."""
+
+    def lowest(alpha):
+        found = rk.critical_amplitudes(rk.Block(alpha, 1.5), rk.example_record(), intensity=(1.001, 20.0), max_ends=1)
+        return found.value[0], found
+
+    (value, found), slope = jax.value_and_grad(lowest, has_aux=True)(0.25)
+    assert not found.balanced[0] and np.isnan(slope)
+    scene = rk.Block(0.25, 1.5), rk.example_record()
+    factor = float(value) / float(rk.intensity.peak_acceleration(scene[1]))
+    verdicts = [bool(rk.outcome(scene[0], x * factor * scene[1]).overturned) for x in (1 - 1e-12, 1 + 1e-12)]
+    assert verdicts == [False, True]

@@ -1,5 +1,7 @@
 """Drawings are to scale, at any rotation; films show the response and its verdict."""
 
+import importlib.util
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -167,6 +169,20 @@ def test_films_are_written(kind, response, tmp_path):
     rk.plot.save_animation(film, path, dpi=30)
     start = path.read_bytes()[:15]
     assert start.startswith(b"GIF89a") if kind == "gif" else start == b"<!DOCTYPE html>"
+
+
+@pytest.mark.filterwarnings("ignore:os.fork")
+def test_films_as_mp4(response, tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="brings the program ffmpeg")
+    rk.plot.save_animation(rk.plot.animate(response, fps=2, speed=3.0), tmp_path / "film.mp4", dpi=50)
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_mp4_without_ffmpeg_says_what_to_do(response, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(plt.rcParams, "animation.ffmpeg_path", "no such program")
+    with pytest.raises(ValueError, match="which is not there: install it, or `pip install"):
+        rk.plot.save_animation(started(rk.plot.animate(response, fps=2)), tmp_path / "film.mp4")
 
 
 def test_other_endings_are_refused(response, tmp_path):

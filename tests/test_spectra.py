@@ -214,6 +214,20 @@ def test_surfaces_go_through_transformations(name):
     assert float(slopes[0]) == pytest.approx(float(difference), rel=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRACED)
+def test_surfaces_go_through_forward_mode(name):
+    """The columns of forward mode are the rows of reverse mode."""
+
+    def finite(x):
+        values = TRACED[name](x)
+        return jnp.where(jnp.isfinite(values), values, 0.0)
+
+    forward, reverse = (jax.jit(derivative(finite))(0.2) for derivative in (jax.jacfwd, jax.jacrev))
+    assert np.any(forward != 0)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+
+
 def elasticity(amplitude):
     """Of the peak by the amplitude, and by everything."""
     found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7), rk.Linear()).max_rotation

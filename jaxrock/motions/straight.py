@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock._checks import is_traced
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scaled
@@ -48,7 +49,7 @@ def straight(motion: AbstractMotion) -> Straight:
     **Raises:** ValueError for many motions in one, or one that is traced.
     """
     check_single(motion=motion)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(motion)):
+    if is_traced(motion):
         raise ValueError("Argument `motion` must be known: its intensity is no function under `jax.jit` or `jax.vmap`.")
     if isinstance(motion, Record):
         samples = GRAVITY * np.asarray(motion.samples, float)

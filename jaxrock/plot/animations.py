@@ -1,6 +1,8 @@
 """Films of responses: the block on the moving ground, its history beside it, impacts and the verdict."""
 
 import html
+import importlib.util
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -157,8 +159,10 @@ def save_animation(film, path: Annotated[str | Path, path_of], *, dpi: Annotated
     - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4.
     - `dpi`: dots per inch.
 
-    **Raises:** ValueError for another ending; for MP4 where the program ffmpeg is not installed.
+    **Raises:** ValueError for another ending; for MP4 where the program ffmpeg is not there: that of the system, or of
+    `pip install "jaxrock[film]"`.
     """
+    import matplotlib
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     fps = 1000 / film.event_source.interval
@@ -170,8 +174,22 @@ def save_animation(film, path: Annotated[str | Path, path_of], *, dpi: Annotated
         title = html.escape(path.stem)
         path.write_text(f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}", encoding="utf-8")
     elif kind == ".mp4":
-        if not FFMpegWriter.isAvailable():
-            raise ValueError("Argument `path` must end with .gif or .html: for .mp4 the program ffmpeg is not there.")
-        film.save(path, writer=FFMpegWriter(fps=fps), dpi=dpi)
+        with matplotlib.rc_context({"animation.ffmpeg_path": _ffmpeg()}):
+            if not FFMpegWriter.isAvailable():
+                raise ValueError(
+                    "Argument `path` must end with .gif or .html, as .mp4 needs the program ffmpeg, which is not "
+                    'there: install it, or `pip install "jaxrock[film]"`.'
+                )
+            film.save(path, writer=FFMpegWriter(fps=fps), dpi=dpi)
     else:
         raise ValueError(f"Argument `path` must end with .gif, .html or .mp4, but is {str(path)!r}.")
+
+
+def _ffmpeg() -> str:
+    """The program that matplotlib is told to take, or one that a package brought, where that is not there."""
+    import matplotlib
+
+    usual = matplotlib.rcParams["animation.ffmpeg_path"]
+    if shutil.which(usual) is None and importlib.util.find_spec("imageio_ffmpeg") is not None:
+        return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    return usual

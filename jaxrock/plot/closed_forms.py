@@ -86,15 +86,18 @@ def sine_regions(restitution: float, axis=None, *, frequency_ratio=None):
     return axis
 
 
+_PIECE = 8  # points
+
+
 def _to_its_tips(curve: Callable, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A curve, also between the last place at which it is known and the one beyond where it ends."""
 
     def at(places: np.ndarray) -> np.ndarray:
-        # In pieces of one size: one program.
-        whole = np.resize(places, (-(-places.size // x.size), x.size))
+        # In pieces of one size: one program. A curve has a few ends, and all of it has been asked once.
+        whole = np.resize(places, (-(-places.size // _PIECE), _PIECE))
         return np.concatenate([np.asarray(curve(piece)) for piece in whole])[: places.size]
 
-    y = at(x)
+    y = np.asarray(curve(x))
     known = np.isfinite(y)
     ends = np.flatnonzero(known[1:] != known[:-1])
     inner = start = np.where(known[ends], x[ends], x[ends + 1])

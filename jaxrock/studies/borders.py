@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._arguments import arguments
+from jaxrock._checks import is_traced
 from jaxrock.status import Status
 from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.spectra import OverturningMap, under_pulse
@@ -73,9 +74,10 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
     **Raises:** ValueError for a map with further axes, of one column or one row, or that was not computed by
     `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
     """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(result)):
+    if is_traced(result):
         raise TypeError(
-            "Borders are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap)."
+            "Borders are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap): ask "
+            "`critical_amplitudes` for the lowest ends at every frequency."
         )
     ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     if result.parameters or result.scene is None or min(ratio.size, intensity.size) < 2 or ratio.ndim > 1:

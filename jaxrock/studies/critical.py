@@ -3,7 +3,8 @@
 Whether a block overturns is not monotonic: below the amplitude that overturns it without impact there are others
 that do so after one, three, five impacts, in ever narrower intervals, and safe gaps between them that may be narrower
 still. A bisection of the verdict finds one end of them by chance. Here the margin, its slope and the number of impacts
-at sampled points tell where something may hide between two of them, and only there the sampling is refined.
+at sampled points tell where something may hide between two of them, and only there the sampling is refined: for all
+ends by `ends`, and for so many of the lowest by `lowest_ends`, which stops there and may be traced.
 """
 
 from typing import Annotated
@@ -12,10 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxrock._arguments import arguments, pair
-from jaxrock._checks import ratio, scalar
+from jaxrock._arguments import arguments, at_least, pair
+from jaxrock._checks import is_traced, ratio, scalar, watched
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -24,12 +25,12 @@ from jaxrock.engines.scene import peak_bound, uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.current_model import current_model
-from jaxrock.responses.outcome import outcome
-from jaxrock.status import Status
 from jaxrock.studies.ends import brackets_of, roots_of
-from jaxrock.studies.parameters import named, rebuilt
+from jaxrock.studies.lowest_ends import lowest_ends
+from jaxrock.studies.parameters import named
+from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, on_border
 from jaxrock.sweeps.sweep import surface
 
 _FIRST = 256  # intervals of the first sampling
@@ -83,7 +84,8 @@ def critical_amplitudes(
     model: AbstractEquation = Housner(),
     *,
     intensity: Annotated[tuple[float, float], pair] = (1.0, 10.0),
-    derivatives: bool = True,
+    derivatives: bool | None = None,
+    max_ends: Annotated[int | None, at_least(1, 256)] = None,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
@@ -94,14 +96,17 @@ def critical_amplitudes(
     - `block`, `motion`: one scene, or many: parameters of shape (scenes,). The amplitude of the motion plays no part.
     - `model`, `engine`: as in `outcome`.
     - `intensity`: where to look: least and largest amplitude over the uplift threshold [-]. Below 1 nothing moves.
-    - `derivatives`: whether to find them; without, they are not numbers (NaN).
+    - `derivatives`: whether to find `derivative`; without, it is not a number (NaN). None: for known arguments; of
+      traced ones JAX takes derivatives of `value`, and of what is traced.
+    - `max_ends`: how many ends to look for, from the lowest on, 1 to 256; there are so many results then, filled up.
+      None: all there are, which takes much longer under records; traced arguments need a number.
     - `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
     themselves beside them may be missed; a safe gap between different numbers of impacts is not.
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
-    **Raises:** ValueError for arguments outside their ranges; TypeError within `jax.jit`, `jax.vmap` or a derivative,
-    as the number of ends is not known before: `derivative` has what these would give.
+    **Raises:** ValueError for arguments outside their ranges.
 
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
@@ -110,8 +115,8 @@ def critical_amplitudes(
     scenes = _Scenes.of(block, motion, model)
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
-    factors = grid * (scenes.threshold / scenes.peak)[:, None]
-    return _critical(scenes, np.log(factors), _Amplitude(model, engine), derivatives, progress)
+    grid = np.log(grid) + jnp.log(scenes.threshold / scenes.peak)[:, None]
+    return _critical(scenes, grid, Amplitude(model, engine), derivatives, max_ends, progress)
 
 
 @arguments
@@ -121,7 +126,8 @@ def critical_durations(
     model: AbstractEquation = Housner(),
     *,
     factor: Annotated[tuple[float, float], pair] = (0.05, 20.0),
-    derivatives: bool = True,
+    derivatives: bool | None = None,
+    max_ends: Annotated[int | None, at_least(1, 256)] = None,
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Critical:
@@ -129,12 +135,13 @@ def critical_durations(
 
     **Arguments:**
 
-    - `block`, `motion`, `model`, `derivatives`, `engine`, `progress`: as in `critical_amplitudes`.
+    - `block`, `motion`, `model`, `derivatives`, `max_ends`, `engine`, `progress`: as in `critical_amplitudes`.
     - `factor`: where to look: least and largest duration over that of `motion` [-], all times stretched alike.
 
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
+    With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
-    **Raises:** as `critical_amplitudes`.
+    **Raises:** ValueError for arguments outside their ranges.
     """
     low, high = _rising("factor", factor)
     if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
@@ -142,8 +149,8 @@ def critical_durations(
     model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
-    grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
-    return _critical(scenes, grid, _Duration(model, engine), derivatives, progress)
+    grid = jnp.broadcast_to(grid, (scenes.threshold.size, grid.size))
+    return _critical(scenes, grid, Duration(model, engine), derivatives, max_ends, progress)
 
 
 def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
@@ -156,158 +163,151 @@ def _rising(name: str, ends: tuple[float, float]) -> tuple[float, float]:
 class _Scenes(eqx.Module):
     """Many scenes: parameters of shape (scenes,), samples of a record as they are."""
 
-    block: Block | AsymmetricBlock
-    motion: AbstractMotion
-    threshold: np.ndarray  # [g], (scenes,)
-    peak: np.ndarray  # bound of the acceleration [g]
-    amplitude: np.ndarray  # as the motion names it [g]
+    both: PyTree  # block and motion
+    threshold: Float[Array, " scenes"]  # [g]
+    peak: Float[Array, " scenes"]  # bound of the acceleration [g]
+    amplitude: Float[Array, " scenes"]  # as the motion names it [g]
     single: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "_Scenes":
         """Broadcast all parameters against one another."""
         both = block, motion
-        if any(isinstance(leaf.value, jax.core.Tracer) for leaf in leaves_of(both)):
-            raise TypeError(
-                "Critical values are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap, "
-                "jax.grad): give all scenes in one call, and take `derivative`."
-            )
         shape = jnp.broadcast_shapes(*(jnp.shape(leaf.value) for leaf in leaves_of(both) if not leaf.is_shared))
         if len(shape) > 1:
             raise ValueError(
                 f"The parameters of `block` and `motion` must be numbers or lists, but have shape {shape}."
             )
         size = shape[0] if shape else 1
-        block, motion = broadcast(both, (size,))
+        both = broadcast(both, (size,))
 
         def facts(index):
-            block_, motion_ = one_of_many((block, motion), index)
-            return (
-                uplift_threshold(block_, model),
-                peak_bound(motion_),
-                jnp.abs(named(block_, motion_)["amplitude"]),
-            )
+            block, motion = one_of_many(both, index)
+            return uplift_threshold(block, model), peak_bound(motion), jnp.abs(named(block, motion)["amplitude"])
 
-        found = cls(block, motion, *map(np.asarray, jax.vmap(facts)(jnp.arange(size))), single=not shape)
-        if not (found.peak > _LEAST).all():
-            raise ValueError(f"Argument `motion` must move the ground, but its peak is {found.peak.min():g} g.")
-        return found
-
-
-# What is varied: z is the logarithm of a factor.
+        threshold, peak, amplitude = jax.vmap(facts)(jnp.arange(size))
+        message = "Argument `motion` must move the ground"
+        if is_traced(peak):
+            peak = watched(peak, message, ~(peak > _LEAST).all())
+        elif not (peak > _LEAST).all():
+            raise ValueError(f"{message}, but its peak is {peak.min():g} g.")
+        return cls(both, threshold, peak, amplitude, single=not shape)
 
 
-class _Kind(eqx.Module):
-    model: AbstractEquation
-    engine: AbstractEngine | None
-
-    def margin(self, z, block, motion):
-        """Margin and outcome of the scene with the factor e^z."""
-        result = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
-        return result.margin, result
-
-    def at(self, z, index, scenes):
-        """Margin, its slope, impacts and status of one point."""
-        place = one_of_many(scenes, index)
-        margin, slope, result = jax.jvp(lambda z: self.margin(z, *place), (z,), (jnp.ones_like(z),), has_aux=True)
-        decided = (result.status == Status.successful) | (result.status == Status.undecided)
-        return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
-
-    def slopes(self, z, index, scenes):
-        """Derivatives of the logarithm of the critical value by the parameters."""
-        block, motion = one_of_many(scenes, index)
-        values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
-
-        def margin(z, values):
-            place = rebuilt(block, motion, named(block, motion) | values)
-            return self.margin(z, *place)[0]
-
-        def unit(values):
-            return jnp.log(self.unit(*rebuilt(block, motion, named(block, motion) | values)))
-
-        by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
-        own = jax.jacfwd(unit)(values)
-        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
-        return {name: own[name] - slope / by_z for name, slope in by_values.items()}
-
-
-class _Amplitude(_Kind):
-    def scene(self, z, block, motion):
-        """A larger motion."""
-        return block, Scaled(motion, jnp.exp(z))
-
-    def unit(self, block, motion):
-        """What the factor multiplies: the amplitude [g]."""
-        return jnp.abs(named(block, motion)["amplitude"])
-
-    def keeps(self, name: str) -> bool:
-        """Whether the critical value depends on a parameter."""
-        return name != "amplitude"
-
-
-class _Duration(_Kind):
-    def scene(self, z, block, motion):
-        """A longer motion is a larger p: only their product counts."""
-        return eqx.tree_at(lambda b: b.p, block, block.p * jnp.exp(z)), motion
-
-    def unit(self, block, motion):
-        """What the factor multiplies: the duration of the motion [s]."""
-        return motion.end
-
-    def keeps(self, name: str) -> bool:
-        """Whether the critical value depends on a parameter."""
-        return name not in ("duration", "period", "dt")
+# Of many scenes: what is asked of one point.
 
 
 def _at(z, index, scene):
-    kind, scenes = scene
-    return kind.at(z, index, scenes)
+    kind, both = scene
+    return kind.at(z, *one_of_many(both, index))
 
 
 def _slopes(z, index, scene):
-    kind, scenes = scene
-    return kind.slopes(z, index, scenes)
+    kind, both = scene
+    return kind.slopes(z, *one_of_many(both, index))
 
 
-def _critical(scenes: _Scenes, grid: np.ndarray, kind: _Kind, derivatives: bool, progress: bool | None) -> Critical:
+def _critical(
+    scenes: _Scenes,
+    grid: Float[Array, "scenes points"],
+    kind: AbstractVaried,
+    derivatives: bool | None,
+    most: int | None,
+    progress: bool | None,
+) -> Critical:
+    """All ends, or the lowest; derivatives by the names of parameters, where they are wanted."""
+    known = not is_traced((scenes, grid, kind))
+    if most is None and not known:
+        raise ValueError(
+            "Argument `max_ends` must be given where arguments are traced (jax.jit, jax.vmap, a derivative): the "
+            "number of ends is not known before."
+        )
+    names = tuple(name for name in named(*one_of_many(scenes.both, 0)) if kind.keeps(name))
+    wanted = names if derivatives is None and known or derivatives else ()
+    search = _all if most is None else _lowest
+    rows = search(scenes, grid, kind, wanted, most, progress)
+    if not wanted:
+        rows["derivative"] = jnp.full((*rows["value"].shape, len(names)), jnp.nan)
+    return Critical(**jax.tree.map(lambda x: x[0] if scenes.single else x, rows), names=names)
+
+
+# What stands where there are fewer ends.
+_REST = {
+    "value": np.inf, "intensity": np.inf, "rising": False, "impacts": 0, "balanced": False, "derivative": np.nan,
+}  # fmt: skip
+
+
+def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], most: None, progress) -> dict:
     """Search, find, differentiate, and sort by scenes."""
-    scene = scenes.block, scenes.motion
 
     def run(function, z, index):
-        return surface(function, (z, index), (kind, scene), "critical", progress, outer=False)
+        return surface(function, (z, index), (kind, scenes.both), "critical", progress, outer=False)
 
     def at(z, index):
         return tuple(map(np.asarray, run(_at, z, index)))
 
-    brackets, complete = brackets_of(at, grid)
+    brackets, complete = brackets_of(at, np.asarray(grid))
     ends = roots_of(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
-    names = tuple(name for name in named(*one_of_many(scene, 0)) if kind.keeps(name))
-    units = np.asarray(jax.vmap(lambda index: kind.unit(*one_of_many(scene, index)))(jnp.arange(grid.shape[0])))
-    value = np.exp(ends["z"]) * units[ends["index"]]
-    derivative = np.full((order.size, len(names)), np.nan)
-    if derivatives and order.size:
-        slopes = run(_slopes, ends["safe"], ends["index"])
-        derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
-        derivative[~ends["balanced"]] = np.nan
-    amplitude = value if isinstance(kind, _Amplitude) else scenes.amplitude[ends["index"]]
-    rows = {
-        "value": (value, np.inf),
-        "intensity": (amplitude / scenes.threshold[ends["index"]], np.inf),
-        "rising": (ends["rising"], False),
-        "impacts": (ends["impacts"], 0),
-        "balanced": (ends["balanced"], False),
-        "derivative": (derivative, np.nan),
-    }
+    units = jax.vmap(lambda index: kind.unit(*one_of_many(scenes.both, index)))(jnp.arange(grid.shape[0]))
+    units, threshold, amplitude = (np.asarray(x)[ends["index"]] for x in (units, scenes.threshold, scenes.amplitude))
+    value = np.exp(ends["z"]) * units
+    rows = {"value": value, "intensity": kind.amplitude(value, amplitude) / threshold}
+    rows |= {name: ends[name] for name in ("rising", "impacts", "balanced")}
+    if names:
+        derivative = np.zeros((0, len(names)))
+        if order.size:
+            slopes = run(_slopes, ends["safe"], ends["index"])
+            derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
+        rows["derivative"] = np.where(ends["balanced"][:, None], derivative, np.nan)
     count = np.bincount(ends["index"], minlength=grid.shape[0])
     place = np.arange(order.size) - np.repeat(np.cumsum(count) - count, count)
 
-    def filled(values, rest):
-        table = np.full((grid.shape[0], int(count.max(initial=0)), *values.shape[1:]), rest, values.dtype)
+    def filled(name, values):
+        table = np.full((grid.shape[0], int(count.max(initial=0)), *values.shape[1:]), _REST[name], values.dtype)
         table[ends["index"], place] = values
-        return jnp.asarray(table[0] if scenes.single else table)
+        return jnp.asarray(table)
 
-    first = 0 if scenes.single else slice(None)
-    counts = jnp.asarray(count[first]), jnp.asarray(complete[first])
-    return Critical(counts[0], *(filled(*row) for row in rows.values()), complete=counts[1], names=names)
+    told = {name: filled(name, values) for name, values in rows.items()}
+    return told | {"count": jnp.asarray(count), "complete": jnp.asarray(complete)}
+
+
+class _Wanted(eqx.Module):
+    """Known when a program is traced."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    most: int = eqx.field(static=True)
+
+
+def _lowest(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], most: int, progress) -> dict:
+    """So many of every scene; many scenes are the points of a surface."""
+    scene = _Wanted(names, most), kind, scenes, grid
+    if scenes.single:  # a surface would fill up its lanes
+        return jax.tree.map(lambda x: x[None], _lowest_of_one(0, scene))
+    return surface(_lowest_of_one, (jnp.arange(grid.shape[0]),), scene, "critical", progress)
+
+
+@jax.jit
+def _lowest_of_one(index, scene) -> dict:
+    """Ends are found without derivatives, and get those of the implicit function."""
+    wanted, kind, scenes, grid = scene
+    block, motion = one_of_many(scenes.both, index)
+    known, *place = jax.lax.stop_gradient((kind, block, motion))
+    ends = lowest_ends(lambda z: known.at(z, *place), jax.lax.stop_gradient(grid[index]), wanted.most)
+    found, balanced = ends["found"], ends["balanced"] & ends["found"]
+    safe = on_border(ends["safe"], found, balanced, (kind, block, motion))
+    value = jnp.exp(safe + (ends["z"] - ends["safe"])) * kind.unit(block, motion)
+    amplitude = kind.amplitude(value, scenes.amplitude[index])
+    rows = {"value": value, "intensity": amplitude / scenes.threshold[index]}
+    rows |= {name: ends[name] for name in ("rising", "impacts", "balanced")}
+    if wanted.names:
+        slopes = jax.vmap(lambda z: kind.slopes(z, block, motion))(safe)
+        derivative = jnp.stack([slopes[name] for name in wanted.names], axis=-1) * value[:, None]
+        rows["derivative"] = jnp.where(balanced[:, None], derivative, jnp.nan)
+
+    def filled(name, values):
+        return jnp.where(found.reshape(-1, *[1] * (values.ndim - 1)), values, _REST[name])
+
+    told = {name: filled(name, values) for name, values in rows.items()}
+    return told | {"count": found.sum(), "complete": ends["complete"]}

@@ -1,12 +1,17 @@
 """The ends of intervals along lines: where a margin passes through zero, also twice between two sampled points.
 
 The margin, its slope and the number of impacts at sampled points tell where an end may hide, and only there the
-sampling is refined. Many lines are searched at once; what is asked of each round goes out in one batch.
+sampling is refined. Many lines are searched at once; what is asked of each round goes out in one batch. What a search
+of traced arrays (`lowest_ends`) has in common with it takes `numbers`, which is numpy here and jax.numpy there.
 """
 
 from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+
+Sides = list[Any]  # z, margin, slope and impacts at both ends of many intervals, (2, intervals) each
 
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
 _TIGHT = 4e-15  # width of a bracket, relative
@@ -30,68 +35,89 @@ def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], 
         middle = sides[0].mean(axis=0)
         values = (middle, *at(middle, index))
         complete[index[np.isnan(values[1])]] = False
-        (left, right), (low, high), (rise, fall) = sides[0], sides[1], sides[2]
-        guess = (low + high) / 2 + (rise - fall) * (right - left) / 8  # cubic through both values and slopes
-        size = np.minimum(np.minimum(np.abs(low), np.abs(high)), np.abs(values[1]))
-        rough = np.abs(values[1] - guess) > 0.05 * size
-        halves = [
-            [np.stack([x[0], v]) for x, v in zip(sides, values)],
-            [np.stack([v, x[1]]) for x, v in zip(sides, values)],
-        ]
-        sides = [np.concatenate([first, second], axis=1) for first, second in zip(*halves)]
-        index, depth, rough = np.tile(index, 2), np.tile(depth, 2) + 1, np.tile(rough, 2)
-        width = sides[0][1] - sides[0][0]
-        differ = (sides[1][0] < 0) != (sides[1][1] < 0)
-        hidden = ~differ & _may_hide(*sides) & (width > _TIGHT)
-        single = differ & (depth >= _ROUGH)
+        sides, depth, single, more = halved(np, sides, values, depth)
+        index = np.tile(index, 2)
         kept.append((index[single], *(x[:, single] for x in sides)))
-        more = ((differ | rough) & (depth < _ROUGH)) | (hidden & (depth < _DEEP))
-        more &= ~np.isnan(sides[1]).any(axis=0) & ~single
         sides, index, depth = [x[:, more] for x in sides], index[more], depth[more]
     names = ("index", "z", "margin", "slope", "impacts")
     return {name: np.concatenate([part[k] for part in kept], axis=-1) for k, name in enumerate(names)}, complete
 
 
-def _may_hide(z: np.ndarray, margin: np.ndarray, slope: np.ndarray, impacts: np.ndarray) -> np.ndarray:
+def halved(numbers: ModuleType, sides: Sides, values: tuple, depth) -> tuple:
+    """Both halves of every interval, the left ones first, from what was found at its middle.
+
+    **Returns:** their sides and depths; and whether there is one end in each, or it is to be halved again.
+    """
+    (left, right), (low, high), (rise, fall) = sides[:3]
+    guess = (low + high) / 2 + (rise - fall) * (right - left) / 8  # cubic through both values and slopes
+    size = numbers.minimum(numbers.minimum(abs(low), abs(high)), abs(values[1]))
+    rough = numbers.tile(abs(values[1] - guess) > 0.05 * size, 2)
+    halves = [(numbers.concatenate([x[0], v]), numbers.concatenate([v, x[1]])) for x, v in zip(sides, values)]
+    sides, depth = [numbers.stack(each) for each in halves], numbers.tile(depth, 2) + 1
+    differ = (sides[1][0] < 0) != (sides[1][1] < 0)
+    hidden = ~differ & _may_hide(numbers, *sides) & (sides[0][1] - sides[0][0] > _TIGHT)
+    single = differ & (depth >= _ROUGH)
+    more = ((differ | rough) & (depth < _ROUGH)) | (hidden & (depth < _DEEP))
+    return sides, depth, single, more & ~numbers.isnan(sides[1]).any(axis=0) & ~single
+
+
+def _may_hide(numbers: ModuleType, z, margin, slope, impacts):
     """Whether the margin may pass through zero twice between two points at which it has the same sign."""
-    width, sign = z[1] - z[0], np.where(margin[0] < 0, -1.0, 1.0)
+    width, sign = z[1] - z[0], numbers.where(margin[0] < 0, -1.0, 1.0)
     low, high, rise, fall = sign * margin[0], sign * margin[1], sign * slope[0], sign * slope[1]
     dips = (rise < 0) & (fall > 0)
-    where = (high - fall * width - low) / np.where(dips, rise - fall, 1.0)
-    lowest = np.where(dips, low + rise * where, np.inf)
+    where = (high - fall * width - low) / numbers.where(dips, rise - fall, 1.0)
+    lowest = numbers.where(dips, low + rise * where, numbers.inf)
     plunges = (low + rise * width < 0) | (high - fall * width < 0)
     gap = (sign < 0) & (impacts[0] != impacts[1])
-    return (lowest < 0.3 * np.minimum(low, high)) | plunges | gap
+    return (lowest < 0.3 * numbers.minimum(low, high)) | plunges | gap
 
 
 def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The end in every bracket to rounding, by Newton's method, which bisection keeps within it."""
-    index, z, margin, slope, impacts = (brackets[n].copy() for n in ("index", "z", "margin", "slope", "impacts"))
+    index, sides = brackets["index"], [brackets[name].copy() for name in ("z", "margin", "slope", "impacts")]
     columns = np.arange(index.size)
-    for count in range(120):
-        width = z[1] - z[0]
-        open_ = width > _TIGHT * np.maximum(1.0, np.abs(z).max(axis=0))
+    for count in range(MOST_POINTS):
+        open_ = is_wide(np, sides)
         if not open_.any():
             break
-        near = np.abs(margin[1]) < np.abs(margin[0])
-        side = near.astype(int)
-        best, value, rate = z[side, columns], margin[side, columns], slope[side, columns]
-        step = -value / np.where(rate == 0, np.inf, rate)
-        # A little too far, so that the bracket closes from both sides.
-        trial = best + 1.05 * step + np.copysign(_TIGHT / 4, step)
-        inside = (trial > z[0]) & (trial < z[1]) & (count % 4 != 3)
-        trial = np.where(inside, trial, z.mean(axis=0))[open_]
+        trial = next_point(np, sides, count)[open_]
         values = (trial, *at(trial, index[open_]))
-        onto = ((values[1] < 0) == (margin[1, open_] < 0)).astype(int)
-        for array, new in zip((z, margin, slope, impacts), values):
+        onto = ((values[1] < 0) == (sides[1][1, open_] < 0)).astype(int)
+        for array, new in zip(sides, values):
             array[onto, columns[open_]] = new
+    return {"index": index} | ends_of(np, sides)
+
+
+MOST_POINTS = 120  # to close a bracket
+
+
+def is_wide(numbers: ModuleType, sides: Sides):
+    """Whether a bracket is wider than rounding."""
+    low, high = sides[0]
+    return high - low > _TIGHT * numbers.maximum(1.0, numbers.maximum(abs(low), abs(high)))
+
+
+def next_point(numbers: ModuleType, sides: Sides, count):
+    """Where to look next in each bracket, after so many points."""
+    z, margin, slope = sides[:3]
+    near = abs(margin[1]) < abs(margin[0])
+    best, value, rate = (numbers.where(near, x[1], x[0]) for x in (z, margin, slope))
+    step = -value / numbers.where(rate == 0, numbers.inf, rate)
+    # A little too far, so that the bracket closes from both sides.
+    trial = best + 1.05 * step + numbers.copysign(_TIGHT / 4, step)
+    inside = (trial > z[0]) & (trial < z[1]) & (count % 4 != 3)
+    return numbers.where(inside, trial, z.mean(axis=0))
+
+
+def ends_of(numbers: ModuleType, sides: Sides) -> dict[str, Any]:
+    """What is told of the ends in closed brackets: `safe` is the side on which the block stands."""
+    z, margin, _, impacts = sides
     rising = ~(margin[0] < 0)  # zero is safe
-    lost, safe = rising.astype(int), 1 - rising.astype(int)
     return {
-        "index": index,
         "z": z.mean(axis=0),
-        "safe": z[safe, columns],
+        "safe": numbers.where(rising, z[0], z[1]),
         "rising": rising,
-        "impacts": impacts[lost, columns],
-        "balanced": np.abs(margin).max(axis=0, initial=0.0) < 1e-6,
+        "impacts": numbers.where(rising, impacts[1], impacts[0]),
+        "balanced": numbers.maximum(abs(margin[0]), abs(margin[1])) < 1e-6,
     }

@@ -19,6 +19,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
+from jaxrock._checks import is_traced
 from jaxrock._progress import Progress
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import exchange, meet, process, shared_out
@@ -162,7 +163,7 @@ def surface(
 
     Within `jax.jit`, `jax.vmap` or a derivative it is the plain function of arrays, on the device that JAX takes.
     """
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((axes, scene))):
+    if is_traced((axes, scene)):
         return _traced_surface(function, tuple(map(jnp.asarray, axes)), scene, outer)
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
     results = compute(function, plan, scene, label, progress, columns=columns)[0]

@@ -1,0 +1,91 @@
+"""The lowest ends of one line, as `ends` finds all of many: a plain function of arrays, for traced ones.
+
+How many ends there are is not known before, so it is said how many are wanted. Intervals wait in line, the lowest
+first; some of them at a time are halved, until the wanted ends are found or none may hide any more.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxrock.studies.ends import MOST_POINTS, Sides, ends_of, halved, is_wide, next_point
+
+_AT_A_TIME = 32  # intervals
+_ROOM = 1024  # intervals that wait; each that is taken leaves two at most, and those are taken next
+
+
+class _Line(NamedTuple):
+    """Intervals in rising order."""
+
+    sides: Sides
+    depth: Int[Array, " n"]
+    here: Bool[Array, " n"]  # whether there is one
+
+    def first(self, count: int) -> "_Line":
+        """So many of them, from the left; where there are fewer, places are empty."""
+        order = jnp.argsort(jnp.where(self.here, self.sides[0][0], jnp.inf), stable=True)[:count]
+        return _Line([x[:, order] for x in self.sides], self.depth[order], self.here[order])
+
+    def part(self, begin: int, end: int) -> "_Line":
+        """Some of them."""
+        return jax.tree.map(lambda x: x[..., begin:end], self)
+
+    def followed_by(self, other: "_Line") -> "_Line":
+        """Both, in no order."""
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), self, other)
+
+
+def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[str, Any]:
+    """The `most` lowest ends, without derivatives.
+
+    `at`: margin, its slope and impacts at one point. **Returns:** what `ends_of` tells of each, with `found`, whether
+    there is one, and `complete`, whether every point that was looked at could be decided.
+    """
+    many = jax.vmap(at)
+    values = (grid, *many(grid))
+    sides = [jnp.stack([x[:-1], x[1:]]) for x in values]
+    count = grid.size - 1
+    empty = _Line([jnp.zeros_like(x, shape=(2, _ROOM)) for x in sides], *(jnp.zeros(_ROOM, t) for t in (int, bool)))
+    line = _Line(sides, jnp.zeros(count, int), jnp.ones(count, bool)).followed_by(empty).first(_ROOM)
+    kept = empty.part(0, most)
+
+    def unfinished(carry):
+        line, kept, _ = carry
+        return line.here[0] & ~(kept.here[-1] & (kept.sides[0][0, -1] <= line.sides[0][0, 0]))
+
+    def step(carry):
+        line, kept, complete = carry
+        now, rest = line.part(0, _AT_A_TIME), line.part(_AT_A_TIME, _ROOM)
+        middle = jnp.where(now.here, now.sides[0].mean(axis=0), grid[0])
+        values = (middle, *many(middle))
+        complete &= ~(jnp.isnan(values[1]) & now.here).any()
+        sides, depth, single, more = halved(jnp, now.sides, values, now.depth)
+        here = jnp.tile(now.here, 2)
+        kept = kept.followed_by(_Line(sides, depth, single & here)).first(most)
+        waiting = rest.followed_by(_Line(sides, depth, more & here)).first(_ROOM + _AT_A_TIME)
+        return waiting.part(0, _ROOM), kept, complete & ~waiting.here[_ROOM]
+
+    complete = ~jnp.isnan(values[1]).any()
+    _, kept, complete = jax.lax.while_loop(unfinished, step, (line, kept, complete))
+    sides = _closed(many, kept.sides, kept.here, grid[0])
+    return ends_of(jnp, sides) | {"found": kept.here, "complete": complete}
+
+
+def _closed(many: Callable, sides: Sides, here: Bool[Array, " n"], elsewhere: Float[Array, ""]) -> Sides:
+    """Brackets as narrow as rounding."""
+
+    def is_open(sides):
+        return here & is_wide(jnp, sides)
+
+    def step(carry):
+        sides, count = carry
+        open_ = is_open(sides)
+        trial = jnp.where(open_, next_point(jnp, sides, count), elsewhere)
+        values = (trial, *many(trial))
+        onto = jnp.arange(2)[:, None] == ((values[1] < 0) == (sides[1][1] < 0))
+        return [jnp.where(onto & open_, new, old) for new, old in zip(values, sides)], count + 1
+
+    return jax.lax.while_loop(lambda c: is_open(c[0]).any() & (c[1] < MOST_POINTS), step, (sides, 0))[0]

@@ -1,0 +1,114 @@
+"""What is varied in a search for critical values: z is the logarithm of a factor, on the motion or on its times."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.motion import Scaled
+from jaxrock.responses.outcome import outcome
+from jaxrock.status import Status
+from jaxrock.studies.parameters import named, rebuilt
+
+
+class AbstractVaried(eqx.Module):
+    """Scenes of one block, motion and model along a line of factors."""
+
+    model: AbstractEquation
+    engine: AbstractEngine | None
+
+    def margin(self, z, block, motion):
+        """Margin and outcome of the scene with the factor e^z."""
+        result = outcome(*self.scene(z, block, motion), self.model, engine=self.engine)
+        return result.margin, result
+
+    def at(self, z, block, motion):
+        """Margin (not a number where it is not known), its slope, and impacts."""
+        margin, slope, result = jax.jvp(
+            lambda z: self.margin(z, block, motion), (z,), (jnp.ones_like(z),), has_aux=True
+        )
+        decided = (result.status == Status.successful) | (result.status == Status.undecided)
+        return jnp.where(decided, margin, jnp.nan), slope, result.impact_count
+
+    def slopes(self, z, block, motion):
+        """Derivatives of the logarithm of the critical value by the parameters."""
+        values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
+
+        def margin(z, values):
+            place = rebuilt(block, motion, named(block, motion) | values)
+            return self.margin(z, *place)[0]
+
+        def unit(values):
+            return jnp.log(self.unit(*rebuilt(block, motion, named(block, motion) | values)))
+
+        by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
+        own = jax.jacfwd(unit)(values)
+        by_z = jnp.where(by_z == 0, jnp.nan, by_z)
+        return {name: own[name] - slope / by_z for name, slope in by_values.items()}
+
+
+class Amplitude(AbstractVaried):
+    """A larger motion."""
+
+    def scene(self, z, block, motion):
+        """What is asked for at a factor."""
+        return block, Scaled(motion, jnp.exp(z))
+
+    def unit(self, block, motion):
+        """What the factor multiplies: the amplitude [g]."""
+        return jnp.abs(named(block, motion)["amplitude"])
+
+    def amplitude(self, value, own):
+        """Of the motion at a critical value, where its own is given [g]."""
+        return value
+
+    def keeps(self, name: str) -> bool:
+        """Whether the critical value depends on a parameter."""
+        return name != "amplitude"
+
+
+class Duration(AbstractVaried):
+    """A longer motion, which is a larger p: only their product counts."""
+
+    def scene(self, z, block, motion):
+        """What is asked for at a factor."""
+        return eqx.tree_at(lambda b: b.p, block, block.p * jnp.exp(z)), motion
+
+    def unit(self, block, motion):
+        """What the factor multiplies: the duration of the motion [s]."""
+        return motion.end
+
+    def amplitude(self, value, own):
+        """Of the motion at a critical value, where its own is given [g]."""
+        return own
+
+    def keeps(self, name: str) -> bool:
+        """Whether the critical value depends on a parameter."""
+        return name not in ("duration", "period", "dt")
+
+
+@eqx.filter_custom_jvp
+def on_border(z, found, balanced, scene):
+    """Ends `z`, which were found without derivatives, with those of the implicit function: the margin stays zero.
+
+    `scene`: what is varied, block and motion. Where the block does not come to balance derivatives are not numbers;
+    where no end was found they are zero.
+    """
+    return z
+
+
+@on_border.def_jvp
+def _on_border_jvp(primals, tangents):
+    z, found, balanced, scene = primals
+    z = on_border(*primals)  # for derivatives of the next order
+
+    def margins(scene):
+        kind, *both = scene
+        return jax.vmap(lambda z: kind.margin(z, *both)[0])(z)
+
+    _, change = eqx.filter_jvp(margins, (scene,), (tangents[3],))
+    slope = jax.vmap(lambda z: scene[0].at(z, *scene[1:])[1])(z)
+    good = balanced & (slope != 0)
+    rate = jnp.where(good, -1 / jnp.where(good, slope, 1.0), jnp.where(found, jnp.nan, 0.0))
+    return z, rate * change
