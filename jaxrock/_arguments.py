@@ -15,16 +15,17 @@ import os
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
 
 from jaxrock._checks import Range, one_of, shown, whole
 
+Taking = TypeVar("Taking", bound=Callable)
 Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
 
 
-def arguments(function: Callable) -> Callable:
+def arguments(function: Taking) -> Taking:
     """Decorate a function whose arguments are checked by their annotations, before it sees them.
 
     **Raises:** ValueError, when it is called, for an argument that is not what is asked for: "Argument `x` must ...".
@@ -37,14 +38,14 @@ def arguments(function: Callable) -> Callable:
     places = [(each.name, checks.get(each.name)) for each in parameters if each.kind <= each.POSITIONAL_OR_KEYWORD]
 
     @functools.wraps(function)
-    def checked(*args, **kwargs):
+    def checked(*args: Any, **kwargs: Any) -> Any:
         args = [value if check is None else check(name, value) for (name, check), value in zip(places, args)] + list(
             args[len(places) :]
         )  # too many: Python says so
         kwargs = {name: checks[name](name, value) if name in checks else value for name, value in kwargs.items()}
         return function(*args, **kwargs)
 
-    return checked
+    return cast(Taking, checked)
 
 
 def check_fields(owner: Any) -> None:

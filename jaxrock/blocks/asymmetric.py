@@ -66,6 +66,8 @@ class AsymmetricBlock(eqx.Module):
         inertia_ratio: ArrayLike = 0.75,
         radius_ratio: ArrayLike | None = None,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        *,
+        throw: bool = True,
     ):
         self.given_radius_ratio = None
         given = {} if radius_ratio is None else {"given_radius_ratio": radius_ratio}
@@ -84,6 +86,8 @@ class AsymmetricBlock(eqx.Module):
         gyration_radius: ArrayLike,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the distances of its corners to the centre of mass, and its inertia.
 
@@ -114,6 +118,8 @@ class AsymmetricBlock(eqx.Module):
         p2: ArrayLike,
         inertia_ratio: ArrayLike = 0.75,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the frequency parameters about both corners.
 
@@ -145,6 +151,8 @@ class AsymmetricBlock(eqx.Module):
         gyration_radius: ArrayLike,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the places of its corners and of its centre of mass, at rest.
 
@@ -183,6 +191,7 @@ class AsymmetricBlock(eqx.Module):
         gyration_radius: ArrayLike | None = None,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a homogeneous block from the polygon of its outline, in the plane of rocking.
 
@@ -221,6 +230,7 @@ class AsymmetricBlock(eqx.Module):
         tolerance: ArrayLike | None = None,
         restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build the block that a rock is in the vertical plane of an azimuth, from the mesh of its surface.
 

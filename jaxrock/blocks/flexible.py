@@ -83,6 +83,7 @@ class FlexibleBlock(eqx.Module):
         impacts: str = "alternate",
         base: str = "linear",
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ):
         self.damping = one_of("damping", damping, ("stiffness", "modal", "rayleigh"))
         self.impacts = one_of("impacts", impacts, ("alternate", "every"))

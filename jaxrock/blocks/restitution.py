@@ -98,7 +98,7 @@ class Constant(AbstractRestitution):
     value: Real = parameter("-", share, symbol="e", argument="restitution")
 
     @with_throw
-    def __init__(self, value: ArrayLike):
+    def __init__(self, value: ArrayLike, *, throw: bool = True):
         set_parameters(self, value=value)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
@@ -127,7 +127,7 @@ class Housner(AbstractRestitution):
     inertia_ratio: Real | None = parameter("-", ratio_of_inertia)
 
     @with_throw
-    def __init__(self, inertia_ratio: ArrayLike | None = None):
+    def __init__(self, inertia_ratio: ArrayLike | None = None, *, throw: bool = True):
         self.inertia_ratio = None if inertia_ratio is None else ratio_of_inertia("inertia_ratio", inertia_ratio)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
@@ -178,7 +178,7 @@ class PerSide(AbstractRestitution):
     second: Real = parameter("-", not_negative, symbol="e2", argument="restitution")
 
     @with_throw
-    def __init__(self, first: ArrayLike, second: ArrayLike):
+    def __init__(self, first: ArrayLike, second: ArrayLike, *, throw: bool = True):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
         together(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
@@ -218,7 +218,7 @@ class SpeedDependent(AbstractRestitution):
     scale: Real = parameter("rad/s", size)
 
     @with_throw
-    def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
+    def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike, *, throw: bool = True):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:

@@ -1,13 +1,20 @@
 """Figures of fits to measured histories, and of records that were looked for."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxrock.inverse.found_record import FoundRecord
 from jaxrock.inverse.history_fit import HistoryFit
 from jaxrock.plot.style import BLUE, GREY, RED
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def history_fit(fit: HistoryFit, time, axes=None):
+
+def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a measured and a fitted history, and what is left between them.
 
     **Arguments:**
@@ -32,7 +39,7 @@ def history_fit(fit: HistoryFit, time, axes=None):
     return axes
 
 
-def found_record(found: FoundRecord, axes=None):
+def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a record that was found, the one that was changed, and the change, in time and by frequency.
 
     **Arguments:**

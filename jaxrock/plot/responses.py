@@ -1,5 +1,8 @@
 """Figures of one response: history, and orbit in the phase plane."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,9 @@ from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @jax.jit
@@ -29,7 +35,7 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
 
 
-def history(response: Response | FlexibleResponse, axes=None):
+def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
     **Arguments:**
@@ -87,7 +93,7 @@ def _bending_history(response: FlexibleResponse, axes):
     return axes
 
 
-def phase(response: Response, axis=None):
+def phase(response: Response, axis: "Axes | None" = None) -> "Axes":
     """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
 
     **Arguments:**

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
@@ -17,7 +17,7 @@ from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 _WITHIN = 8  # parts of each step at whose ends the extremes are looked for
 
 
@@ -46,11 +46,11 @@ class Contact(eqx.Module):
     __repr__ = described
 
     @property
-    def keeps_contact(self):
+    def keeps_contact(self) -> Bool[Array, ""]:
         """Whether the ground never had to pull."""
         return self.least_normal > 0
 
-    def sticks(self, friction: ArrayLike):
+    def sticks(self, friction: ArrayLike) -> Bool[Array, "..."]:
         """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at impacts."""
         needed = jnp.maximum(self.largest_friction, jnp.maximum(*self.friction_at_impact))
         return self.keeps_contact & (jnp.asarray(friction) >= needed)

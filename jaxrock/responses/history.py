@@ -1,6 +1,6 @@
 """The history of a block under a motion."""
 
-from typing import Annotated
+from typing import Annotated, overload
 
 import equinox as eqx
 import jax
@@ -20,13 +20,13 @@ from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 
 
 class Summary(eqx.Module):
@@ -169,6 +169,32 @@ def _peaks_of(path: Trajectory) -> tuple:
     nodes = path.nodes
     turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
     return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
+
+
+@overload
+def simulate(
+    block: RigidBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = ...,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = ...,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    samples: int = ...,
+    throw: bool = ...,
+) -> Response: ...
+
+
+@overload
+def simulate(
+    block: FlexibleBlock,
+    motion: AbstractMotion,
+    *,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    samples: int = ...,
+    throw: bool = ...,
+) -> FlexibleResponse: ...
 
 
 @arguments

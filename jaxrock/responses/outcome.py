@@ -1,6 +1,6 @@
 """What becomes of a block under a motion: peak, verdict, margin."""
 
-from typing import Annotated
+from typing import Annotated, overload
 
 import equinox as eqx
 import jax
@@ -23,13 +23,13 @@ from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.recipe import Passes
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 
 
 class Outcome(eqx.Module):
@@ -76,6 +76,29 @@ class Outcome(eqx.Module):
     status: Status
 
     __repr__ = described
+
+
+@overload
+def outcome(
+    block: RigidBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = ...,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = ...,
+    engine: AbstractEngine | None = ...,
+    throw: bool = ...,
+) -> Outcome: ...
+
+
+@overload
+def outcome(
+    block: FlexibleBlock,
+    motion: AbstractMotion,
+    *,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    throw: bool = ...,
+) -> FlexibleOutcome: ...
 
 
 @arguments

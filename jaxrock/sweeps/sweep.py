@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,36 @@ from jaxrock.sweeps.plan import Plan, tiles
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.store import Store, listed, local, made_or_mended, of_sweep
 from jaxrock.transforms.fingerprint import Traced
+
+
+@overload
+def sweep(
+    function: Callable,
+    /,
+    *,
+    outer: bool = ...,
+    store: str | Path | None = ...,
+    load: Literal[True] = ...,
+    block: int | None = ...,
+    progress: bool | None = ...,
+    version: str | None = ...,
+    **axes: ArrayLike | Sequence[float | int],
+) -> Grid: ...
+
+
+@overload
+def sweep(
+    function: Callable,
+    /,
+    *,
+    outer: bool = ...,
+    store: str | Path,
+    load: bool,
+    block: int | None = ...,
+    progress: bool | None = ...,
+    version: str | None = ...,
+    **axes: ArrayLike | Sequence[float | int],
+) -> Grid | None: ...
 
 
 @arguments
