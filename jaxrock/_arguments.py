@@ -50,12 +50,13 @@ def arguments(function: Taking) -> Taking:
 
 def check_fields(owner: Any) -> None:
     """The same for the fields of a module without an `__init__` of its own: for its `__check_init__`."""
-    for name, check in _of_fields(type(owner)).items():
+    kind: Any = type(owner)
+    for name, check in _of_fields(kind).items():
         check(name, getattr(owner, name))
 
 
 @functools.cache
-def _of_fields(kind: type) -> dict[str, Check]:
+def _of_fields(kind: Any) -> dict[str, Check]:
     hints = {name: hint for each in reversed(kind.__mro__) for name, hint in inspect.get_annotations(each).items()}
     checks = {name: check_of(hint) for name, hint in hints.items()}
     return {name: check for name, check in checks.items() if check is not None}
@@ -75,7 +76,7 @@ def check_of(hint: Any) -> Check | None:
         return lambda name, value: _kind(name, value, (str,), "be a word")
     if hint is collections.abc.Callable or get_origin(hint) is collections.abc.Callable:
         return _callable
-    if hint is dict or get_origin(hint) is dict:
+    if (get_origin(hint) or hint) in (dict, collections.abc.Mapping):
         return lambda name, value: _kind(name, value, (collections.abc.Mapping,), "be a dictionary")
     if _is_own(hint):
         return lambda name, value: _kind(name, value, (hint,), f"be {_called(hint)}")
@@ -102,15 +103,16 @@ def _of_union(members: tuple) -> Check | None:
         words = [_called(each) for each in rest]
         words = " or ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
-        def inner(name, value):
-            return _kind(name, value, rest, f"be {words}")
-    elif len(rest) == 1:
-        inner = check_of(rest[0])
+        inner: Check | None = functools.partial(_of_kinds, rest, f"be {words}")
     else:
-        inner = None
+        inner = check_of(rest[0]) if len(rest) == 1 else None
     if inner is None or not missing:
         return inner
     return lambda name, value: None if value is None else inner(name, value)
+
+
+def _of_kinds(kinds: tuple[type, ...], allowed: str, name: str, value: Any) -> Any:
+    return _kind(name, value, kinds, allowed)
 
 
 def _is_own(hint: Any) -> bool:

@@ -114,7 +114,7 @@ def _compiled_failed(holds: Callable) -> Callable:
     return jax.jit(lambda array: ~jnp.all(holds(array)), inline=True)
 
 
-def watched(values, message: str, failed: Bool[ArrayLike, ""]):
+def watched(values: Any, message: str, failed: Bool[Array, ""]) -> Any:
     """Return `values`, which are traced, with a check: it is put down, or made where they are computed."""
     state, checks = _put_down.get()
     if state is not None and state == get_opaque_trace_state():
@@ -124,7 +124,7 @@ def watched(values, message: str, failed: Bool[ArrayLike, ""]):
 
 
 # What is traced where checks are put down, and these; every thread has its own.
-_put_down = contextvars.ContextVar("put_down", default=(None, None))
+_put_down: contextvars.ContextVar[tuple[Any, Any]] = contextvars.ContextVar("put_down", default=(None, None))
 
 
 @contextlib.contextmanager

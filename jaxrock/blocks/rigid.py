@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import acute, rate, size, together, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.restitution import (
     AbstractRestitution,
     Corners,
@@ -20,7 +20,7 @@ from jaxrock.blocks.restitution import (
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
 
 
-class Block(eqx.Module):
+class Block(Owner):
     """A free-standing symmetric rigid block.
 
     **Arguments:**

@@ -4,6 +4,7 @@ import os
 
 import jax
 
+from jaxrock._precision import setting
 from jaxrock.keeping.folder import LARGEST, OF_JAX, folder
 
 
@@ -15,7 +16,7 @@ def keep_compiled() -> None:
     without it. It sets options of JAX (`jax_compilation_cache_dir` and its limits), for all that this process compiles.
     """
     place = folder()
-    if place is None or jax.config.jax_compilation_cache_dir:
+    if place is None or setting("jax_compilation_cache_dir"):
         return
     place = place / OF_JAX
     try:

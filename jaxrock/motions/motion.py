@@ -6,10 +6,10 @@ in units of g; positive acceleration drives negative rotation.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.lookup import count_up_to
 
@@ -25,7 +25,7 @@ Scalar = Inexact[Array, ""]
 Piece = Int[Array, ""]  # number of a smooth piece
 
 
-class AbstractMotion(eqx.Module):
+class AbstractMotion(Owner):
     """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
     __repr__ = described
@@ -306,16 +306,19 @@ class Summed(AbstractMotion):
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
-        return sum(part.spread(part.motion.bounds, 0.0) for part in self._parts)
+        first, second = (part.spread(part.motion.bounds, 0.0) for part in self._parts)
+        return first + second
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        return sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts))
+        return (
+            sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts)) or []
+        )
 
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
         found = [(part, part.motion.vertical_bounds) for part in self._parts]
         found = [part.spread(bounds, 0.0) for part, bounds in found if bounds is not None]
-        return sum(found) if found else None
+        return functools.reduce(jnp.add, found) if found else None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         return sum_of_series(
@@ -364,7 +367,7 @@ class WithVertical(_Changed):
         return Envelope(*(part.spread_bounds(motion.envelope.horizontal) for part, motion in pairs))
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        return self._parts[0].series(self.horizontal.series, piece, local, unit, order)
+        return self._parts[0].series(self.horizontal.series, piece, local, unit, order) or []
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         return self._parts[1].series(self.vertical.series, piece, local, unit, order)

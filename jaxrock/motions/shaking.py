@@ -1,7 +1,7 @@
 """What motions tell of the ground: its acceleration as a series, and bounds of it."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
@@ -76,6 +76,10 @@ class Envelope(NamedTuple):
         return Envelope(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
 
+@overload
+def sum_of_series(first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]: ...
+@overload
+def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None: ...
 def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None:
     """Coefficients of a sum; None is zero."""
     if first is None or second is None:

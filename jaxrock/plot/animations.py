@@ -4,7 +4,7 @@ import html
 import importlib.util
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -55,13 +55,13 @@ def animate(
     """
     from matplotlib.animation import FuncAnimation
 
-    duration, flexible = float(response.duration), isinstance(response, FlexibleResponse)
+    duration = float(response.duration)
     rate = max(1.0, duration / _LONGEST) if speed is None else float(scalar("speed", size("speed", speed)))
     body = Body.of(_drawn(response, block), model)
     count = int(np.ceil(duration * fps / rate)) + 1
     time = np.minimum(np.arange(count) * rate / fps, duration)
     rotation, bending = np.asarray(response(time)[0]), [None] * count
-    if flexible:
+    if isinstance(response, FlexibleResponse):
         alpha, heights = float(response.scene.block.alpha), body.heights
         bending = np.asarray(response.column(time)) - np.cos(alpha) * rotation[:, None] * heights
     parts = _Parts(response, body, rate)
@@ -170,7 +170,8 @@ def save_animation(
     import matplotlib
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
-    fps = 1000 / film.event_source.interval
+    source: Any = film.event_source
+    fps, path = 1000 / source.interval, Path(path)
     kind = path.suffix.lower()
     if kind == ".gif":
         film.save(path, writer=PillowWriter(fps=fps), dpi=dpi)

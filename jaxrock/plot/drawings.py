@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _turn = Range("be in [-pi/2, pi/2]", -np.pi / 2, np.pi / 2, lambda x: abs(x) <= np.pi / 2 + 1e-6)
 _PAPER = "#efe3c8"
-_INK = {"color": "black", "linewidth": 0.8}
+_INK: dict[str, Any] = {"color": "black", "linewidth": 0.8}
 
 
 @arguments
@@ -72,7 +72,7 @@ def scene(
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 5 if motion is None else 6.5), layout="constrained")
     column = None
-    if bent:
+    if bent and isinstance(block, FlexibleBlock):
         shape = unit_column(block.masses).shapes[:, 0]
         column = bent * np.concatenate([[0.0], shape / shape[-1]])
     shapes = body.pose(rotation, column)
@@ -109,7 +109,9 @@ def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Li
     from matplotlib.patches import Polygon
 
     modelled = bool(body.heights.size)
-    look = {"facecolor": "#f7f2e6", "edgecolor": GREY, "linestyle": "--"} if modelled else {"facecolor": _PAPER}
+    look: dict[str, Any] = (
+        {"facecolor": "#f7f2e6", "edgecolor": GREY, "linestyle": "--"} if modelled else {"facecolor": _PAPER}
+    )
     outline = Polygon(shapes.outline, **({"edgecolor": "black", "linewidth": 1.0} | look))
     axis.add_patch(outline)
     (column,) = axis.plot(*shapes.column.T, color=BLUE, linewidth=2.5, solid_capstyle="round")

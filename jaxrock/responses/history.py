@@ -234,7 +234,8 @@ def simulate(
     start = start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    response = Response(time, *_evaluate(path, time), summary, path)
+    rotation, velocity = _evaluate(path, time)
+    response = Response(time, rotation, velocity, summary, path)
     return response if throw else marked_result(response, (block, motion, model, start, duration))
 
 
@@ -286,7 +287,7 @@ def _on_tape(given) -> tuple[State, State, Outcome]:
     return _steps(*given, taped=True)
 
 
-def _steps(block, motion, model, initial, stop, engine, taped: bool = False, plain: bool = False):
+def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False, plain: bool = False):
     """The state at the end of a history, the states before all steps (and after the last), and what came of it.
 
     `plain`: a step is not a thing of its own, which would have derivatives by all that it starts from.

@@ -200,7 +200,7 @@ def _passes(rounds: bool) -> Passes:
     )
 
 
-def _to_outcome(block, motion, model, initial, engine, taped: bool) -> Outcome:
+def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcome:
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))

@@ -1,6 +1,7 @@
 """The near-fault pulse of Mavroeidis and Papageorgiou."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,7 +67,7 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         # The product of cosines is a sum of three: at the period, and at the two side frequencies.
         time = local - self.oscillations * self.period / 2
-        total = [0.0] * (order + 1)
+        total: list[Any] = [0.0] * (order + 1)
         for weight, ratio in ((0.5, 1.0), (0.25, 1 + 1 / self.oscillations), (0.25, 1 - 1 / self.oscillations)):
             rate = ratio * 2 * math.pi / self.period
             angle = rate * time + self.phase

@@ -79,6 +79,8 @@ class _OneCycle(AbstractPulse):
 class SinePulse(_OneCycle):
     """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
+    __init__ = _OneCycle.__init__  # said again for type checkers, which would make one of the fields
+
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
         return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
@@ -86,6 +88,8 @@ class SinePulse(_OneCycle):
 
 class CosinePulse(_OneCycle):
     """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
+
+    __init__ = _OneCycle.__init__
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
