@@ -1,7 +1,7 @@
 """What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -131,7 +131,7 @@ class Observations(eqx.Module):
         restitution: Values | None = None,
         *,
         facing: Values = 0.0,
-        **known,
+        **known: Any,
     ) -> "Observations":
         """Observations of rocks whose sides differ.
 

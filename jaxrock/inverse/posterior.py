@@ -8,7 +8,7 @@ BlackJAX takes their place where one is given (see `samplers`).
 """
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -91,13 +91,14 @@ class Posterior(AbstractTable):
         flat = self.samples.reshape(-1, len(self.names))
         return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
 
-    def to_arviz(self):
+    def to_arviz(self) -> Any:
         """The samples for ArviZ (an extra of its own): an `InferenceData`, or from ArviZ 1.0 on a `DataTree`."""
         import arviz
 
         samples = {name: np.asarray(self.samples[..., i]) for i, name in enumerate(self.names)}
         groups = {"posterior": samples, "sample_stats": {"lp": np.asarray(self.log_density)}}
-        return arviz.from_dict(**groups) if hasattr(arviz, "InferenceData") else arviz.from_dict(groups)
+        made: Any = arviz.from_dict
+        return made(**groups) if hasattr(arviz, "InferenceData") else made(groups)
 
     def summary(self) -> str:
         """Mean, standard deviation, quantiles and diagnostics as a table, and the status."""

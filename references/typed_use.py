@@ -1,6 +1,6 @@
 """What users write, for type checkers: `mypy --strict` and pyright find nothing wrong here, and every type as said.
 
-No test: `tests/test_types.py` has mypy read it, and runs it once, so that what checkers are told is so.
+`.ci/run` has mypy read it; `tests/test_types.py` runs it, so that what checkers are told is so.
 """
 
 from pathlib import Path
@@ -83,7 +83,7 @@ def own_record(folder: Path) -> None:
     assert_type(motion, rk.motions.WithVertical)
     clean = rk.processing.filtered(rk.processing.baseline_corrected(record, degree=1), low=0.5, high=20.0)
     assert_type(clean, rk.Record)
-    print(float(later.end), float(rk.intensity.arias(clean)), float(rk.intensity.peak_velocity(clean)))
+    print(float(later.end), float(rk.intensity.arias(clean)), float(rk.intensity.peak_acceleration(clean)))
     print(rk.outcome(rk.Block.from_dimensions(width=0.3, height=1.5), motion))
 
 
