@@ -85,12 +85,14 @@ _LATER = {
 }
 
 
-def __getattr__(name: str):
-    if name in _LATER:
-        return _importlib.import_module(_LATER[name])
-    if name == "Diffrax":
-        return _importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
-    return _moved(name)
+if not _typing.TYPE_CHECKING:  # checkers know these names from above, and are to tell of any other
+
+    def __getattr__(name: str):
+        if name in _LATER:
+            return _importlib.import_module(_LATER[name])
+        if name == "Diffrax":
+            return _importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
+        return _moved(name)
 
 
 def __dir__() -> list[str]:

@@ -15,16 +15,17 @@ import os
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
 
 from jaxrock._checks import Range, one_of, shown, whole
 
+Taking = TypeVar("Taking", bound=Callable)
 Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
 
 
-def arguments(function: Callable) -> Callable:
+def arguments(function: Taking) -> Taking:
     """Decorate a function whose arguments are checked by their annotations, before it sees them.
 
     **Raises:** ValueError, when it is called, for an argument that is not what is asked for: "Argument `x` must ...".
@@ -37,24 +38,25 @@ def arguments(function: Callable) -> Callable:
     places = [(each.name, checks.get(each.name)) for each in parameters if each.kind <= each.POSITIONAL_OR_KEYWORD]
 
     @functools.wraps(function)
-    def checked(*args, **kwargs):
+    def checked(*args: Any, **kwargs: Any) -> Any:
         args = [value if check is None else check(name, value) for (name, check), value in zip(places, args)] + list(
             args[len(places) :]
         )  # too many: Python says so
         kwargs = {name: checks[name](name, value) if name in checks else value for name, value in kwargs.items()}
         return function(*args, **kwargs)
 
-    return checked
+    return cast(Taking, checked)
 
 
 def check_fields(owner: Any) -> None:
     """The same for the fields of a module without an `__init__` of its own: for its `__check_init__`."""
-    for name, check in _of_fields(type(owner)).items():
+    kind: Any = type(owner)
+    for name, check in _of_fields(kind).items():
         check(name, getattr(owner, name))
 
 
 @functools.cache
-def _of_fields(kind: type) -> dict[str, Check]:
+def _of_fields(kind: Any) -> dict[str, Check]:
     hints = {name: hint for each in reversed(kind.__mro__) for name, hint in inspect.get_annotations(each).items()}
     checks = {name: check_of(hint) for name, hint in hints.items()}
     return {name: check for name, check in checks.items() if check is not None}
@@ -74,7 +76,7 @@ def check_of(hint: Any) -> Check | None:
         return lambda name, value: _kind(name, value, (str,), "be a word")
     if hint is collections.abc.Callable or get_origin(hint) is collections.abc.Callable:
         return _callable
-    if hint is dict or get_origin(hint) is dict:
+    if (get_origin(hint) or hint) in (dict, collections.abc.Mapping):
         return lambda name, value: _kind(name, value, (collections.abc.Mapping,), "be a dictionary")
     if _is_own(hint):
         return lambda name, value: _kind(name, value, (hint,), f"be {_called(hint)}")
@@ -101,15 +103,16 @@ def _of_union(members: tuple) -> Check | None:
         words = [_called(each) for each in rest]
         words = " or ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
-        def inner(name, value):
-            return _kind(name, value, rest, f"be {words}")
-    elif len(rest) == 1:
-        inner = check_of(rest[0])
+        inner: Check | None = functools.partial(_of_kinds, rest, f"be {words}")
     else:
-        inner = None
+        inner = check_of(rest[0]) if len(rest) == 1 else None
     if inner is None or not missing:
         return inner
     return lambda name, value: None if value is None else inner(name, value)
+
+
+def _of_kinds(kinds: tuple[type, ...], allowed: str, name: str, value: Any) -> Any:
+    return _kind(name, value, kinds, allowed)
 
 
 def _is_own(hint: Any) -> bool:

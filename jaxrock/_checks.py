@@ -3,9 +3,8 @@
 import contextlib
 import contextvars
 import functools
-import inspect
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._guard import guarded
 
+Making = TypeVar("Making", bound=Callable)
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
 
@@ -114,7 +114,7 @@ def _compiled_failed(holds: Callable) -> Callable:
     return jax.jit(lambda array: ~jnp.all(holds(array)), inline=True)
 
 
-def watched(values, message: str, failed: Bool[ArrayLike, ""]):
+def watched(values: Any, message: str, failed: Bool[Array, ""]) -> Any:
     """Return `values`, which are traced, with a check: it is put down, or made where they are computed."""
     state, checks = _put_down.get()
     if state is not None and state == get_opaque_trace_state():
@@ -124,17 +124,17 @@ def watched(values, message: str, failed: Bool[ArrayLike, ""]):
 
 
 # What is traced where checks are put down, and these; every thread has its own.
-_put_down = contextvars.ContextVar("put_down", default=(None, None))
+_put_down: contextvars.ContextVar[tuple[Any, Any]] = contextvars.ContextVar("put_down", default=(None, None))
 
 
 @contextlib.contextmanager
-def put_down():
+def put_down() -> Iterator[list[tuple[str, Bool[Array, ""]]]]:
     """Checks of traced values are not made, but put down: pairs of a message, and whether the check has failed.
 
     A program that may raise is not kept by JAX's cache of compiled programs; one that returns what was put down is.
     Checks within transformations of the function that is traced here are still made.
     """
-    checks = []
+    checks: list[tuple[str, Bool[Array, ""]]] = []
     before = _put_down.set((get_opaque_trace_state(), checks))
     try:
         yield checks
@@ -147,7 +147,7 @@ _marks = contextvars.ContextVar("marks", default=False)
 
 
 @contextlib.contextmanager
-def marked(unless: bool = False):
+def marked(unless: bool = False) -> Iterator[None]:
     """Numbers outside of their ranges become what is not a number, whether they are known or traced.
 
     Not around anything that JAX traces and keeps: a program would go on marking.
@@ -159,8 +159,8 @@ def marked(unless: bool = False):
         _marks.reset(before)
 
 
-def with_throw(function: Callable) -> Callable:
-    """Decorate what makes a block, a law or a motion: it takes `throw`, too.
+def with_throw(function: Making) -> Making:
+    """Decorate what makes a block, a law or a motion, and takes `throw`: that is seen to here.
 
     False: a number outside of its range becomes what is not a number, and nothing is raised, so that optimisers may
     take a step there; the outcome of such a scene is not a number either, and its status says so. What is no number at
@@ -168,7 +168,7 @@ def with_throw(function: Callable) -> Callable:
     """
 
     @functools.wraps(function)
-    def made(*args, throw: bool = True, **kwargs):
+    def made(*args: Any, throw: bool = True, **kwargs: Any) -> Any:
         if throw is not True and throw is not False:
             raise ValueError(f"Argument `throw` must be True or False, but is {shown(throw)}.")
         if throw:
@@ -176,12 +176,7 @@ def with_throw(function: Callable) -> Callable:
         with marked():
             return function(*args, **kwargs)
 
-    told = inspect.signature(function)
-    parameter = inspect.Parameter("throw", inspect.Parameter.KEYWORD_ONLY, default=True, annotation=bool)
-    parts = list(told.parameters.values())
-    last = len(parts) - sum(part.kind is part.VAR_KEYWORD for part in parts)
-    made.__signature__ = told.replace(parameters=[*parts[:last], parameter, *parts[last:]])
-    return made
+    return cast(Making, made)
 
 
 class Range(NamedTuple):

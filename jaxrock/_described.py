@@ -14,7 +14,7 @@ _FEW = 6  # numbers that are shown one by one
 _LONG = 100  # characters of a line
 
 
-def described(self) -> str:
+def described(self: Any) -> str:
     """The name of a module's class with all fields; for `__repr__` of modules."""
     fields = [field for field in dataclasses.fields(self) if field.repr]
     parts = [f"{field.name}={_told(getattr(self, field.name))}" for field in fields]
@@ -34,14 +34,14 @@ def _told(value: Any) -> str:
     return repr(value)
 
 
-def _numbers(value) -> str:
+def _numbers(value: Any) -> str:
     if not getattr(value, "is_fully_addressable", True) or np.size(value) > _FEW:
         return f"{np.dtype(value.dtype)}[{', '.join(map(str, np.shape(value)))}]"
     told = [f"{x:.7g}" if isinstance(x, float) else str(x) for x in np.ravel(value).tolist()]
     return told[0] if np.ndim(value) == 0 else f"[{', '.join(told)}]"
 
 
-def _status(value) -> str:
+def _status(value: Any) -> str:
     kind, which = value._enumeration, value._value
     if isinstance(which, jax.core.Tracer) or np.ndim(which) > 0:
         return f"{kind.__name__}{list(np.shape(which))}"

@@ -22,7 +22,7 @@ _guard_p.multiple_results = True
 def guarded(values: PyTree, failed: Bool[Array, ""], message: str) -> PyTree:
     """`values`, with a check that raises `message` where it has `failed`."""
     leaves, structure = jax.tree.flatten(values)
-    return structure.unflatten(_guard_p.bind(jnp.asarray(failed), *map(jnp.asarray, leaves), message=message))
+    return jax.tree.unflatten(structure, _guard_p.bind(jnp.asarray(failed), *map(jnp.asarray, leaves), message=message))
 
 
 @_guard_p.def_impl

@@ -12,12 +12,12 @@ class Label:
     def __init__(self, value: Any):
         self.value = value
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Label)
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return 0
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         first = self.value[0] if isinstance(self.value, tuple) and self.value else self.value
         return repr(first)

@@ -2,6 +2,7 @@
 
 import importlib
 import warnings
+from typing import Any
 
 _MOVED = {
     "blocks": "Rock draw_blocks",
@@ -31,7 +32,7 @@ _MOVED = {
 _HOMES = {name: space for space, names in _MOVED.items() for name in names.split()}
 
 
-def moved(name: str):
+def moved(name: str) -> Any:
     """What a name of before means now, with a warning that says where it is."""
     if name not in _HOMES:
         raise AttributeError(f"module 'jaxrock' has no attribute {name!r}")

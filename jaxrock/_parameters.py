@@ -12,7 +12,7 @@ unit and range.
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -45,7 +45,7 @@ def parameter(
     follows: str = "",
     is_free: bool = True,
     argument: str = "",
-):
+) -> Any:
     """Declare a field of a block, a motion or a model as a parameter.
 
     **Arguments:**
@@ -73,7 +73,7 @@ def declared(kind: type) -> dict[str, Parameter]:
     return {field.name: field.metadata["parameter"] for field in fields if "parameter" in field.metadata}
 
 
-def set_parameters(owner: eqx.Module, **values) -> None:
+def set_parameters(owner: eqx.Module, **values: Any) -> None:
     """Check values by what is declared of them, and set them: for the owner's `__init__`.
 
     **Raises:** ValueError for a value outside its range.
@@ -86,6 +86,15 @@ def set_parameters(owner: eqx.Module, **values) -> None:
             raise ValueError(f"Argument `{called}` must hold at least one number, but has shape {array.shape}.")
         setattr(owner, name, array)
     together(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
+
+
+if TYPE_CHECKING:
+
+    @dataclass_transform(field_specifiers=(parameter, eqx.field, dataclasses.field))
+    class Owner(eqx.Module):
+        """What declares parameters: so checkers know that `parameter(...)` is a field, and no default."""
+else:
+    Owner = eqx.Module
 
 
 class Leaf(NamedTuple):
@@ -128,7 +137,7 @@ def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECL
             yield from leaves_of(getattr(owner, field.name), (*path, field.name), own)
 
 
-def _is_module(value) -> bool:
+def _is_module(value: Any) -> bool:
     return isinstance(value, eqx.Module)
 
 
@@ -142,7 +151,7 @@ def broadcast(owner: Any, shape: tuple[int, ...]) -> Any:
     return jax.tree.map(lambda x, own: x if own else jnp.broadcast_to(x, shape), owner, shared(owner))
 
 
-def one_of_many(owners: Any, index) -> Any:
+def one_of_many(owners: Any, index: Any) -> Any:
     """One of many owners in one tree, whose numbers have a leading axis."""
     return jax.tree.map(lambda x, own: x if own else x[index], owners, shared(owners))
 

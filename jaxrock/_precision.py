@@ -3,13 +3,19 @@
 import functools
 import sys
 import warnings
+from typing import Any
 
 import jax
 
 
+def setting(name: str) -> Any:
+    """A setting of JAX, which declares none of them to type checkers."""
+    return getattr(jax.config, name)
+
+
 def say_if_single() -> None:
     """Warn, once in a process, if JAX computes in single precision; to be called by what users call."""
-    if not jax.config.jax_enable_x64:
+    if not setting("jax_enable_x64"):
         _say()
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from typing import Any
 
 
 class Progress:
@@ -27,7 +28,7 @@ def _is_watched() -> bool:
     return sys.stderr.isatty() or "IPKernelApp" in getattr(shell, "config", ())
 
 
-def _kind() -> type:
+def _kind() -> Any:
     with warnings.catch_warnings():  # where a notebook has no widgets the bar is made of characters
         warnings.simplefilter("ignore")
         from tqdm.auto import tqdm

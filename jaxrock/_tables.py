@@ -2,12 +2,17 @@
 
 import abc
 import importlib
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxrock._described import described
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 
 class Column(NamedTuple):
@@ -28,7 +33,7 @@ class AbstractTable(eqx.Module):
     def _columns(self) -> dict[str, Column]:
         """All columns; some of them may be None, and are left out."""
 
-    def to_xarray(self):
+    def to_xarray(self) -> "xarray.Dataset":
         """The result as an `xarray.Dataset`: units are attributes, a status is the name of its item.
 
         **Raises:** ImportError without xarray.
@@ -42,7 +47,7 @@ class AbstractTable(eqx.Module):
         own = {name: told.pop(name) for name, column in columns.items() if column.dimensions == (name,)}
         return xarray.Dataset(told, own, attrs={"result": type(self).__name__})
 
-    def to_pandas(self):
+    def to_pandas(self) -> "pandas.DataFrame":
         """The result as a `pandas.DataFrame`, indexed by its coordinates: a status is a category, and units stand by
         column in `attrs["units"]`.
 
@@ -88,7 +93,7 @@ def items_of(status: Any) -> list[str]:
     return list(status._enumeration._name_to_item)
 
 
-def needed(module: str):
+def needed(module: str) -> ModuleType:
     """Import a module of the extra `store`, or say how to get it."""
     try:
         return importlib.import_module(module)

@@ -1,31 +1,56 @@
 """What became of a computation: every result carries one of these."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool
+
+if TYPE_CHECKING:  # of Equinox's own declaration some checkers think that its items are words
+    from typing import Self, TypeVar
+
+    Kind = TypeVar("Kind")
+
+    class item:
+        """What checkers see of an item: an instance of its class."""
+
+        def __init__(self, message: str) -> None: ...
+        def __get__(self, instance: object, owner: type[Kind]) -> Kind: ...
+
+    class _Items(type):
+        def __getitem__(cls, item: Any) -> str: ...
+
+    class Enumeration(metaclass=_Items):
+        """What checkers see of `equinox.Enumeration`: items, alone or in arrays, that compare to arrays."""
+
+        def __eq__(self, other: object) -> Bool[Array, "..."]: ...  # type: ignore[override]
+        def __ne__(self, other: object) -> Bool[Array, "..."]: ...  # type: ignore[override]
+        @classmethod
+        def where(cls, pred: Bool[ArrayLike, "..."], a: Self, b: Self) -> Self: ...
+else:
+    Enumeration, item = eqx.Enumeration, str
 
 
-class Status(eqx.Enumeration):
+class Status(Enumeration):
     """Outcome of a computation, as data: it goes through jit and vmap, and compares with ==.
 
     `Status[result.status]` is the message. Numbers beside a status other than `successful` are not results.
     """
 
-    successful = "The response was computed."
-    step_budget_exhausted = (
+    successful = item("The response was computed.")
+    step_budget_exhausted = item(
         "The step budget was used up before the motion ended, usually by impacts that do not die out "
         "(restitution at or near 1). Raise `max_steps` of the engine."
     )
-    undecided = (
+    undecided = item(
         "Too close to call: a near balance, a grazing impact or long chaotic rocking makes the response so sensitive "
         "that errors of this computation decide it. A tighter tolerance may decide; near the last digit nothing can."
     )
-    solver_failed = (
+    solver_failed = item(
         "The differential equation solver gave up: its nonlinear solver failed or its steps became too small."
     )
-    not_finite = "The state or the motion stopped being a finite number. Check the inputs."
+    not_finite = item("The state or the motion stopped being a finite number. Check the inputs.")
 
 
 @jax.jit

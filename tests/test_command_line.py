@@ -256,6 +256,7 @@ def test_parameters_of_pulses_are_options():
     given = ["--pulse", "ricker", "--kind", "antisymmetric", "--center", "3"]
     motion = pulse_of(parser.parse_args(given))(0.5, 1.0)
     assert (motion.kind, float(motion.center)) == ("antisymmetric", 3.0)
+    assert "--throw" not in parser.format_help()  # which is no parameter
 
 
 @pytest.mark.parametrize(
@@ -297,22 +298,22 @@ BAD = {
     "missing file": (["run", "missing.AT2"], r"No such file or directory: '\S*missing.AT2'"),
     "folder": (["run", "."], "Is a directory"),
     "no numbers": (["run", "words.txt"], "File `words.txt`: no line holds columns of numbers"),
-    "no unit": (["run", "motion.txt", "--dt", "0.02"], "Argument `unit` must be 'g', 'm/s2' or 'cm/s2'"),
-    "wrong unit": ([*FILE, "--unit", "ft/s2"], "Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft/s2'"),
-    "no dt": (["run", "motion.txt", "--unit", "g"], "Argument `dt` must be given"),
-    "dt 0": ([*FILE, "--dt", "0"], "Argument `dt` must be positive and finite, .*, but is 0.0"),
-    "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `dt` must be positive and finite, .*, but is -0.01"),
-    "dt NaN": ([*FILE, "--dt", "nan"], "Argument `dt` must be positive and finite, .*, but is nan"),
-    "column 3": ([*FILE, "--column", "3"], "Argument `column` must be 0 to 0, .*, but is 3"),
-    "column -1": ([*FILE, "--column", "-1"], "Argument `column` must be a whole number, at least 0, but is -1"),
+    "no unit": (["run", "motion.txt", "--dt", "0.02"], "Argument `--unit` must be 'g', .*, but is not given"),
+    "wrong unit": ([*FILE, "--unit", "ft/s2"], "Argument `--unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft/s2'"),
+    "no dt": (["run", "motion.txt", "--unit", "g"], "Argument `--dt` must be given .*, but is not given"),
+    "dt 0": ([*FILE, "--dt", "0"], "Argument `--dt` must be positive and finite, .*, but is 0.0"),
+    "dt negative": ([*FILE, "--dt", "-0.01"], "Argument `--dt` must be positive and finite, .*, but is -0.01"),
+    "dt NaN": ([*FILE, "--dt", "nan"], "Argument `--dt` must be positive and finite, .*, but is nan"),
+    "column 3": ([*FILE, "--column", "3"], "Argument `--column` must be 0 to 0, .*, but is 3"),
+    "column -1": ([*FILE, "--column", "-1"], "Argument `--column` must be a whole number, at least 0, but is -1"),
     "dt without file": (["run", "--dt", "0.01"], "Option --dt describes a file, but no RECORD is given"),
     "unit without file": (["spectrum", "--unit", "g"], "Option --unit describes a file, but no RECORD is given"),
-    "width negative": (["run", "--width", "-0.6"], "Argument `width` must be positive and finite, .*, but is -0.6"),
-    "width 0": (["run", "--width", "0"], "Argument `width` must be positive and finite, .*, but is 0.0"),
-    "height NaN": (["run", "--height", "nan"], "Argument `height` must be positive and finite, .*, but is nan"),
+    "width negative": (["run", "--width", "-0.6"], "Argument `--width` must be positive and finite, .*, but is -0.6"),
+    "width 0": (["run", "--width", "0"], "Argument `--width` must be positive and finite, .*, but is 0.0"),
+    "height NaN": (["run", "--height", "nan"], "Argument `--height` must be positive and finite, .*, but is nan"),
     "stocky": (["run", "--width", "6"], "Argument `alpha` must be at most 0.955"),
-    "restitution 2": (["run", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
-    "duration 0": (["run", "--duration", "0"], "Argument `duration` must be positive and finite, .*, but is 0.0"),
+    "restitution 2": (["run", "--restitution", "2"], r"Argument `--restitution` must be in \[0, 1\], but is 2.0"),
+    "duration 0": (["run", "--duration", "0"], "Argument `--duration` must be positive and finite, .*, but is 0.0"),
     "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, .*, but is nan"),
     "fragility, missing file": (["fragility", "missing.AT2"], "No such file or directory"),
     "fragility, levels": (["fragility", "a", "--levels", "2", "1"], "`--levels` must be positive, finite and in order"),
@@ -323,7 +324,7 @@ BAD = {
         ["spectrum", "--slenderness", "0"],
         "Argument `--slenderness` must be positive, but is 0.0",
     ),
-    "spectrum, restitution 2": (["spectrum", "--restitution", "2"], "Argument `restitution` must be in"),
+    "spectrum, restitution 2": (["spectrum", "--restitution", "2"], "Argument `--restitution` must be in"),
     "spectrum, shortest 0": (["spectrum", "--shortest", "0"], "`--shortest, --longest` must be positive, finite"),
     "spectrum, order": (["spectrum", "--shortest", "9"], "must be positive, finite and in order, but is 9 to 8"),
     "spectrum, longest NaN": (
@@ -333,9 +334,9 @@ BAD = {
     "spectrum, longest inf": (["spectrum", "--longest", "inf"], "must be .*finite.*inf"),
     "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
-    "map, restitution 2": (["map", "--restitution", "2"], r"Argument `restitution` must be in \[0, 1\], but is 2.0"),
+    "map, restitution 2": (["map", "--restitution", "2"], r"Argument `--restitution` must be in \[0, 1\], but is 2.0"),
     "map, shape of a sine": (["map", "--shape", "1"], "Argument `--shape` is not a parameter of the pulse sine"),
-    "map, alpha 2": (["map", "--alpha", "2"], r"Argument `alpha` must be in \(0, pi/2\), .*, but is 2.0"),
+    "map, alpha 2": (["map", "--alpha", "2"], r"Argument `--alpha` must be in \(0, pi/2\), .*, but is 2.0"),
     "map, ratio from 0": (
         ["map", "--frequency-ratio", "0", "8"],
         "`--frequency-ratio` must be positive, finite and in order, but is 0 to 8",

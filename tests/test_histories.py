@@ -1,5 +1,6 @@
 """Fits to histories: against free rocking in closed form, certified least squares, and repeated experiments."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -55,6 +56,8 @@ def test_free_rocking_without_errors_is_recovered():
     assert found.agreement == 1
     assert found["restitution"] == found.values[2] == float(found.block.restitution)
     assert len(rk.plot.history_fit(found, TIME)) == 2
+    two_sided = eqx.tree_at(lambda fit: fit.block, found, rk.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P))
+    assert len(rk.plot.history_fit(two_sided, TIME)) == 2
     # Mirrored, it is the same block from the other side.
     mirrored = fit(-free_rocking(TIME))
     np.testing.assert_allclose(mirrored.values, found.values * [1, 1, 1, -1], rtol=1e-8)

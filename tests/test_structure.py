@@ -240,10 +240,37 @@ def test_what_is_public_has_a_docstring(name):
         assert ast.get_docstring(TREES[home])
         return
     definitions = [
-        node for node in TREES[module].body if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == origin
+        node
+        for node in TREES[module].body
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == origin
+        if "overload" not in map(ast.unparse, node.decorator_list)
     ]
     assert len(definitions) == 1, f"{name} is not defined in {module}, from which it is imported"
     assert ast.get_docstring(definitions[0])
+
+
+def functions_of(name):
+    """What a user may call of a public name: the function, or the methods of the class."""
+    module, origin = exports()[name]
+    for node in TREES.get(module, ast.Module([], [])).body:
+        if getattr(node, "name", None) == origin:
+            inner = node.body if isinstance(node, ast.ClassDef) else [node]
+            yield from (each for each in inner if isinstance(each, ast.FunctionDef))
+
+
+def is_hidden(function):
+    return function.name.startswith("_") and function.name not in ("__init__", "__call__")
+
+
+@pytest.mark.parametrize("name", exports())
+def test_what_is_public_says_its_types(name):
+    for function in functions_of(name):
+        if not is_hidden(function):
+            given = function.args
+            every = [*given.posonlyargs, *given.args, *given.kwonlyargs, *filter(None, (given.vararg, given.kwarg))]
+            untyped = [each.arg for each in every if each.annotation is None and each.arg not in ("self", "cls")]
+            assert not untyped, f"{function.name}: {untyped}"
+            assert function.returns or function.name == "__init__", f"{function.name} says not what it returns"
 
 
 def test_the_public_names_are_found():

@@ -6,6 +6,7 @@ Judges: the same motion as a record, the same model as one of the package.
 import diffrax
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -253,3 +254,12 @@ def test_a_class_that_closes_over_a_traced_number():
     assert float(slope) == pytest.approx(expected, rel=1e-6)
     many = jax.vmap(peak)(jnp.array([1 - step, 1.0, 1 + step]))
     np.testing.assert_allclose(many, [below, float(value), above], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_orbit_of_functions_is_drawn():
+    """Of functions no manifold is known: the equilibria stand alone."""
+    model = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
+    axis = rk.plot.phase(rk.simulate(BLOCK, rk.SinePulse(0.3, 0.6), model))
+    assert axis.get_legend() is None and len(axis.lines) == 4
+    plt.close(axis.figure)

@@ -2,7 +2,6 @@
 
 from typing import Annotated, Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
@@ -10,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 from jaxrock._arguments import arguments, pair, word_of
 from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.mesh import section_of
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
@@ -18,12 +17,35 @@ from jaxrock.blocks.rigid import GRAVITY, Side
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
+Ratios = tuple[ArrayLike, ArrayLike] | AbstractRestitution | None
 
 _LARGEST = "be at most p1/sqrt(2 sqrt(inertia_ratio (1 - inertia_ratio))), the largest about any corner"
 _gyration = Range("be 0 or more and finite, and at most 1e9", 0.0, np.inf, lambda x: (x >= 0) & (x <= 1e9))
 
 
-class AsymmetricBlock(eqx.Module):
+def _law(restitution: Ratios) -> AbstractRestitution:
+    """The law that the restitution of an asymmetric block means."""
+    if isinstance(restitution, (tuple, list)):
+        return PerSide(*pair("restitution", restitution))
+    return law_of(restitution, AngularMomentum())
+
+
+def _as_seen(corner1: Values, corner2: Values, centre: Values) -> tuple[tuple[Real, Real], tuple[Real, Real]]:
+    """Slenderness angles and distances of the centre of mass, from the corners."""
+    places = {"corner1": corner1, "corner2": corner2, "centre": centre}
+    right, left, middle = (strength(name, place) for name, place in places.items())
+    for name, place in zip(places, (right, left, middle)):
+        if place.shape != (2,):
+            raise ValueError(f"Argument `{name}` must have shape (2,), but has {place.shape}.")
+    width1 = size("corner1[0] - centre[0]", right[0] - middle[0])
+    width2 = size("centre[0] - corner2[0]", middle[0] - left[0])
+    height1 = size("centre[1] - corner1[1]", middle[1] - right[1])
+    height2 = size("centre[1] - corner2[1]", middle[1] - left[1])
+    alphas = jnp.arctan2(width1, height1), jnp.arctan2(width2, height2)
+    return alphas, (jnp.hypot(width1, height1), jnp.hypot(width2, height2))
+
+
+class AsymmetricBlock(Owner):
     """A free-standing rigid block whose two sides differ: a rock, a statue, a loaded cabinet.
 
     Side 1 is that of positive rotations, on which it stands on corner 1, the right one; side 2 that of negative
@@ -65,13 +87,14 @@ class AsymmetricBlock(eqx.Module):
         p1: ArrayLike,
         inertia_ratio: ArrayLike = 0.75,
         radius_ratio: ArrayLike | None = None,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
+        *,
+        throw: bool = True,
     ):
         self.given_radius_ratio = None
         given = {} if radius_ratio is None else {"given_radius_ratio": radius_ratio}
         set_parameters(self, alpha1=alpha1, alpha2=alpha2, p1=p1, inertia_ratio=inertia_ratio, **given)
-        two = isinstance(restitution, (tuple, list))
-        self.law = PerSide(*pair("restitution", restitution)) if two else law_of(restitution, AngularMomentum())
+        self.law = _law(restitution)
 
     @classmethod
     @with_throw
@@ -82,8 +105,10 @@ class AsymmetricBlock(eqx.Module):
         R1: ArrayLike,
         R2: ArrayLike,
         gyration_radius: ArrayLike,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the distances of its corners to the centre of mass, and its inertia.
 
@@ -113,7 +138,9 @@ class AsymmetricBlock(eqx.Module):
         p1: ArrayLike,
         p2: ArrayLike,
         inertia_ratio: ArrayLike = 0.75,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the frequency parameters about both corners.
 
@@ -143,8 +170,10 @@ class AsymmetricBlock(eqx.Module):
         corner2: Values,
         centre: Values,
         gyration_radius: ArrayLike,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,
+        *,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a block from the places of its corners and of its centre of mass, at rest.
 
@@ -158,17 +187,7 @@ class AsymmetricBlock(eqx.Module):
 
         **Raises:** ValueError where the block would not stand.
         """
-        places = {"corner1": corner1, "corner2": corner2, "centre": centre}
-        right, left, centre = (strength(name, place) for name, place in places.items())
-        for name, place in zip(places, (right, left, centre)):
-            if place.shape != (2,):
-                raise ValueError(f"Argument `{name}` must have shape (2,), but has {place.shape}.")
-        width1 = size("corner1[0] - centre[0]", right[0] - centre[0])
-        width2 = size("centre[0] - corner2[0]", centre[0] - left[0])
-        height1 = size("centre[1] - corner1[1]", centre[1] - right[1])
-        height2 = size("centre[1] - corner2[1]", centre[1] - left[1])
-        alphas = jnp.arctan2(width1, height1), jnp.arctan2(width2, height2)
-        radii = jnp.hypot(width1, height1), jnp.hypot(width2, height2)
+        alphas, radii = _as_seen(corner1, corner2, centre)
         return cls.from_radii(*alphas, *radii, gyration_radius, restitution, gravity)
 
     @classmethod
@@ -181,8 +200,9 @@ class AsymmetricBlock(eqx.Module):
         supports: Annotated[tuple[int, int] | None, pair] = None,
         centre: Values | None = None,
         gyration_radius: ArrayLike | None = None,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build a homogeneous block from the polygon of its outline, in the plane of rocking.
 
@@ -202,8 +222,8 @@ class AsymmetricBlock(eqx.Module):
         that face, and not rock about the corner.
         """
         shape = Outline.of(outline)
-        right, left, *rest = shape.standing(supports, centre, gyration_radius)
-        block = cls.from_corners(right, left, *rest, restitution, gravity)
+        right, left, middle, gyration = shape.standing(supports, centre, gyration_radius)
+        block = cls.from_corners(right, left, middle, gyration, restitution, gravity)
         for corner, side, alpha in ((right, 1, block.alpha1), (left, -1, block.alpha2)):
             shape.check_rolling(corner, side, float(alpha))
         return block
@@ -219,8 +239,9 @@ class AsymmetricBlock(eqx.Module):
         base: Annotated[str, word_of("narrow", "wide")] = "narrow",
         unit: Annotated[str, word_of("m", "cm", "mm")] = "m",
         tolerance: ArrayLike | None = None,
-        restitution: tuple[ArrayLike, ArrayLike] | AbstractRestitution | None = None,
+        restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ) -> "AsymmetricBlock":
         """Build the block that a rock is in the vertical plane of an azimuth, from the mesh of its surface.
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, below_one, checked, one_of, size, whole, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
 from jaxrock.blocks.rigid import GRAVITY
@@ -18,7 +18,7 @@ Real = Inexact[Array, "..."]
 _stiff = Range("be positive and finite, from 1e-9 to 1e30", 0.0, math.inf, lambda x: (x >= 1e-9) & (x <= 1e30))
 
 
-class FlexibleBlock(eqx.Module):
+class FlexibleBlock(Owner):
     """A rectangular elastic block that rocks: lumped masses on a cantilever whose base is a rocking spring (mmSM).
 
     Small rotations: the column of length 2R carries the ground's acceleration times cos(alpha), and its base turns
@@ -83,6 +83,7 @@ class FlexibleBlock(eqx.Module):
         impacts: str = "alternate",
         base: str = "linear",
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ):
         self.damping = one_of("damping", damping, ("stiffness", "modal", "rayleigh"))
         self.impacts = one_of("impacts", impacts, ("alternate", "every"))

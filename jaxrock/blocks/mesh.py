@@ -34,8 +34,8 @@ class Section(NamedTuple):
     @property
     def slenderness(self) -> tuple[float, float]:
         """Angles of the centre of mass over the right and the left point [rad]."""
-        away = (self.right - self.centre, self.left - self.centre)
-        return tuple(float(np.arctan2(abs(each[0]), -each[1])) for each in away)
+        right, left = self.right - self.centre, self.left - self.centre
+        return float(np.arctan2(abs(right[0]), -right[1])), float(np.arctan2(abs(left[0]), -left[1]))
 
 
 class Rock(NamedTuple):
@@ -117,8 +117,8 @@ class Rock(NamedTuple):
         points = np.stack([(self.vertices - self.centre)[:, :2] @ _direction(azimuth), self.vertices[:, 2]], axis=1)
         last = [_rolled(points * [side, 1], corner * [side, 1], self.centre[2]) * [side, 1]
                 for side, corner in ((1, narrow.right), (-1, narrow.left))]  # fmt: skip
-        rolls = tuple(not np.allclose(end, corner) for end, corner in zip(last, (narrow.right, narrow.left)))
-        found = narrow._replace(rolls=rolls)
+        right, left = (not np.allclose(end, corner) for end, corner in zip(last, (narrow.right, narrow.left)))
+        found = narrow._replace(rolls=(right, left))
         return found._replace(right=last[0], left=last[1]) if base == "wide" else found
 
     @arguments
@@ -133,10 +133,10 @@ class Rock(NamedTuple):
         """The section by the points on the ground alone."""
         along = _direction(azimuth)
         places = (self.base[:, :2] - self.centre[:2]) @ along
-        ends = [np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin())]
+        right, left = (np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin()))
         axis = np.array([-along[1], along[0], 0.0])
         return Section(
-            *ends, np.array([0.0, self.centre[2]]), float(np.sqrt(axis @ self.inertia @ axis)), (False, False)
+            right, left, np.array([0.0, self.centre[2]]), float(np.sqrt(axis @ self.inertia @ axis)), (False, False)
         )
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, checked, not_negative, share, size, together, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]
@@ -52,7 +52,7 @@ class Corners(NamedTuple):
     side: int = 1
 
 
-class AbstractRestitution(eqx.Module):
+class AbstractRestitution(Owner):
     """A law of restitution. Its fields are parameters, such as derivatives are taken by."""
 
     __repr__ = described
@@ -98,7 +98,7 @@ class Constant(AbstractRestitution):
     value: Real = parameter("-", share, symbol="e", argument="restitution")
 
     @with_throw
-    def __init__(self, value: ArrayLike):
+    def __init__(self, value: ArrayLike, *, throw: bool = True):
         set_parameters(self, value=value)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
@@ -127,7 +127,7 @@ class Housner(AbstractRestitution):
     inertia_ratio: Real | None = parameter("-", ratio_of_inertia)
 
     @with_throw
-    def __init__(self, inertia_ratio: ArrayLike | None = None):
+    def __init__(self, inertia_ratio: ArrayLike | None = None, *, throw: bool = True):
         self.inertia_ratio = None if inertia_ratio is None else ratio_of_inertia("inertia_ratio", inertia_ratio)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
@@ -178,7 +178,7 @@ class PerSide(AbstractRestitution):
     second: Real = parameter("-", not_negative, symbol="e2", argument="restitution")
 
     @with_throw
-    def __init__(self, first: ArrayLike, second: ArrayLike):
+    def __init__(self, first: ArrayLike, second: ArrayLike, *, throw: bool = True):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
         together(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
@@ -218,7 +218,7 @@ class SpeedDependent(AbstractRestitution):
     scale: Real = parameter("rad/s", size)
 
     @with_throw
-    def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike):
+    def __init__(self, gentle: ArrayLike, violent: ArrayLike, scale: ArrayLike, *, throw: bool = True):
         set_parameters(self, gentle=gentle, violent=violent, scale=scale)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
@@ -242,7 +242,8 @@ def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
         return alpha
     if law.inertia_ratio is None:
         widest = np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6)
-        allowed = "be at most 0.955 when `restitution` is None, because Housner's value is negative above"
+        reason = "Housner's value is negative above"
+        allowed = f"be at most 0.955, of a width of 1.41 heights, when `restitution` is None: {reason}"
         return checked("alpha", alpha, allowed, lambda x: x <= widest)
     allowed = "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative"
     return checked("alpha", alpha, allowed, lambda x: law._loss * jnp.sin(x) ** 2 <= 1 + 1e-6)
@@ -268,25 +269,30 @@ class Reset(eqx.Module):
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 
     @property
+    def _number(self) -> Real:
+        assert isinstance(self.law, Constant)
+        return self.law.value
+
+    @property
     def depends_on_speed(self) -> bool:
         """Whether the ratio does."""
         return self.law.depends_on_speed
 
     def ratio(self, speed: Real) -> Real:
         """Speed after over speed before an impact; not a number where a law gives what is none."""
-        if not self.depends_on_speed:
-            return self.law.value
+        if self.corners is None or self.p is None:
+            return self._number
         ratio = self.law.ratio(self.corners, speed * self.p)
         return jnp.where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
 
     def slope(self, speed: Real) -> Real:
         """How the speed after an impact changes with that before it."""
         if not self.depends_on_speed:
-            return self.law.value
+            return self._number
         return jax.jvp(lambda v: v * self.ratio(v), (speed,), (jnp.ones_like(speed),))[1]
 
     def most(self, speed: Real) -> Real:
         """An upper bound of the ratio of all impacts up to a speed."""
-        if not self.depends_on_speed:
-            return self.law.value
+        if self.corners is None or self.p is None:
+            return self._number
         return self.law.most(self.corners, speed * self.p)

@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import acute, rate, size, together, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.restitution import (
     AbstractRestitution,
     Corners,
@@ -20,7 +20,7 @@ from jaxrock.blocks.restitution import (
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
 
 
-class Block(eqx.Module):
+class Block(Owner):
     """A free-standing symmetric rigid block.
 
     **Arguments:**
@@ -46,7 +46,7 @@ class Block(eqx.Module):
     __repr__ = described
 
     @with_throw
-    def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None):
+    def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None, *, throw: bool = True):
         set_parameters(self, alpha=alpha, p=p)
         self.law = law_of(restitution, Housner())
         self.alpha = fitting_alpha(self.law, self.alpha)
@@ -59,6 +59,8 @@ class Block(eqx.Module):
         height: ArrayLike,
         restitution: Restitution | None = None,
         gravity: ArrayLike = GRAVITY,
+        *,
+        throw: bool = True,
     ) -> "Block":
         """Build a homogeneous rectangular block from its full sizes.
 
@@ -88,6 +90,7 @@ class Block(eqx.Module):
         *,
         inertia_ratio: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
+        throw: bool = True,
     ) -> "Block":
         """Build a block from its slenderness and the distance of its corners to the centre of mass.
 

@@ -3,6 +3,8 @@
 And what holds the column on a spring that stands for it, and what overturns that.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
@@ -140,5 +142,5 @@ def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result
 
     **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.
     """
-    left = restitution ** (2 * impacts) * amplitude * (2 - amplitude)
+    left: Any = restitution ** (2 * impacts) * amplitude * (2 - amplitude)
     return left / (1 + jnp.sqrt(1 - left))

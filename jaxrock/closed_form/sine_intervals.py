@@ -1,6 +1,6 @@
 """Every interval of intensity that overturns a block under one cycle of a sine; terms as in `sine_pulse`."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
@@ -69,7 +69,8 @@ def overturning_intervals(
     def unchanged(points):
         return (_at(points, ratio, restitution)[0] > 0) == lost[change][:, None]
 
-    ends = sum(_narrowed(samples[change], samples[change + 1], unchanged, 17)) / 2
+    low, high = _narrowed(samples[change], samples[change + 1], unchanged, 17)
+    ends = (low + high) / 2
     lower, upper = list(ends[~lost[change]]), list(ends[lost[change]])
     if lost[0]:
         lower.insert(0, searched_from)
@@ -105,7 +106,7 @@ def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarra
     """`growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
     if not points.size:
         return np.zeros(points.shape), np.zeros(points.shape, int)
-    end = arcs.follow(points.ravel(), ratio, restitution)
+    end: Any = arcs.follow(points.ravel(), ratio, restitution)
     directly = end.opening + end.speed > 1
     return arcs.growth(end, restitution).reshape(points.shape), (end.impacts + ~directly).reshape(points.shape)
 

@@ -3,6 +3,7 @@
 import argparse
 from inspect import Parameter
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +44,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "sides alpha1_deg,alpha2_deg,radius1_m,radius2_m,facing,observed",
     )
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="kind of motion (default sine)")
-    ends = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
+    ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
     parser.add_argument("--amplitude", default=(0.02, 3.0), help="range of the amplitude [g] (default 0.02 3)", **ends)
     parser.add_argument(
         "--duration", default=(0.1, 5.0), help="range of duration or period [s] (default 0.1 5)", **ends
@@ -178,7 +179,8 @@ def _write(
             for duration, amplitude, rock, complete in zip(wall.durations, wall.amplitude, wall.weakest, wall.complete):
                 name = _quoted(observations.names[int(rock)]) if rock >= 0 else ""
                 print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
-    rk.plot.feasible_region(region, estimate, wall).figure.savefig(files[3], dpi=150)
+    figure: Any = rk.plot.feasible_region(region, estimate, wall).figure
+    figure.savefig(files[3], dpi=150)
     return files
 
 

@@ -12,6 +12,7 @@ from jaxrock.command_line.cache import CACHE
 from jaxrock.command_line.fragility import FRAGILITY
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
+from jaxrock.command_line.options import as_typed
 from jaxrock.command_line.output import Report, heard
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
@@ -48,8 +49,9 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("-q", "--quiet", action="store_true", help="print nothing but what went wrong")
         sub.add_argument("-v", "--verbose", action="store_true", help="also say what the package does")
         if command.computes:
-            sub.add_argument("--model", choices=("housner", "linear"), default="housner", help="equation of motion")
-            sub.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and tables")
+            models, folder = ("housner", "linear"), Path("results")
+            sub.add_argument("--model", choices=models, default="housner", help="equation of motion (default housner)")
+            sub.add_argument("--out", type=Path, default=folder, help=f"folder for what is written (default {folder})")
         command.add_options(sub)
     return parser
 
@@ -72,7 +74,7 @@ def main(words: list[str] | None = None) -> int:
                 _prepare(arguments)
             command.run(arguments, report)
         except (ValueError, OSError) as error:
-            print(f"jaxrock: error: {error}", file=sys.stderr)
+            print(f"jaxrock: error: {as_typed(str(error), arguments)}", file=sys.stderr)
             return 2
         return report.finished()
 

@@ -1,6 +1,7 @@
 """Options that several commands have, and what they stand for."""
 
 import argparse
+import re
 from collections.abc import Callable
 from functools import partial
 from inspect import Parameter, signature
@@ -68,7 +69,8 @@ def other_parameters(pulse: type[AbstractPulse]) -> dict[str, Any]:
 
     `Parameter.empty` for one that has none.
     """
-    return {name: parameter.default for name, parameter in list(signature(pulse).parameters.items())[2:]}
+    more = list(signature(pulse).parameters.values())[2:]
+    return {each.name: each.default for each in more if each.kind is not Parameter.KEYWORD_ONLY}  # which `throw` is
 
 
 def add_pulse(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +84,7 @@ def add_pulse(parser: argparse.ArgumentParser) -> None:
             meant.setdefault(name, []).append(f"{word} (default {shown})")
             kinds[name] = str if isinstance(default, str) else number
     for name, words in meant.items():
-        parser.add_argument(_option(name), type=kinds[name], help=f"of the pulse {', '.join(words)}")
+        parser.add_argument(option_of(name), type=kinds[name], help=f"of the pulse {', '.join(words)}")
 
 
 def pulse_of(arguments: argparse.Namespace) -> Callable[..., AbstractPulse]:
@@ -93,14 +95,25 @@ def pulse_of(arguments: argparse.Namespace) -> Callable[..., AbstractPulse]:
     for name in {name for each in PULSES.values() for name in other_parameters(each)}:
         value = getattr(arguments, name)
         if value is not None and name not in parameters:
-            raise ValueError(f"Argument `{_option(name)}` is not a parameter of the pulse {arguments.pulse}.")
+            raise ValueError(f"Argument `{option_of(name)}` is not a parameter of the pulse {arguments.pulse}.")
         if value is not None:
             fixed[name] = value
     return partial(pulse, **fixed) if fixed else pulse
 
 
-def _option(name: str) -> str:
+def option_of(name: str) -> str:
+    """What an argument is called on the command line."""
     return "--" + name.replace("_", "-")
+
+
+_POSITIONAL = {"command", "record", "records", "rocks"}
+
+
+def as_typed(message: str, arguments: argparse.Namespace) -> str:
+    """A message of the package, with its arguments called as they are typed: `dt` is `--dt`, and None is not given."""
+    options = vars(arguments).keys() - _POSITIONAL
+    told = re.sub(r"`(\w+)`", lambda found: f"`{option_of(found[1])}`" if found[1] in options else found[0], message)
+    return re.sub(r"^(Argument `--.*), but is None\.$", r"\1, but is not given.", told)
 
 
 def check_points(points: int, least: int) -> None:

@@ -45,7 +45,8 @@ class Report:
     def __init__(self, command: str, as_json: bool = False, quiet: bool = False):
         self._speaks = not (as_json or quiet)
         self._as_json, self._status = as_json, 0
-        self.results, self._told = {}, {"command": command, "version": rk.__version__}
+        self.results: dict[str, Any] = {}
+        self._told: dict[str, Any] = {"command": command, "version": rk.__version__}
         self._units, self._files = {}, []
 
     def title(self, words: str) -> None:

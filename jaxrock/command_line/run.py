@@ -18,7 +18,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--duration", type=number, help="how long to follow the block [s] (default: a little past the record)"
     )
     parser.add_argument(
-        "--animate", nargs="?", const="gif", choices=("gif", "html", "mp4"), help="also write a film (default gif)"
+        "--animate", nargs="?", const="gif", choices=("gif", "html", "mp4"), help="also write a film: a GIF, or as said"
     )
     add_restitution(parser)
     add_record(parser)

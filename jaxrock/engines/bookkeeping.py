@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractStepper
@@ -13,8 +13,8 @@ from jaxrock.models.equation import Angle
 from jaxrock.numerics.xla_cpu import keep
 from jaxrock.status import Status
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 _LOST = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
 

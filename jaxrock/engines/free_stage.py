@@ -13,7 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.blocks.restitution import Reset
 from jaxrock.engines.state import surpasses
@@ -21,8 +21,8 @@ from jaxrock.models import free_swing as skewed
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class FreeStage(eqx.Module):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
@@ -23,8 +23,8 @@ from jaxrock.models.equation import Angle
 from jaxrock.numerics.elementary import logarithm
 from jaxrock.numerics.xla_cpu import keep_flag
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class _Rebound(NamedTuple):

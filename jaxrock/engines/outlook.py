@@ -3,12 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.motions.shaking import Bounds, Envelope
 from jaxrock.numerics.lookup import pick
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 _FAR, _NEAR = 256, 16  # pieces that a block at rest may skip at once
 
 
@@ -31,7 +31,7 @@ class _Ahead(eqx.Module):
             return cls(bounds, _running_maximum(values), values, values)
         return cls(bounds, _running_maximum(values), *(_sliding_maximum(values, width) for width in (_NEAR, _FAR)))
 
-    def at(self, values: Inexact[Array, " knots"], piece: Int[ArrayLike, ""]) -> Scalar:
+    def at(self, values: Inexact[Array, " knots"], piece: Int[Array, ""]) -> Scalar:
         """One of these bounds."""
         return self.bounds.times_gain(pick(values, piece))
 
@@ -47,7 +47,8 @@ class Outlook(eqx.Module):
     @classmethod
     def of(cls, envelope: Envelope, threshold: Scalar) -> "Outlook":
         """The outlook at the start."""
-        return cls(*envelope.each(_Ahead.of), threshold)
+        vertical = None if envelope.vertical is None else _Ahead.of(envelope.vertical)
+        return cls(_Ahead.of(envelope.horizontal), vertical, threshold)
 
     @property
     def strongest_drive(self) -> Scalar:
@@ -59,14 +60,14 @@ class Outlook(eqx.Module):
         weight = self.threshold * vertical.times_gain(vertical.values)
         return jnp.max(horizontal.times_gain(horizontal.values) + weight)
 
-    def _drive(self, piece: Int[ArrayLike, ""], which: str) -> Scalar:
+    def _drive(self, piece: Int[Array, ""], which: str) -> Scalar:
         """Bound of what acts against the threshold [g]; for what is at rest while |u| + threshold |v| < threshold."""
         drive = self.horizontal.at(getattr(self.horizontal, which), piece)
         if self.vertical is None:
             return drive
         return drive + self.threshold * self.vertical.at(getattr(self.vertical, which), piece)
 
-    def is_over(self, piece: Int[ArrayLike, ""]) -> Bool[Array, ""]:
+    def is_over(self, piece: Int[Array, ""]) -> Bool[Array, ""]:
         """Whether nothing from a piece on lifts a block at rest."""
         return self._drive(piece, "to_end") <= self.threshold
 
@@ -77,7 +78,7 @@ class Outlook(eqx.Module):
         far, near = (self._drive(piece, which) < self.threshold for which in ("far", "near"))
         return piece + jnp.where(far, _FAR, jnp.where(near, _NEAR, 0))
 
-    def most_helpful(self, piece: Int[ArrayLike, ""]) -> tuple[Scalar, Scalar | None]:
+    def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:
         """The forcing [g] and weight still to come that do most for a block past its saddle."""
         most, vertical = self.horizontal.at(self.horizontal.to_end, piece), self.vertical
         return most, None if vertical is None else 1 - vertical.at(vertical.to_end, piece)

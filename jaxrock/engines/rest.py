@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import Watch, first_event, meet, step_length
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 def wait(
@@ -63,7 +63,8 @@ def wait(
 def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:
     """For how long the series tell what the ground does, at most `room`."""
     length = room
-    for terms, scale in zip(shaking, (stepper.scene.threshold, 1.0)):
+    parts: list[tuple] = [(shaking.horizontal, stepper.scene.threshold), (shaking.vertical, 1.0)]
+    for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
             length = jnp.minimum(length, step_length(terms, tolerance * scale, room))
     return length

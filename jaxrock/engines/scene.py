@@ -17,7 +17,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking, sum_of_series
 from jaxrock.numerics.lookup import pick
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 _MANY = 32  # pieces, from which on there may be room for more
 
 
@@ -116,7 +116,7 @@ class Scene(eqx.Module):
         """Number of smooth pieces of the motion."""
         return self.most_pieces if self.count is None else self.count
 
-    def on(self, side: Scalar) -> "Scene":
+    def on(self, side: Scalar | float) -> "Scene":
         """The scene as a block on this side sees it; at rest as on side +1."""
         if self.far is None:
             return self

@@ -2,15 +2,15 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.uncertainty import Spread
 from jaxrock.models.equation import Angle
 from jaxrock.status import Status
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class State(eqx.Module):

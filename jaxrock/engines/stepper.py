@@ -8,18 +8,20 @@ the motion (`finish`), and to evaluate a history (`evaluate`). What all do alike
 import abc
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int, PyTree
+from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.numerics.lookup import pick
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
+Stepper = TypeVar("Stepper", bound="AbstractStepper")
 
 
 class AbstractEngine(eqx.Module):
@@ -52,11 +54,24 @@ class AbstractEngine(eqx.Module):
 class AbstractStepper(eqx.Module):
     """One scene with an engine's settings, and how far to follow it."""
 
-    scene: AbstractVar[Scene]
-    stop: AbstractVar[Scalar]  # time at which to stop [s]; infinite: at the end of the motion
-    engine: AbstractVar[AbstractEngine]
-    history: AbstractVar[bool]  # follow an overturning block down to the ground
-    doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
+    if TYPE_CHECKING:  # which would make them arguments of every subclass, in this order
+
+        @property
+        def scene(self) -> Scene: ...
+        @property
+        def stop(self) -> Scalar: ...
+        @property
+        def engine(self) -> AbstractEngine: ...
+        @property
+        def history(self) -> bool: ...
+        @property
+        def doubt(self) -> float: ...
+    else:
+        scene: AbstractVar[Scene]
+        stop: AbstractVar[Scalar]  # time at which to stop [s]; infinite: at the end of the motion
+        engine: AbstractVar[AbstractEngine]
+        history: AbstractVar[bool]  # follow an overturning block down to the ground
+        doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
 
     @abc.abstractmethod
     def advance(self, state: State) -> State:
@@ -70,9 +85,11 @@ class AbstractStepper(eqx.Module):
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
 
-    def on(self, side: Scalar) -> "AbstractStepper":
+    def on(self: Stepper, side: Scalar) -> Stepper:
         """The same for a block that stands on this side."""
-        return self if self.scene.far is None else replace(self, scene=self.scene.on(side))
+        if self.scene.far is None:
+            return self
+        return replace(self, scene=self.scene.on(side))  # type: ignore[call-arg]  # a field of all that are no base
 
     def time(self, state: State) -> Scalar:
         """Time of a state [s]."""

@@ -7,9 +7,9 @@ matrix). The estimate costs a few per cent of a step, and tells apart a verdict 
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 # Standard errors of the angle within which a touch of the ground may be a miss, and a miss a touch.
 GRAZING = 32.0
@@ -29,7 +29,7 @@ class Spread(eqx.Module):
         return cls(zero, zero, zero)
 
     @classmethod
-    def where(cls, condition: Bool[ArrayLike, ""], one: "Spread", other: "Spread") -> "Spread":
+    def where(cls, condition: Bool[Array, ""], one: "Spread", other: "Spread") -> "Spread":
         """`one` where the condition holds, else `other`."""
         return cls(*(jnp.where(condition, a, b) for a, b in zip(one._parts, other._parts)))
 
@@ -47,16 +47,16 @@ class Spread(eqx.Module):
         """Standard error of angle and velocity together [rad]."""
         return jnp.sqrt(jnp.maximum(self.xx + self.vv, 0.0))
 
-    def along(self, of_angle: Scalar, of_velocity: Scalar) -> Scalar:
+    def along(self, of_angle: Scalar | float, of_velocity: Scalar | float) -> Scalar:
         """Standard error of a quantity with these derivatives."""
         variance = of_angle**2 * self.xx + 2 * of_angle * of_velocity * self.xv + of_velocity**2 * self.vv
         return jnp.sqrt(jnp.maximum(variance, 0.0))
 
-    def plus(self, angle: Scalar, velocity: Scalar) -> "Spread":
+    def plus(self, angle: Scalar | float, velocity: Scalar | float) -> "Spread":
         """Add independent errors."""
         return Spread(self.xx + angle**2, self.xv, self.vv + velocity**2)
 
-    def _through(self, a: Scalar, b: Scalar, c: Scalar, d: Scalar) -> "Spread":
+    def _through(self, a: Scalar, b: Scalar | float, c: Scalar, d: Scalar) -> "Spread":
         """M S M' with M = [[a, b], [c, d]]."""
         return Spread(
             a * a * self.xx + 2 * a * b * self.xv + b * b * self.vv,

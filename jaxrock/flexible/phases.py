@@ -16,13 +16,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
+from jaxtyping import Array, Bool, Complex, Inexact
 
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.numerics.exponential_sums import Curve, powers
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 # Damping ratio below which the base follows the column at once, and the least that is computed with.
 UNDAMPED, _LEAST = 1e-9, 1e-13

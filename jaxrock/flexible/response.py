@@ -21,7 +21,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 
 
 class FlexibleResponse(AbstractTable):
@@ -181,7 +181,8 @@ def simulate_flexible(
     stop = _duration(block, motion, duration, throw)
     result, path = _simulate(block, motion, stop, _budget(motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    response = FlexibleResponse(time, *_along(path, time, "outputs")[:3], result, path)
+    rotation, displacement, bending = _along(path, time, "outputs")[:3]
+    response = FlexibleResponse(time, rotation, displacement, bending, result, path)
     return response if throw else marked_result(response, (block, motion, stop))
 
 

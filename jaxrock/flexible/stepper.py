@@ -7,7 +7,7 @@ polynomial that answers the motion's Taylor series. Steps end where the series d
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -19,7 +19,7 @@ from jaxrock.numerics.polynomial import step_length
 from jaxrock.numerics.roots import carried
 from jaxrock.status import Status
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 _ORDER = 16  # of the motion's Taylor series
 
 
@@ -238,7 +238,8 @@ class FlexibleScene(eqx.Module):
         length = jnp.cos(self.numbers.alpha) * self.block.length
         largest = jnp.maximum(*jnp.split(state.maxima, 2)) * jnp.stack([jnp.ones_like(length), length, length])
         largest = jnp.where(lost, jnp.inf, largest)
-        return FlexibleOutcome(*largest, state.impacts, lost, total, status)
+        rotation, displacement, bending = largest
+        return FlexibleOutcome(rotation, displacement, bending, state.impacts, lost, total, status)
 
     def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
         """Whether, without further shaking, the unstable mode outgrows all others from here on."""

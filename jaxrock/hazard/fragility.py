@@ -21,13 +21,14 @@ from jaxrock._checks import (
     share,
     together,
 )
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
 
 
-class AbstractFragility(eqx.Module):
+class AbstractFragility(Owner):
     """The probability that a rock topples, against the intensity of the shaking: what every fragility offers.
 
     One of your own needs `__call__`, and `knots` if it is not smooth.
@@ -145,17 +146,19 @@ def beside(name: str, array: Real, levels: Real) -> Real:
     return array
 
 
-class FitStatus(eqx.Enumeration):
+class FitStatus(Enumeration):
     """What became of a fit; `FitStatus[fit.status]` is the message."""
 
-    successful = "The likelihood has one maximum, and it was found."
-    separable = (
+    successful = item("The likelihood has one maximum, and it was found.")
+    separable = item(
         "No shaking that a rock survived was stronger than one that toppled it (or the reverse, or all ended alike): "
         "the likelihood only grows as the dispersion shrinks or the median leaves the data. Outcomes that overlap "
         "are needed; these only tell between which levels the median lies."
     )
-    not_growing = "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
-    not_converged = "The maximum of the likelihood was not found."
+    not_growing = item(
+        "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
+    )
+    not_converged = item("The maximum of the likelihood was not found.")
 
 
 class FragilityFit(AbstractTable):
@@ -246,7 +249,8 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     fit = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), fit, (median, dispersion))
     good = status == FitStatus.successful
     fit = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), fit)
-    return FragilityFit(*fit, highest_survived, lowest_toppled, status)
+    fragility, covariance, likelihood = fit
+    return FragilityFit(fragility, covariance, likelihood, highest_survived, lowest_toppled, status)
 
 
 def probit(z, toppled, survived):

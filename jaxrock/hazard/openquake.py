@@ -92,18 +92,19 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
     paths = [paths] if isinstance(paths, str | os.PathLike) else list_of(object, "paths")("paths", paths)
     if not paths:
         raise ValueError("Argument `paths` must be a file or a list of files, but is empty.")
-    paths = [path_of("paths", path) for path in paths]
-    files = [_read(path) for path in paths]
+    found = [path_of("paths", path) for path in paths]
+    files = [_read(path) for path in found]
     first = files[0]
-    for path, file in zip(paths, files):
+    for path, file in zip(found, files):
         for what in ("measure", "levels", "names", "positions"):
             if not np.array_equal(file[what], first[what]):
                 which = "sites" if what in ("names", "positions") else what
-                raise file_error(path.name, f"differs in its {which} from file `{paths[0].name}`.")
+                raise file_error(path.name, f"differs in its {which} from file `{found[0].name}`.")
     rates = jnp.asarray(np.stack([file["rates"] for file in files]))
     curves = HazardCurve(jnp.broadcast_to(jnp.asarray(first["levels"]), rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
-    return HazardCurves(curves, *jnp.asarray(first["positions"]).T, kinds=kinds, names=tuple(first["names"]))
+    longitude, latitude, depth = jnp.asarray(first["positions"]).T
+    return HazardCurves(curves, longitude, latitude, depth, kinds=kinds, names=tuple(first["names"]))
 
 
 def _read(path: Path) -> dict:
@@ -143,13 +144,12 @@ def _read(path: Path) -> dict:
 
 def _comment(name: str, line: str) -> tuple[float, str, str]:
     """Investigation time [years], measure and kind in the first line."""
-    time, measure = _TIME.search(line), _MEASURE.search(line)
-    if not line.startswith("#") or not time or not measure:
+    time, measure, kind = _TIME.search(line), _MEASURE.search(line), _KIND.search(line) or _OLD_KIND.match(line)
+    if not line.startswith("#") or not time or not measure or not kind:
         expected = "a comment that states investigation_time and imt, as of hazard curves by OpenQuake"
         raise file_error(name, f"line 1 should be {expected}, but is {line[:60]!r}.")
     if not _NUMBER.fullmatch(time[1]) or not 0 < float(time[1]) < np.inf:
         raise file_error(name, f"line 1 states an investigation time of {time[1]!r}, which is not a positive number.")
-    kind = _KIND.search(line) or _OLD_KIND.match(line)
     return float(time[1]), next(filter(None, measure.groups())), kind[1]
 
 

@@ -27,6 +27,7 @@ from jaxrock._checks import (
     together,
 )
 from jaxrock._parameters import one_of_many
+from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
@@ -292,7 +293,9 @@ def simulated_surface(
     return SimulatedSurface(acceleration, ratio, np.stack(parts))
 
 
-def _verdicts(blocks: Block, group: AbstractMotion, factors: np.ndarray, model, engine, progress) -> np.ndarray:
+def _verdicts(
+    blocks: Block | AsymmetricBlock, group: AbstractMotion, factors: np.ndarray, model, engine, progress
+) -> np.ndarray:
     """(motions, levels, draws) of a stack of motions, scaled by factors (motions, levels)."""
     draws = jax.tree.leaves(blocks)[0].shape[0]
     motions, levels = factors.shape

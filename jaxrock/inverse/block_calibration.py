@@ -25,17 +25,22 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
+from jaxrock.status import Enumeration, item
 from jaxrock.studies.suite_scenes import scenes
 
 _STARTS = 6  # points of a net from which the likelihood is climbed
 
 
-class CalibrationStatus(eqx.Enumeration):
+class CalibrationStatus(Enumeration):
     """What became of a calibration; `CalibrationStatus[found.status]` is the message."""
 
-    successful = "The likelihood has a maximum within the ranges, and it was found."
-    at_an_end = "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."
-    not_converged = "The maximum of the likelihood was not found, or is flat: some parameter is not told by the tests."
+    successful = item("The likelihood has a maximum within the ranges, and it was found.")
+    at_an_end = item(
+        "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."
+    )
+    not_converged = item(
+        "The maximum of the likelihood was not found, or is flat: some parameter is not told by the tests."
+    )
 
 
 class BlockCalibration(AbstractTable):

@@ -1,6 +1,6 @@
 """What rocks say about a motion, as a function for optimisers and samplers of any library."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import equinox as eqx
@@ -50,7 +50,7 @@ class LogDensity(eqx.Module):
         return self.problem.values(self.place(self._checked(point)))
 
     @arguments
-    def point(self, values: dict[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
+    def point(self, values: Mapping[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
         """The point of parameters by name; infinite at the ends of their ranges, not a number outside."""
         if set(values) != set(self.names):
             raise ValueError(f"Argument `values` must hold {', '.join(self.names)}, but holds {', '.join(values)}.")

@@ -27,6 +27,7 @@ from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.numerics.climb import Summits, climb
+from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
 _SCREENED = 4  # points for each start, of which the best are taken
@@ -41,27 +42,27 @@ _COMPUTED = 0.5  # of the possible scenes at the maximum
 _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
 
 
-class EstimateStatus(eqx.Enumeration):
+class EstimateStatus(Enumeration):
     """What became of an estimate; `EstimateStatus[estimate.status]` is the message."""
 
-    successful = "One maximum stands out, and every interval lies within the range that was searched."
-    open_interval = (
+    successful = item("One maximum stands out, and every interval lies within the range that was searched.")
+    open_interval = item(
         "The observations leave a parameter open: an interval ends at the range that was searched, not where the "
         "observations end it. More rocks near the boundary, or a prior, would close it."
     )
-    no_information = (
+    no_information = item(
         "The observations tell nothing: every motion in the range explains them about equally well. Intervals are the "
         "ranges that were searched."
     )
-    contradictory = (
+    contradictory = item(
         "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
         "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
     )
-    not_computed = (
+    not_computed = item(
         "Under the best motion the responses of rocks were mostly too close to call, or could not be computed: nothing "
         "can be said. Look at the motion, or set the engine."
     )
-    not_converged = "The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none."
+    not_converged = item("The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none.")
 
 
 class Estimate(AbstractTable):
@@ -211,7 +212,8 @@ def _beside(evaluate: Evaluator, summits: Summits) -> np.ndarray:
 
 
 def _joined(more: Summits, summits: Summits) -> Summits:
-    return Summits(*(np.concatenate(pair) for pair in zip(more[:3], summits[:3])))
+    points, values, arrived = (np.concatenate(pair) for pair in zip(more[:3], summits[:3]))
+    return Summits(points, values, arrived)
 
 
 def _spread(count: int, evaluate: Evaluator) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Which motions rocks allow, over two parameters: regions of likelihood, and the largest motion nobody has exceeded."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import equinox as eqx
@@ -51,8 +51,8 @@ class FeasibleRegion(AbstractTable):
 @arguments
 def feasible_region(
     likelihood: Likelihood,
-    over: dict[str, Values],
-    fixed: dict[str, ArrayLike] | None = None,
+    over: Mapping[str, Values],
+    fixed: Mapping[str, ArrayLike] | None = None,
     *,
     progress: bool | None = None,
 ) -> FeasibleRegion:
@@ -84,7 +84,8 @@ def feasible_region(
         bar.add(count)
     total = jnp.asarray(np.concatenate(terms)).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
-    return FeasibleRegion(tuple(lists), tuple(lists.values()), total, total > total.max() + np.log(0.05))
+    (first, second), (along, across) = lists, lists.values()
+    return FeasibleRegion((first, second), (along, across), total, total > total.max() + np.log(0.05))
 
 
 @eqx.filter_jit

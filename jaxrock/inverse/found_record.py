@@ -27,6 +27,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.record import Record
 from jaxrock.responses.current_model import current_model
+from jaxrock.status import Enumeration, item
 
 Real = Float[Array, "..."]
 Target = str | ArrayLike | Sequence[str | float]
@@ -36,16 +37,16 @@ _SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that,
 _USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth digit decides
 
 
-class RecordStatus(eqx.Enumeration):
+class RecordStatus(Enumeration):
     """What became of a search for a record; `RecordStatus[found.status]` is the message."""
 
-    successful = "The margins are as wanted. No record near this one that does as much is nearer to the start."
-    unchanged = "The margins are as wanted under the record as it is."
-    useless_slopes = (
+    successful = item("The margins are as wanted. No record near this one that does as much is nearer to the start.")
+    unchanged = item("The margins are as wanted under the record as it is.")
+    useless_slopes = item(
         "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
         "long that slopes lead nowhere, and digits of the record decide that nobody measures. There are nearer ones."
     )
-    not_reached = (
+    not_reached = item(
         "No change was found that makes margins as wanted: none on straight lines from the start, nor on the way of "
         "the optimiser. More `starts`, a wider `band`, or fewer blocks may help."
     )

@@ -25,21 +25,24 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.least_squares import Covariance, Minimum, Problem, Progression, covariance, least_squares
+from jaxrock.status import Enumeration, item
 
 _GROWTH = 1.6  # from window to window
 _WIDE = 0.25  # relative standard error, from which on straight lines in the parameters no longer describe the data
 
 
-class HistoryStatus(eqx.Enumeration):
+class HistoryStatus(Enumeration):
     """What became of a fit to a history; `HistoryStatus[fit.status]` is the message."""
 
-    successful = "A minimum of the sum of squares was found, and it tells every parameter."
-    not_identified = (
+    successful = item("A minimum of the sum of squares was found, and it tells every parameter.")
+    not_identified = item(
         "The data do not tell the parameters apart: along some combination of them the standard error is so wide that "
         "intervals mean little. See `warnings` for what is known; fit fewer parameters, or larger rotations."
     )
-    not_converged = "No start came to a minimum of the sum of squares. Better starting values or more starts may help."
-    not_simulated = "No start could be simulated to the end of the data: the numbers are not results."
+    not_converged = item(
+        "No start came to a minimum of the sum of squares. Better starting values or more starts may help."
+    )
+    not_simulated = item("No start could be simulated to the end of the data: the numbers are not results.")
 
 
 class HistoryFit(AbstractTable):
@@ -246,7 +249,7 @@ def _fit(scene: FittedScene, minimum: Minimum, spread: Covariance, problem, rota
         agreement=minimum.agreement,
         block=block,
         motion=motion,
-        initial=tuple(float(x) for x in initial),
+        initial=(float(initial[0]), float(initial[1])),
         status=status,
         warnings=tuple(warnings),
     )

@@ -1,6 +1,7 @@
 """What a fit to a measured history simulates: the scene, and the coordinates in which its parameters are fitted."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,7 +27,7 @@ from jaxrock.studies.parameters import declarations, named, rebuilt
 
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
 
-_USUAL = {
+_USUAL: dict[type, tuple[str, ...]] = {
     Block: ("alpha", "p", "restitution", "initial"),
     AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
 }
@@ -111,7 +112,7 @@ class FittedScene(eqx.Module):
         """How far the measurement may be delayed [s]; further it would be better shifted by hand."""
         return 2 / _size(self.block)[1]
 
-    def at(self, values: dict) -> tuple[Block | AsymmetricBlock, AbstractMotion, tuple]:
+    def at(self, values: dict) -> tuple[Any, AbstractMotion, tuple]:
         """Block, motion and initial state with other parameters."""
         before = named(self.block, self.motion)
         block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})

@@ -20,7 +20,7 @@ Of an asymmetric rock of which it is not known which way round it stood in the s
 both ways.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -97,7 +97,7 @@ class Likelihood(eqx.Module):
         parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
         return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
-    def log_terms(self, values: dict[str, ArrayLike], slopes: bool = True) -> Real:
+    def log_terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
         For a rock that survived or toppled the logarithm of a probability, for a measured rotation that of a density
@@ -123,11 +123,11 @@ class Likelihood(eqx.Module):
         """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
         return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
 
-    def survival(self, values: dict[str, ArrayLike]) -> Real:
+    def survival(self, values: Mapping[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return jnp.exp(self._possible(values)[0].log_probability(True))
 
-    def surprise(self, values: dict[str, ArrayLike]) -> tuple[Real, Real, Real]:
+    def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
         """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
 
         The badness is minus the log-probability; for a measured rotation half its squared distance from what is
@@ -135,7 +135,7 @@ class Likelihood(eqx.Module):
         """
         return self._surprise(self._possible(values)[0])
 
-    def terms_and_facts(self, values: dict[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
+    def terms_and_facts(self, values: Mapping[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
         """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
         of the first."""
         possible, impossible = self._possible(values, slopes=True)
@@ -160,7 +160,7 @@ class Likelihood(eqx.Module):
         measured = jnp.where((seen.seen == ROTATION) & (total > 1e-6), 0.5, 0.0)
         return badness + measured * (seen.rotation - centre) ** 2 / spread, mean + measured, variance + measured
 
-    def _possible(self, values: dict[str, ArrayLike], slopes: bool = False) -> tuple[Possible, Bool[Array, "..."]]:
+    def _possible(self, values: Mapping[str, ArrayLike], slopes: bool = False) -> tuple[Possible, Bool[Array, "..."]]:
         """What becomes of every rock in every possible scene, with first derivatives, if `slopes`; and whether there is
         no such motion."""
         seen, names = self.observations, tuple(values)

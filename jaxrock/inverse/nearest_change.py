@@ -101,12 +101,12 @@ class Search(NamedTuple):
         for begin in range(0, len(changes), _LANES):
             part = changes[begin : begin + _LANES]
             padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append(np.asarray(_reached(self.site, padded))[: len(part)])
+            found.append(np.asarray(_reached(self.site, jnp.asarray(padded)))[: len(part)])
         return np.concatenate(found)
 
     def slopes(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By how much margins fail, (blocks,), and its derivatives by the allowed changes, (blocks, n) [1/g]."""
-        margin, slopes = map(np.asarray, _margins_and_slopes(self.site, change))
+        margin, slopes = map(np.asarray, _margins_and_slopes(self.site, jnp.asarray(change)))
         side = np.asarray(self.site.side)
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)

@@ -20,6 +20,7 @@ The first line that is not a comment (#) names the columns, with their units; th
 import csv
 import difflib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -113,8 +114,10 @@ def _observations(rocks: list[dict], names: list[str] | None = None) -> Observat
     rest = (column("observed"), column("restitution")), {name: column(name) for name in known} | {"names": names}
     if "alpha2" not in rocks[0]:
         return Observations(column("alpha"), column("p"), *rest[0], **rest[1])
-    shape = [np.array(column(name)) for name in ("alpha", "alpha2", "p", "inertia_ratio", "radius_ratio")]
-    return Observations.asymmetric(AsymmetricBlock(*shape), *rest[0], facing=column("facing"), **rest[1])
+    names = ("alpha", "alpha2", "p", "inertia_ratio", "radius_ratio")
+    alpha1, alpha2, p1, inertia_ratio, radius_ratio = (np.array(column(name)) for name in names)
+    blocks = AsymmetricBlock(alpha1, alpha2, p1, inertia_ratio, radius_ratio)
+    return Observations.asymmetric(blocks, *rest[0], facing=column("facing"), **rest[1])
 
 
 def _check_comments(file: str, lines: list[str], first: int, header: list[str]) -> None:
@@ -177,7 +180,7 @@ def _rock(fields: dict[str, str]) -> dict:
 
     if called(fields["observed"]) is None:
         raise ValueError(f"`observed` must be {', '.join(SEEN)}, but is {fields['observed']!r}.")
-    rock = {"name": fields.get("name", ""), "observed": called(fields["observed"])}
+    rock: dict[str, Any] = {"name": fields.get("name", ""), "observed": called(fields["observed"])}
     if "width_m" in fields:
         rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))
     elif "alpha1_rad" in fields or "alpha1_deg" in fields:

@@ -1,7 +1,7 @@
 """What rocks have shown: which stand, which fell, how far one rocked, and how well each of them is known."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -131,7 +131,7 @@ class Observations(eqx.Module):
         restitution: Values | None = None,
         *,
         facing: Values = 0.0,
-        **known,
+        **known: Any,
     ) -> "Observations":
         """Observations of rocks whose sides differ.
 
@@ -195,6 +195,7 @@ class Observations(eqx.Module):
         if self.other is None:
             return Housner().ratio(Corners(alpha, alpha, self.p), jnp.zeros_like(alpha))
         block = self.blocks_at(alpha, self.p, None)
+        assert isinstance(block, AsymmetricBlock)
         return jnp.sqrt(block.restitution1 * block.restitution2)
 
     def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
@@ -205,8 +206,8 @@ class Observations(eqx.Module):
             root, there = jnp.sqrt(self.other.restitution_ratio), self.other
             pair = None if restitution is None else (restitution * root, restitution / root)
             values = (alpha, there.alpha_ratio * alpha, p, there.inertia_ratio, there.radius_ratio)
-            shape = jnp.shape(alpha)
-            return AsymmetricBlock(*(jnp.broadcast_to(x, shape) for x in values), pair)
+            alpha1, alpha2, p1, inertia, radii = (jnp.broadcast_to(x, jnp.shape(alpha)) for x in values)
+            return AsymmetricBlock(alpha1, alpha2, p1, inertia, radii, pair)
 
     @property
     def blocks(self) -> Block | AsymmetricBlock:
@@ -229,12 +230,13 @@ class Observations(eqx.Module):
 
 def _chosen(which: ArrayLike, count: int) -> np.ndarray:
     """Numbers of the rocks that are meant."""
-    given = np.asarray(which) if isinstance(which, (list, tuple, np.ndarray, jax.Array, int, np.integer)) else None
-    good = given is not None and given.ndim == 1 and given.size
+    known = isinstance(which, (list, tuple, np.ndarray, jax.Array, int, np.integer))
+    given = np.asarray(which if known else None)
+    good = given.ndim == 1 and given.size > 0
     if good and given.dtype == bool:
-        good = given.size == count and given.any()
+        good = given.size == count and bool(given.any())
     elif good:
-        good = given.dtype.kind in "iu" and (given >= -count).all() and (given < count).all()
+        good = given.dtype.kind in "iu" and bool(((given >= -count) & (given < count)).all())
     if not good:
         said = f"be numbers of some of {count} rocks, or a truth value for each"
         raise ValueError(f"Argument `which` must {said}, but is {shown(which)}.")

@@ -8,7 +8,7 @@ BlackJAX takes their place where one is given (see `samplers`).
 """
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.pulses import UNITS
 from jaxrock.numerics.proposals import ROUNDS, independent_proposals
+from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
 _CHAINS = 8
@@ -43,16 +44,16 @@ _ALIKE = 1.01  # R-hat
 _END = 0.02  # of a range, where samples are counted: an end is open if there are a fifth as many as of a uniform one
 
 
-class PosteriorStatus(eqx.Enumeration):
+class PosteriorStatus(Enumeration):
     """Whether samples can be trusted; `PosteriorStatus[posterior.status]` is the message."""
 
-    successful = "The chains agree, and hold enough independent samples."
-    open_interval = (
+    successful = item("The chains agree, and hold enough independent samples.")
+    open_interval = item(
         "The chains agree. The observations leave a parameter open: its distribution reaches the end of the range, "
         "which bounds it as a prior does."
     )
-    not_converged = "The chains do not agree, or there are too few independent samples. Raise `steps`."
-    contradictory = (
+    not_converged = item("The chains do not agree, or there are too few independent samples. Raise `steps`.")
+    contradictory = item(
         "The observations contradict each other (see the estimate): samples say what would hold if they did not."
     )
 
@@ -90,13 +91,14 @@ class Posterior(AbstractTable):
         flat = self.samples.reshape(-1, len(self.names))
         return jnp.quantile(flat, jnp.array([(1 - share) / 2, (1 + share) / 2]), axis=0).T
 
-    def to_arviz(self):
+    def to_arviz(self) -> Any:
         """The samples for ArviZ (an extra of its own): an `InferenceData`, or from ArviZ 1.0 on a `DataTree`."""
         import arviz
 
         samples = {name: np.asarray(self.samples[..., i]) for i, name in enumerate(self.names)}
         groups = {"posterior": samples, "sample_stats": {"lp": np.asarray(self.log_density)}}
-        return arviz.from_dict(**groups) if hasattr(arviz, "InferenceData") else arviz.from_dict(groups)
+        made: Any = arviz.from_dict
+        return made(**groups) if hasattr(arviz, "InferenceData") else made(groups)
 
     def summary(self) -> str:
         """Mean, standard deviation, quantiles and diagnostics as a table, and the status."""
@@ -208,9 +210,8 @@ class _Drawn(NamedTuple):
 def _by_proposals(problem: Problem, estimate: Estimate, wanted: _Wanted, bar: Progress) -> _Drawn:
     random, density = np.random.default_rng(wanted.seed), _Density(problem)
     low, high = np.asarray(problem.ends).T
-    settings = {"chains": _CHAINS, "points": _ROUND, "progress": lambda: bar.add(1)}
-    sampler = independent_proposals(density, low, high, **settings)
-    chains = sampler.init(_summits(problem, estimate), random)
+    sampler = independent_proposals(density, low, high, chains=_CHAINS, points=_ROUND, progress=lambda: bar.add(1))
+    chains, sizes = sampler.init(_summits(problem, estimate), random), np.zeros(0)
     for done in range(0, wanted.steps, _ROUND // _CHAINS):
         if chains.steps >= _PATIENCE and sizes.min() < _POOR * _CHAINS * chains.steps:
             chains = sampler.anew(random, chains)  # they have met something, from which there is more to learn
@@ -232,7 +233,7 @@ def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _W
     for steps in rounds_of(make, density, points, wanted.seed):
         rounds.append(steps)
         count += steps.gradients
-        places = np.asarray(density.place(np.concatenate([each.points for each in rounds])))
+        places = np.asarray(density.place(jnp.asarray(np.concatenate([each.points for each in rounds]))))
         sizes, r_hat = diagnostics(places)
         bar.add(min(len(steps.points), bar.total - bar.done))
         if len(places) >= wanted.steps or wanted.is_reached(sizes, r_hat):
@@ -242,7 +243,7 @@ def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _W
         values = _Density(problem)(places.reshape(-1, places.shape[-1])).reshape(places.shape[:-1])[: wanted.steps]
     else:
         values = np.concatenate([each.log_density for each in rounds])[: wanted.steps]
-        values = values - np.asarray(density.log_volume(points))
+        values = values - np.asarray(density.log_volume(jnp.asarray(points)))
     return _Drawn(places[: wanted.steps], values, *diagnostics(places[: wanted.steps]), count)
 
 

@@ -29,7 +29,8 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock.inverse.observations import Observations
 
-Real, Flags = Inexact[Array, "..."], Bool[Array, "..."]
+Real = Inexact[Array, "..."]
+Flags = Bool[Array, "..."]
 _APART = 0.4  # distance of nodes, in standard deviations
 _EACH_SIDE = 9  # nodes on each side of the motion itself: 3.6 standard deviations
 NODES = 2 * _EACH_SIDE + 2  # scenes that are computed for each rock
@@ -148,7 +149,7 @@ class Possible(NamedTuple):
         beyond = log_ndtr(this + jnp.minimum(near, 0.0) / slope)
         other = log_ndtr(that) + log_ndtr(far / _END_WIDTH)
         parts = jnp.concatenate([jnp.stack([beyond, other]), inner])
-        if jnp.ndim(density):
+        if not isinstance(density, float):
             parts = parts + jnp.concatenate([density[:1], density[-1:], density[1:-1]])
         return _mean_of_ways(logsumexp(parts, axis=0))
 

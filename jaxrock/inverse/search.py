@@ -36,6 +36,7 @@ class Trace(eqx.Module):
     @classmethod
     def of(cls, evaluate: Evaluator, summits: Summits) -> "Trace":
         """That of points on the way to summits."""
+        assert summits.path is not None
         points, values = summits.path
         places = jnp.asarray(evaluate.places(points))
         parameters = jnp.stack(list(evaluate.problem.values(places).values()), axis=-1)
@@ -89,7 +90,7 @@ class _Foreign:
         values, _ = self.evaluate(best)
         longest = max(len(part[2]) for part in parts)
         paths = [np.concatenate([_lengthened(np.array(part[i]), longest) for part in parts], axis=1) for i in (2, 3)]
-        return Summits(best, values, arrived & np.isfinite(values), tuple(paths))
+        return Summits(best, values, arrived & np.isfinite(values), (paths[0], paths[1]))
 
     def _together(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, list, list]:
         """The best points, whether they are those of climbers that have arrived, and all points and values."""

@@ -69,15 +69,21 @@ class Unknown(eqx.Module):
         return jnp.log(ends) if self.log else ends
 
     @property
+    def _prior(self) -> tuple[Real, Real]:
+        assert self.prior is not None
+        return self.prior
+
+    @property
     def _middle(self) -> Real:
         """The place of the prior's median."""
-        return jnp.log(self.prior[0]) if self.log else self.prior[0]
+        median, _ = self._prior
+        return jnp.log(median) if self.log else median
 
     @property
     def _away(self) -> Real:
         """How far the range is from the prior's median, in its standard deviations."""
         low, high = self.ends
-        return jnp.maximum(low - self._middle, self._middle - high) / self.prior[1]
+        return jnp.maximum(low - self._middle, self._middle - high) / self._prior[1]
 
     def log_prior(self, place: Real) -> Real:
         """Logarithm of the prior's density at a place in the range, but for a constant."""
@@ -121,7 +127,8 @@ class Problem(eqx.Module):
 
     def log_prior(self, places: Real) -> Real:
         """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
-        return sum(unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values()))
+        priors = [unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values())]
+        return sum(priors[1:], start=priors[0])
 
     def log_density(self, places: Real, slopes: bool = True) -> Real:
         """Log-likelihood and log-prior (by the places) at places, (..., parameters); with first derivatives."""
@@ -190,7 +197,7 @@ class Evaluator:
     def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
         """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
-        return tuple(np.asarray(x)[0] for x in _batch(self.problem, np.tile(place, (_LANES, 1)))[2])
+        return tuple(np.asarray(x)[0] for x in _batch(self.problem, jnp.asarray(np.tile(place, (_LANES, 1))))[2])
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of points."""

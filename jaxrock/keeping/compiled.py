@@ -5,6 +5,7 @@ import os
 import jax
 import jaxlib
 
+from jaxrock._precision import setting
 from jaxrock.keeping.folder import LARGEST, OF_JAX, folder
 
 _EMITTERS = "--xla_cpu_use_fusion_emitters"
@@ -21,7 +22,7 @@ def keep_compiled() -> None:
     """
     _compile_quickly()
     place = folder()
-    if place is None or jax.config.jax_compilation_cache_dir:
+    if place is None or setting("jax_compilation_cache_dir"):
         return
     place = place / OF_JAX
     try:

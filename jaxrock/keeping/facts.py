@@ -98,9 +98,10 @@ def _told(value: Any) -> str:
         return f"dict({', '.join(f'{_told(key)}: {_told(part)}' for key, part in value.items())})"
     if isinstance(value, type) or callable(value) and hasattr(value, "__code__"):
         return _named(value)
-    if isinstance(value, eqx.Module) or isinstance(value, tuple):
+    if isinstance(value, (eqx.Module, tuple)):
         kind = _named(type(value))
-        names = value._fields if isinstance(value, tuple) else [field.name for field in dataclasses.fields(value)]
+        named: Any = value
+        names = named._fields if isinstance(value, tuple) else [field.name for field in dataclasses.fields(value)]
         return f"{kind}({', '.join(f'{name}={_told(getattr(value, name))}' for name in names)})"
     raise _Unknown
 

@@ -8,24 +8,25 @@ acceleration u (g), every model of a rigid block reads
 A coefficient that a model does not have is None, so that nothing is computed for it.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
 from jaxrock.models import free_swing
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.numerics.elementary import sine_cosine
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 _ONE = 1.0
 
 
-def _or_zero(coefficient: Scalar | None) -> Scalar | float:
+def _or_zero(coefficient: Scalar | float | None) -> Scalar | float:
     return 0.0 if coefficient is None else coefficient
 
 
@@ -39,10 +40,10 @@ class Basis(NamedTuple):
     None: zero, or not needed.
     """
 
-    constant: Scalar | None
-    line: Scalar | None
-    sine: Scalar | None
-    cosine: Scalar | None
+    constant: Any
+    line: Any
+    sine: Any
+    cosine: Any
 
     @classmethod
     def at(cls, angle: Angle) -> "Basis":
@@ -68,13 +69,13 @@ class Basis(NamedTuple):
 class Terms(eqx.Module):
     """A moment, or an arm: coefficients of 1, x, sin x and cos x; None where there is no such term."""
 
-    constant: Scalar | None = None
-    line: Scalar | None = None
-    sine: Scalar | None = None
-    cosine: Scalar | None = None
+    constant: Scalar | float | None = None
+    line: Scalar | float | None = None
+    sine: Scalar | float | None = None
+    cosine: Scalar | float | None = None
 
     @property
-    def coefficients(self) -> tuple[Scalar | None, ...]:
+    def coefficients(self) -> tuple[Scalar | float | None, ...]:
         """In the order of `Basis`."""
         return self.constant, self.line, self.sine, self.cosine
 
@@ -83,7 +84,7 @@ class Terms(eqx.Module):
         """Whether sin x or cos x appear at all."""
         return self.sine is not None or self.cosine is not None
 
-    def along(self, basis: Basis, empty=0.0):
+    def along(self, basis: Basis, empty: Any = 0.0) -> Any:
         """The sum of coefficients times functions; `empty` where there is none."""
         products = self.products(basis)
         return sum(products, start=0.0) if products else empty
@@ -94,7 +95,7 @@ class Terms(eqx.Module):
         pairs = pairs if sign is None else [(sign * c, f) for c, f in pairs]
         return [c if f is _ONE else c * f for c, f in pairs]
 
-    def each(self, function, *others) -> "Terms":
+    def each(self, function: Callable, *others: Any) -> "Terms":
         """Terms that a function makes of every coefficient there is, and of what stands in its place in `others`."""
         pairs = zip(self.coefficients, *others)
         return Terms(*(None if c is None else function(c, *more) for c, *more in pairs))
@@ -119,7 +120,7 @@ class Coefficients(AbstractMoments):
     arm_terms: Terms
     known_saddle: Scalar | None = None  # where it is known beforehand, because the coefficients change on the way
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         moment = self.restoring_terms
         straight = moment.constant is not None and moment.line is not None and not moment.trigonometric
         if not straight and (moment.sine is None or moment.line is not None):
@@ -133,7 +134,7 @@ class Coefficients(AbstractMoments):
         """The coefficients alone."""
         return self if self.known_saddle is None else replace(self, known_saddle=None)
 
-    def times(self, factor: Scalar) -> "Coefficients":
+    def times(self, factor: Scalar | float) -> "Coefficients":
         """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
         return replace(jax.tree.map(lambda c: factor * c, self.bare), known_saddle=self.saddle)
 
@@ -179,8 +180,8 @@ class Coefficients(AbstractMoments):
         """How fast the restoring moment falls at the saddle: k in k sin(saddle - x), or k (saddle - x)."""
         moment = self.restoring_terms
         if not self.sinusoidal:
-            return -moment.line
-        height = jnp.hypot(moment.sine, _or_zero(moment.cosine))
+            return jnp.asarray(-_or_zero(moment.line))
+        height = jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine))
         return height if moment.constant is None else jnp.sqrt((height - moment.constant) * (height + moment.constant))
 
     @property
@@ -196,8 +197,8 @@ class Coefficients(AbstractMoments):
         if self.known_saddle is not None:
             return self.known_saddle
         if not self.sinusoidal:
-            return -moment.constant / moment.line
-        middle = jnp.arctan2(_or_zero(moment.cosine), -moment.sine)
+            return -_or_zero(moment.constant) / jnp.asarray(moment.line)
+        middle = jnp.arctan2(_or_zero(moment.cosine), -_or_zero(moment.sine))
         return middle if moment.constant is None else middle + jnp.arctan2(moment.constant, self.stiffness)
 
     def manifold(self, x: Scalar) -> Scalar:

@@ -5,27 +5,28 @@ the restoring moment and s u times the overturning arm, both over m g R, and wha
 """
 
 import abc
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
+from jaxrock._parameters import Owner
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.numerics.elementary import sine_cosine
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 
 class Angle(NamedTuple):
     """An angle [rad] with its sine and cosine, which are computed once."""
 
-    value: Scalar
-    sine: Scalar
-    cosine: Scalar
+    value: Any
+    sine: Any
+    cosine: Any
 
     @classmethod
-    def of(cls, value: Scalar) -> "Angle":
+    def of(cls, value: Scalar | float) -> "Angle":
         """An angle from its value, between 0 and pi/2 or a little beyond."""
         return cls(value, *sine_cosine(jnp.asarray(value)))
 
@@ -33,10 +34,21 @@ class Angle(NamedTuple):
 class AbstractMoments(eqx.Module):
     """The moments that act on one block on one of its corners, and what follows from them."""
 
-    saddle: eqx.AbstractVar[Scalar]  # opening angle of the unstable equilibrium: it balances on its corner [rad]
-    stiffness: eqx.AbstractVar[Scalar]  # how fast the restoring moment falls there; 1 where that is not known
-    restoring_at_rest: eqx.AbstractVar[Scalar]  # restoring moment just after uplift, positive
-    arm_at_rest: eqx.AbstractVar[Scalar]  # overturning arm just after uplift, positive
+    if TYPE_CHECKING:  # which would make them arguments of every subclass, where they are mostly properties
+
+        @property
+        def saddle(self) -> Scalar: ...
+        @property
+        def stiffness(self) -> Scalar: ...
+        @property
+        def restoring_at_rest(self) -> Scalar: ...
+        @property
+        def arm_at_rest(self) -> Scalar: ...
+    else:
+        saddle: eqx.AbstractVar[Scalar]  # opening angle of the unstable equilibrium: it balances on its corner [rad]
+        stiffness: eqx.AbstractVar[Scalar]  # how fast the restoring moment falls there; 1 where that is not known
+        restoring_at_rest: eqx.AbstractVar[Scalar]  # restoring moment just after uplift, positive
+        arm_at_rest: eqx.AbstractVar[Scalar]  # overturning arm just after uplift, positive
 
     @abc.abstractmethod
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
@@ -55,7 +67,7 @@ class AbstractMoments(eqx.Module):
         """How fast nearby angles part, per angle: the derivative of the acceleration by the angle."""
 
     @abc.abstractmethod
-    def times(self, factor: Scalar) -> "AbstractMoments":
+    def times(self, factor: Scalar | float) -> "AbstractMoments":
         """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
 
     @abc.abstractmethod
@@ -77,7 +89,7 @@ class AbstractMoments(eqx.Module):
         return change if vertical is None else change + vertical * self.restoring_at_rest
 
 
-class AbstractEquation(eqx.Module):
+class AbstractEquation(Owner):
     """An equation of motion of rigid blocks. Models of the package are such, and a model of your own may be.
 
     A subclass says in `moments` what acts on a block: `Coefficients`, where restoring moment and arm are sums of a

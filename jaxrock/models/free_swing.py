@@ -9,13 +9,13 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
 from jaxrock.numerics.elementary import exponential, sine_cosine, sine_lag, sine_ratio
 from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.numerics.roots import bracketed_root
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 # As many as leave an error below that of rounding in the energy: with 24, 1e-15 up to lengths of 10 (a turn 1e-4 from
 # the balance), and 1e-11 at 35, where rounding decides whether it turns at all.

@@ -104,12 +104,12 @@ class FunctionMoments(AbstractMoments):
 
     function: Callable
     block: Block | Side
-    factor: Scalar | None  # of all accelerations (see `times`)
+    factor: Scalar | float | None  # of all accelerations (see `times`)
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
 
-    def __init__(self, function: Callable, block: Block | Side, factor: Scalar | None = None):
+    def __init__(self, function: Callable, block: Block | Side, factor: Scalar | float | None = None):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
         zero = Angle.of(jnp.zeros_like(block.alpha))
         self.restoring_at_rest = guarded(
@@ -129,7 +129,7 @@ class FunctionMoments(AbstractMoments):
         value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
         return value if self.factor is None else self.factor * value
 
-    def times(self, factor: Scalar) -> "FunctionMoments":
+    def times(self, factor: Scalar | float) -> "FunctionMoments":
         """As for any moments."""
         return FunctionMoments(self.function, self.block, factor)
 
@@ -151,7 +151,8 @@ class FunctionMoments(AbstractMoments):
     @property
     def stiffness(self) -> Scalar:
         """One, or the factor: nothing else is known of the shape of the function."""
-        return jnp.ones_like(self.saddle) if self.factor is None else self.factor
+        one = jnp.ones_like(self.saddle)
+        return one if self.factor is None else self.factor * one
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; infinite, because nothing is known of the function beyond this angle."""

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -76,8 +76,8 @@ def is_vertical(record: Record) -> bool:
     return bool(_VERTICAL.fullmatch(record.origin.component))
 
 
-def _is_column(value) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0
+def _is_column(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 0)
 
 
 @arguments
@@ -87,7 +87,7 @@ def read_components(
     columns: Annotated[
         Sequence[int] | None, list_of((lambda each: isinstance(each, (int, np.integer))), "columns")
     ] = None,
-    **given,
+    **given: Any,
 ) -> Components:
     """Read the components of one record together.
 
@@ -119,4 +119,5 @@ def read_components(
         said = [records[k].origin.component for k in upward]
         raise ValueError(f"Argument `paths` must hold two horizontal components, but {said} are vertical.")
     vertical = records.pop(upward[0] if upward else 2) if len(records) == 3 else None
-    return Components(*records, vertical)
+    first, second = records
+    return Components(first, second, vertical)

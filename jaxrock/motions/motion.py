@@ -6,24 +6,26 @@ in units of g; positive acceleration drives negative rotation.
 """
 
 import abc
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact, Int
+from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import parameter, set_parameters
+from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.lookup import count_up_to
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Piece = Int[Array, ""]  # number of a smooth piece
 
 
-class AbstractMotion(eqx.Module):
+class AbstractMotion(Owner):
     """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
     __repr__ = described
@@ -56,7 +58,7 @@ class AbstractMotion(eqx.Module):
         """An upper bound of the absolute acceleration within each piece [g]."""
 
     @abc.abstractmethod
-    def series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         """Taylor coefficients of the acceleration [g] about `local` seconds after knot `piece`.
 
         Coefficient k multiplies (elapsed time / unit)^k. A motion that is a polynomial returns
@@ -68,7 +70,7 @@ class AbstractMotion(eqx.Module):
         """An upper bound of the absolute vertical acceleration within each piece [g]; None: the ground has none."""
         return None
 
-    def vertical_series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         """As `series`, of the vertical acceleration, positive upward [g]."""
         return None
 
@@ -108,7 +110,7 @@ class AbstractMotion(eqx.Module):
         return WithVertical(self, vertical)
 
     @with_throw
-    def shifted(self, delay: ArrayLike) -> "Shifted":
+    def shifted(self, delay: ArrayLike, *, throw: bool = True) -> "Shifted":
         """The same motion after `delay` seconds of quiet (0 or more)."""
         return Shifted(self, delay)
 
@@ -139,12 +141,12 @@ class _Changed(AbstractMotion):
         """The bounds of both components."""
 
     @property
-    def bounds(self):
+    def bounds(self) -> Inexact[Array, " pieces"]:
         horizontal = self.envelope.horizontal
         return horizontal.times_gain(horizontal.values)
 
     @property
-    def vertical_bounds(self):
+    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
         vertical = self.envelope.vertical
         return None if vertical is None else vertical.times_gain(vertical.values)
 
@@ -161,29 +163,29 @@ class Scaled(_Changed):
         set_parameters(self, factor=factor)
 
     @property
-    def knots(self):
+    def knots(self) -> Inexact[Array, " knots"]:
         return self.motion.knots
 
     @property
-    def lengths(self):
+    def lengths(self) -> Inexact[Array, " pieces"]:
         return self.motion.lengths
 
     @property
-    def lateness(self):
+    def lateness(self) -> Scalar | None:
         return self.motion.lateness
 
     @property
-    def scales(self):
+    def scales(self) -> Inexact[Array, " pieces"]:
         return self.motion.scales
 
     @property
-    def envelope(self):
+    def envelope(self) -> Envelope:
         return self.motion.envelope.each(lambda bounds: bounds.scaled(self.factor))
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         return [self.factor * u for u in self.motion.series(piece, local, unit, order)]
 
-    def vertical_series(self, piece, local, unit, order):
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         terms = self.motion.vertical_series(piece, local, unit, order)
         return None if terms is None else [self.factor * v for v in terms]
 
@@ -200,36 +202,36 @@ class Shifted(_Changed):
         set_parameters(self, delay=delay)
 
     @property
-    def knots(self):
+    def knots(self) -> Inexact[Array, " knots"]:
         knots = self.motion.knots + self.delay
         return jnp.concatenate([jnp.zeros_like(knots[:1]), knots])
 
     @property
-    def lengths(self):
+    def lengths(self) -> Inexact[Array, " pieces"]:
         inner = self.motion.lengths
         return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
 
     @property
-    def lateness(self):
+    def lateness(self) -> Scalar | None:
         return self.motion.lateness
 
     @property
-    def scales(self):
+    def scales(self) -> Inexact[Array, " pieces"]:
         scales = self.motion.scales
         return jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
 
     @property
-    def envelope(self):
-        def after_quiet(bounds):
+    def envelope(self) -> Envelope:
+        def after_quiet(bounds: Bounds) -> Bounds:
             return bounds._replace(values=jnp.concatenate([jnp.zeros_like(bounds.values[:1]), bounds.values]))
 
         return self.motion.envelope.each(after_quiet)
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         inner = self.motion.series(jnp.maximum(piece - 1, 0), local, unit, order)
         return [jnp.where(piece > 0, u, 0.0) for u in inner]
 
-    def vertical_series(self, piece, local, unit, order):
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         inner = self.motion.vertical_series(jnp.maximum(piece - 1, 0), local, unit, order)
         return None if inner is None else [jnp.where(piece > 0, v, 0.0) for v in inner]
 
@@ -240,7 +242,7 @@ class _Pieces(NamedTuple):
     motion: AbstractMotion
     knots: Inexact[Array, " knots"]  # of both
 
-    def inside(self, middle: Inexact[Array, "..."]):
+    def inside(self, middle: Inexact[Array, "..."]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
         """Piece of the motion at a time strictly between knots, and whether it moves then."""
         knots = self.motion.knots
         found = count_up_to(knots, middle) if jnp.ndim(middle) == 0 else jnp.searchsorted(knots, middle, side="right")
@@ -257,7 +259,7 @@ class _Pieces(NamedTuple):
         """Bounds of the motion's pieces for the finer ones."""
         return bounds._replace(values=self.spread(bounds.values, 0.0))
 
-    def series(self, series, piece, local, unit, order) -> list[Scalar] | None:
+    def series(self, series: Callable, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         """What `series`, the motion's horizontal or vertical one, gives in a finer piece."""
         inner, moving = self.inside((self.knots[piece] + self.knots[piece + 1]) / 2)
         offset = self.knots[piece] - self.motion.knots[inner] + local
@@ -268,7 +270,7 @@ class _Pieces(NamedTuple):
 def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
     """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
 
-    def is_shifted(node):
+    def is_shifted(node: Any) -> bool:
         return isinstance(node, Shifted)
 
     if not any(map(is_shifted, jax.tree.leaves(parts, is_leaf=is_shifted))):
@@ -287,11 +289,11 @@ class Summed(AbstractMotion):
         self.first, self.second = first, second
 
     @property
-    def knots(self):
+    def knots(self) -> Inexact[Array, " knots"]:
         return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
 
     @property
-    def lateness(self):
+    def lateness(self) -> Scalar | None:
         return _lateness(self.knots, self.first, self.second)
 
     @property
@@ -299,23 +301,26 @@ class Summed(AbstractMotion):
         return _Pieces(self.first, self.knots), _Pieces(self.second, self.knots)
 
     @property
-    def scales(self):
+    def scales(self) -> Inexact[Array, " pieces"]:
         return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
 
     @property
-    def bounds(self):
-        return sum(part.spread(part.motion.bounds, 0.0) for part in self._parts)
+    def bounds(self) -> Inexact[Array, " pieces"]:
+        first, second = (part.spread(part.motion.bounds, 0.0) for part in self._parts)
+        return first + second
 
-    def series(self, piece, local, unit, order):
-        return sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts))
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
+        return (
+            sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts)) or []
+        )
 
     @property
-    def vertical_bounds(self):
+    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
         found = [(part, part.motion.vertical_bounds) for part in self._parts]
         found = [part.spread(bounds, 0.0) for part, bounds in found if bounds is not None]
-        return sum(found) if found else None
+        return functools.reduce(jnp.add, found) if found else None
 
-    def vertical_series(self, piece, local, unit, order):
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         return sum_of_series(
             *(part.series(part.motion.vertical_series, piece, local, unit, order) for part in self._parts)
         )
@@ -341,11 +346,11 @@ class WithVertical(_Changed):
         self.horizontal, self.vertical = horizontal, vertical
 
     @property
-    def knots(self):
+    def knots(self) -> Inexact[Array, " knots"]:
         return jnp.sort(jnp.concatenate([self.horizontal.knots, self.vertical.knots]))
 
     @property
-    def lateness(self):
+    def lateness(self) -> Scalar | None:
         return _lateness(self.knots, self.horizontal, self.vertical)
 
     @property
@@ -353,16 +358,16 @@ class WithVertical(_Changed):
         return _Pieces(self.horizontal, self.knots), _Pieces(self.vertical, self.knots)
 
     @property
-    def scales(self):
+    def scales(self) -> Inexact[Array, " pieces"]:
         return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
 
     @property
-    def envelope(self):
+    def envelope(self) -> Envelope:
         pairs = zip(self._parts, (self.horizontal, self.vertical))
         return Envelope(*(part.spread_bounds(motion.envelope.horizontal) for part, motion in pairs))
 
-    def series(self, piece, local, unit, order):
-        return self._parts[0].series(self.horizontal.series, piece, local, unit, order)
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
+        return self._parts[0].series(self.horizontal.series, piece, local, unit, order) or []
 
-    def vertical_series(self, piece, local, unit, order):
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         return self._parts[1].series(self.vertical.series, piece, local, unit, order)

@@ -12,7 +12,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, not_negative, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
 
 _SHORT = 64  # samples of a record that is a program of its own
 
@@ -39,7 +39,7 @@ class _Straight(AbstractMotion):
         left, right = self._ends
         return jnp.maximum(jnp.abs(left), jnp.abs(right))
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         left, right = self._ends
         slope = (right[piece] - left[piece]) / self.dt
         return [left[piece] + slope * local, slope * unit][: order + 1]
@@ -84,7 +84,9 @@ class Record(_Straight):
 
     @with_throw
     @arguments
-    def __init__(self, acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None):
+    def __init__(
+        self, acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None, *, throw: bool = True
+    ):
         samples = strength("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")

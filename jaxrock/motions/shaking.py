@@ -1,13 +1,14 @@
 """What motions tell of the ground: its acceleration as a series, and bounds of it."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, overload
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 
 
 class Shaking(NamedTuple):
@@ -16,7 +17,7 @@ class Shaking(NamedTuple):
     horizontal: list[Scalar]
     vertical: list[Scalar] | None = None
 
-    def each(self, function) -> "Shaking":
+    def each(self, function: Callable) -> "Shaking":
         """The same with the coefficients that a function makes of those of each component."""
         return Shaking(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
@@ -70,11 +71,15 @@ class Envelope(NamedTuple):
     horizontal: Bounds
     vertical: Bounds | None
 
-    def each(self, function) -> "Envelope":
+    def each(self, function: Callable) -> "Envelope":
         """The same with the bounds that a function makes of those of each component."""
         return Envelope(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
 
+@overload
+def sum_of_series(first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]: ...
+@overload
+def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None: ...
 def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None:
     """Coefficients of a sum; None is zero."""
     if first is None or second is None:

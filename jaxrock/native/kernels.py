@@ -5,6 +5,7 @@ Several threads may call such a function with the same arguments: each takes lan
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from jax.extend.core import Literal
@@ -15,6 +16,11 @@ from jaxrock.native.lists import Memory, boxed, unboxed
 from jaxrock.native.operations import Unsupported
 
 _I8, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
+
+
+def kind_of(variable: Any) -> np.dtype:
+    """The type of a variable's numbers."""
+    return variable.aval.dtype
 
 
 def is_long(shape: tuple[int, ...]) -> bool:
@@ -214,7 +220,7 @@ class _Refilled:
         for v in self.consts:
             if not isinstance(v, Literal) and v not in values:
                 values[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
-        return [self.e.known(v.val, v.aval.dtype) if isinstance(v, Literal) else values[v] for v in self.consts]
+        return [self.e.known(v.val, kind_of(v)) if isinstance(v, Literal) else values[v] for v in self.consts]
 
     def _starts(self, size: int) -> list:
         b = self.b
@@ -256,7 +262,7 @@ class _Refilled:
     def _of_scene(self, variable, k: int, scene):
         """One number of a scene."""
         if isinstance(variable, Literal):
-            value = np.asarray(variable.val, variable.aval.dtype).ravel()[k]
+            value = np.asarray(variable.val, kind_of(variable)).ravel()[k]
             kind = _I8 if value.dtype == np.bool_ else self.e.kind(value.dtype)
             return kind(int(value) if isinstance(kind, ir.IntType) else float(value))
         at = _I64(k) if self.shared[variable] else self.f.place(k, scene)

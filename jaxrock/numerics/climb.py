@@ -92,7 +92,8 @@ def climb(
         bad = active[~good]
         shorter = expected[~good] / np.maximum(2 * (expected[~good] - gain[~good]), 1e-300)
         step[bad] *= np.clip(shorter, 0.1, 0.5)
-    return Summits(points, values, arrived, tuple(map(np.array, zip(*path))))
+    places, heights = map(np.array, zip(*path))
+    return Summits(points, values, arrived, (places, heights))
 
 
 def _bfgs(inverse: np.ndarray, move: np.ndarray, change: np.ndarray) -> np.ndarray:

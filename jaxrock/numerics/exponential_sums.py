@@ -12,9 +12,9 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
 from jaxrock.numerics.roots import carried
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
-Values = Inexact[ArrayLike, "*values"]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
+Values = Inexact[Array, "*values"]
 _MOST_STRIDES = 10_000
 
 
@@ -82,7 +82,7 @@ class _Tables(eqx.Module):
             rates=rates,
             waves=turned[:3],
             sizes=jnp.abs(turned[np.array([0, 2, 3])]),
-            smooth=smooth[:3],
+            smooth=jnp.asarray(smooth[:3]),
             largest=jnp.abs(smooth[2:]),
             errors=jnp.stack([errors, errors * jnp.abs(rates)]),
             floor=sides.at[0].add(eps * jnp.abs(level)),

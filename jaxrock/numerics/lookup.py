@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Int, Shaped
 _FEW = 8
 
 
-def pick(values: Shaped[Array, " n"], index: Int[ArrayLike, ""]) -> Shaped[Array, ""]:
+def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Array, ""]:
     """`values[index]`; of a few values by comparison, because looking up does not vectorise."""
     if values.shape[0] > _FEW:
         return values[index]

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.xla_cpu import keep
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
@@ -117,7 +117,7 @@ def last_size(coefficients: list[Scalar]) -> Scalar:
     return jnp.maximum(last, 0.02 * jnp.maximum(jnp.abs(coefficients[-3]), jnp.abs(coefficients[-4])))
 
 
-def step_length(coefficients: list[Scalar], size: Scalar, cap: Scalar) -> Scalar:
+def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -> Scalar:
     """Step at which the last coefficients drop below `size`, at most `cap`."""
     order, last = len(coefficients) - 1, last_size(coefficients)
     tiny = jnp.finfo(last.dtype).tiny

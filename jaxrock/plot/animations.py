@@ -4,7 +4,7 @@ import html
 import importlib.util
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -14,12 +14,15 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.plot.bodies import AnyBlock, Body
+from jaxrock.plot.bodies import AnyBlock, Body, Shapes
 from jaxrock.plot.drawings import draw, draw_ground
 from jaxrock.plot.responses import acceleration_of
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 from jaxrock.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
 
 _LONGEST = 20.0  # seconds of a film whose speed is not given
 _FLASH = 0.12  # seconds of the film that an impact is seen
@@ -33,7 +36,7 @@ def animate(
     model: AbstractEquation = Housner(),
     speed: Values | None = None,
     fps: Annotated[int, at_least(1, 240)] = 20,
-):
+) -> "FuncAnimation":
     """Make a film of a response: the block to scale, impacts, the ground's acceleration, and at the end the verdict.
 
     **Arguments:**
@@ -52,13 +55,13 @@ def animate(
     """
     from matplotlib.animation import FuncAnimation
 
-    duration, flexible = float(response.duration), isinstance(response, FlexibleResponse)
+    duration = float(response.duration)
     rate = max(1.0, duration / _LONGEST) if speed is None else float(scalar("speed", size("speed", speed)))
     body = Body.of(_drawn(response, block), model)
     count = int(np.ceil(duration * fps / rate)) + 1
     time = np.minimum(np.arange(count) * rate / fps, duration)
     rotation, bending = np.asarray(response(time)[0]), [None] * count
-    if flexible:
+    if isinstance(response, FlexibleResponse):
         alpha, heights = float(response.scene.block.alpha), body.heights
         bending = np.asarray(response.column(time)) - np.cos(alpha) * rotation[:, None] * heights
     parts = _Parts(response, body, rate)
@@ -85,7 +88,7 @@ def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> Any
 class _Parts:
     """The figure of a film, and what moves in it."""
 
-    def __init__(self, response, body: Body, rate: float):
+    def __init__(self, response: Response | FlexibleResponse, body: Body, rate: float):
         import matplotlib.pyplot as plt
 
         self.response, self.rate = response, rate
@@ -132,7 +135,7 @@ class _Parts:
         below.set_xlabel("time [s]")
         return [axis.axvline(0, color=SAND, linewidth=1.4) for axis in (above, below)]
 
-    def show(self, time: float, shapes, over: bool) -> list:
+    def show(self, time: float, shapes: Shapes, over: bool) -> list:
         """Move everything to a time."""
         self.outline.set_xy(shapes.outline)
         self.column.set_data(*shapes.column.T)
@@ -151,7 +154,9 @@ class _Parts:
 
 
 @arguments
-def save_animation(film, path: Annotated[str | Path, path_of], *, dpi: Annotated[int, at_least(10, 1000)] = 80) -> None:
+def save_animation(
+    film: "FuncAnimation", path: Annotated[str | Path, path_of], *, dpi: Annotated[int, at_least(10, 1000)] = 80
+) -> None:
     """Write a film as its file's name says: GIF, HTML that plays by itself, or MP4.
 
     **Arguments:**
@@ -165,7 +170,8 @@ def save_animation(film, path: Annotated[str | Path, path_of], *, dpi: Annotated
     import matplotlib
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
-    fps = 1000 / film.event_source.interval
+    source: Any = film.event_source
+    fps, path = 1000 / source.interval, Path(path)
     kind = path.suffix.lower()
     if kind == ".gif":
         film.save(path, writer=PillowWriter(fps=fps), dpi=dpi)

@@ -1,14 +1,19 @@
 """Figures of closed forms: safety regions under single lobes and one cycle of a sine."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxrock.closed_form import sine_pulse, single_lobe
 from jaxrock.plot.style import GREY, RED
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def safety_regions(shape: float, axis=None, *, longest: float = 8.0, points: int = 400):
+
+def safety_regions(shape: float, axis: "Axes | None" = None, *, longest: float = 8.0, points: int = 400) -> "Axes":
     """Draw what becomes of a slender block under a single-lobe pulse of one shape, from closed forms.
 
     **Arguments:**
@@ -43,7 +48,7 @@ def safety_regions(shape: float, axis=None, *, longest: float = 8.0, points: int
     return axis
 
 
-def sine_regions(restitution: float, axis=None, *, frequency_ratio=None):
+def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ratio: ArrayLike | None = None) -> "Axes":
     """Draw the closed-form curves of overturning under one cycle of a sine over an axis or a map.
 
     **Arguments:**

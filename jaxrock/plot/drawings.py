@@ -1,5 +1,7 @@
 """Drawings of scenes, to scale: a block or the column that models it, the ground, the motion, and their symbols."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -14,25 +16,30 @@ from jaxrock.models.rigid import Housner
 from jaxrock.models.spring import Spring
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
-from jaxrock.plot.bodies import AnyBlock, Body, turned
+from jaxrock.plot.bodies import AnyBlock, Body, Shapes, turned
 from jaxrock.plot.responses import acceleration_of
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Polygon
+
 _turn = Range("be in [-pi/2, pi/2]", -np.pi / 2, np.pi / 2, lambda x: abs(x) <= np.pi / 2 + 1e-6)
 _PAPER = "#efe3c8"
-_INK = {"color": "black", "linewidth": 0.8}
+_INK: dict[str, Any] = {"color": "black", "linewidth": 0.8}
 
 
 @arguments
 def scene(
     block: AnyBlock,
     motion: AbstractMotion | None = None,
-    axis=None,
+    axis: "Axes | None" = None,
     *,
     model: AbstractEquation = Housner(),
     rotation: ArrayLike = 0.0,
     bending: ArrayLike = 0.0,
-):
+) -> "Axes":
     """Draw a block, or the spring or column that models it, to scale and with its symbols, and the motion below it.
 
     Corner O is that of positive rotations; the ground's acceleration counts to the right. Of a block that is known by
@@ -65,7 +72,7 @@ def scene(
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 5 if motion is None else 6.5), layout="constrained")
     column = None
-    if bent:
+    if bent and isinstance(block, FlexibleBlock):
         shape = unit_column(block.masses).shapes[:, 0]
         column = bent * np.concatenate([[0.0], shape / shape[-1]])
     shapes = body.pose(rotation, column)
@@ -85,7 +92,7 @@ def scene(
     return axis
 
 
-def draw_ground(axis, body: Body) -> None:
+def draw_ground(axis: "Axes", body: Body) -> None:
     """The ground with its hatching, and the arrow of its acceleration."""
     from matplotlib.patches import Polygon
 
@@ -97,12 +104,14 @@ def draw_ground(axis, body: Body) -> None:
     axis.plot(*np.transpose(surface), **_INK)
 
 
-def draw(axis, body: Body, shapes) -> tuple:
+def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Line2D]":
     """The block and its column, as artists that can be moved: outline, column, masses, spring."""
     from matplotlib.patches import Polygon
 
     modelled = bool(body.heights.size)
-    look = {"facecolor": "#f7f2e6", "edgecolor": GREY, "linestyle": "--"} if modelled else {"facecolor": _PAPER}
+    look: dict[str, Any] = (
+        {"facecolor": "#f7f2e6", "edgecolor": GREY, "linestyle": "--"} if modelled else {"facecolor": _PAPER}
+    )
     outline = Polygon(shapes.outline, **({"edgecolor": "black", "linewidth": 1.0} | look))
     axis.add_patch(outline)
     (column,) = axis.plot(*shapes.column.T, color=BLUE, linewidth=2.5, solid_capstyle="round")
@@ -114,13 +123,13 @@ def draw(axis, body: Body, shapes) -> tuple:
     return outline, column, masses
 
 
-def _between(axis, start, end, label: str, offset=(0.0, 0.0)) -> None:
+def _between(axis: "Axes", start: np.ndarray, end: np.ndarray, label: str, offset: Any = (0.0, 0.0)) -> None:
     """A measure: an arrow with two heads and its symbol."""
     axis.annotate("", start, end, arrowprops={"arrowstyle": "<->", "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0})
     axis.text(*((np.add(start, end)) / 2 + offset), label, ha="center", va="center", fontsize=11)
 
 
-def _arc(axis, centre, radius: float, first: float, last: float, label: str) -> None:
+def _arc(axis: "Axes", centre: np.ndarray, radius: float, first: float, last: float, label: str) -> None:
     """An angle between two directions [rad, counterclockwise from the right], and its symbol."""
     angle = np.linspace(first, last, 40)
     axis.plot(centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), color=RED, linewidth=1.0)
@@ -129,13 +138,13 @@ def _arc(axis, centre, radius: float, first: float, last: float, label: str) -> 
     axis.text(*place, label, color=RED, ha="center", va="center", fontsize=11)
 
 
-def _acceleration(axis, body: Body) -> None:
+def _acceleration(axis: "Axes", body: Body) -> None:
     reach, level = 0.28 * body.size, -0.21 * body.size
     axis.annotate("", (reach, level), (-reach, level), arrowprops={"arrowstyle": "->", "color": BLUE, "linewidth": 1.4})
     axis.text(1.15 * reach, level, r"$\ddot u_g$", color=BLUE, va="center", fontsize=12)
 
 
-def _symbols(axis, body: Body, rotation: float, modelled: bool) -> None:
+def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
     """Of a block with two equal sides."""
     side, size = (1 if rotation >= 0 else -1), body.size
     pivot, top = (body.right if side > 0 else body.left), body.outline[:, 1].max()
@@ -169,7 +178,7 @@ def _symbols(axis, body: Body, rotation: float, modelled: bool) -> None:
     _arc(axis, pivot, 0.45 * np.hypot(*body.centre), upright, upright + side * alpha, r"$\alpha$")
 
 
-def _sides(axis, body: Body, rotation: float) -> None:
+def _sides(axis: "Axes", body: Body, rotation: float) -> None:
     """Of a block whose sides differ."""
     pivot, gap = (body.right if rotation >= 0 else body.left), 0.08 * body.size
     _acceleration(axis, body)
@@ -188,7 +197,7 @@ def _sides(axis, body: Body, rotation: float) -> None:
                   va="top", fontsize=11)  # fmt: skip
 
 
-def _motion(axis, motion: AbstractMotion) -> None:
+def _motion(axis: "Axes", motion: AbstractMotion) -> None:
     """Ground acceleration against time, with the symbols of a pulse."""
     end = float(motion.end)
     time = np.linspace(-0.05 * end, 1.1 * end, 1501)

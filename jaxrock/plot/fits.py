@@ -1,13 +1,21 @@
 """Figures of fits to measured histories, and of records that were looked for."""
 
-import numpy as np
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxrock.blocks.rigid import Block
 from jaxrock.inverse.found_record import FoundRecord
 from jaxrock.inverse.history_fit import HistoryFit
 from jaxrock.plot.style import BLUE, GREY, RED
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def history_fit(fit: HistoryFit, time, axes=None):
+
+def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a measured and a fitted history, and what is left between them.
 
     **Arguments:**
@@ -21,7 +29,7 @@ def history_fit(fit: HistoryFit, time, axes=None):
 
     if axes is None:
         _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 4), layout="constrained", height_ratios=(2, 1))
-    alpha = float(fit.block.alpha)
+    alpha = float(fit.block.alpha if isinstance(fit.block, Block) else min(fit.block.alpha1, fit.block.alpha2))
     axes[0].plot(time, (fit.rotation + fit.residuals) / alpha, ".", color=GREY, markersize=3, label="measured")
     axes[0].plot(time, fit.rotation / alpha, color=BLUE, linewidth=1, label="fitted")
     axes[1].plot(time, fit.residuals / alpha, ".", color=RED, markersize=3)
@@ -32,7 +40,7 @@ def history_fit(fit: HistoryFit, time, axes=None):
     return axes
 
 
-def found_record(found: FoundRecord, axes=None):
+def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a record that was found, the one that was changed, and the change, in time and by frequency.
 
     **Arguments:**

@@ -1,5 +1,8 @@
 """Figures of simulated fragilities, by one and by two measures."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxrock.hazard.fragility import LogNormalFragility
@@ -7,8 +10,13 @@ from jaxrock.hazard.simulation import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
 from jaxrock.plot.style import BLUE, RED, SAND, log_ticks
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def fragility(simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis=None):
+
+def fragility(
+    simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis: "Axes | None" = None
+) -> "Axes":
     """Draw the share of blocks that topple against the level of shaking, and between which bounds it is known.
 
     **Arguments:**
@@ -40,8 +48,12 @@ def fragility(simulated: SimulatedFragility, fit: LogNormalFragility | None = No
 
 
 def fragility_surface(
-    simulated: SimulatedSurface, fit: SurfaceFragility | None = None, axis=None, *, contours=(0.05, 0.5, 0.95)
-):
+    simulated: SimulatedSurface,
+    fit: SurfaceFragility | None = None,
+    axis: "Axes | None" = None,
+    *,
+    contours: Sequence[float] = (0.05, 0.5, 0.95),
+) -> "Axes":
     """Draw the share of blocks that topple over PGV/PGA and peak acceleration, with contours.
 
     **Arguments:**

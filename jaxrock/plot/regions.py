@@ -1,5 +1,7 @@
 """Figures of motions that rocks allow."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxrock.inverse.estimate import Estimate
@@ -7,10 +9,13 @@ from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
 from jaxrock.plot.style import GREY, RED, log_ticks
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 def feasible_region(
-    region: FeasibleRegion, estimate: Estimate | None = None, wall: Unexceeded | None = None, axis=None
-):
+    region: FeasibleRegion, estimate: Estimate | None = None, wall: Unexceeded | None = None, axis: "Axes | None" = None
+) -> "Axes":
     """Draw a feasible region: the log-likelihood below its best, the 95 % region, the estimate, the unexceeded motion.
 
     **Arguments:**
@@ -46,7 +51,7 @@ def feasible_region(
     return axis
 
 
-def search(estimate: Estimate, region: FeasibleRegion | None = None, axis=None):
+def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes | None" = None) -> "Axes":
     """Draw where the search of an estimate has been: a line from each start to a dot where it ended.
 
     **Arguments:**

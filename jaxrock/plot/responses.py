@@ -1,13 +1,20 @@
 """Figures of one response: history, and orbit in the phase plane."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.flexible.response import FlexibleResponse
+from jaxrock.models.coefficients import Coefficients
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @jax.jit
@@ -29,7 +36,7 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
 
 
-def history(response: Response | FlexibleResponse, axes=None):
+def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
     **Arguments:**
@@ -87,7 +94,17 @@ def _bending_history(response: FlexibleResponse, axes):
     return axes
 
 
-def phase(response: Response, axis=None):
+def _manifold(axis: "Axes", moments: Coefficients, alpha: float) -> None:
+    """The stable manifolds of both upright saddles, and the unstable ones, dotted."""
+    opening = np.linspace(0, 2, 101)
+    manifold = np.asarray(jax.vmap(moments.manifold)(jnp.asarray(opening * alpha))) / alpha
+    for side in (1, -1):
+        label = "stable manifold" if side > 0 else None
+        axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
+        axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
+
+
+def phase(response: Response, axis: "Axes | None" = None) -> "Axes":
     """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
 
     **Arguments:**
@@ -95,7 +112,8 @@ def phase(response: Response, axis=None):
     - `response`: result of `simulate`.
     - `axis`: matplotlib axis; None makes a figure.
 
-    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns.
+    **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns. Of an `Equation`,
+    which is functions, the equilibria are drawn alone.
 
     **Raises:** ValueError for the response of a flexible block.
     """
@@ -114,12 +132,9 @@ def phase(response: Response, axis=None):
     # The line breaks at impacts: the velocity jumps there.
     crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
     axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=BLUE, linewidth=0.8)
-    opening = np.linspace(0, 2, 101)
-    manifold = np.asarray(jax.vmap(scene.moments.manifold)(jnp.asarray(opening * alpha))) / alpha
+    if isinstance(scene.moments, Coefficients):  # of functions no manifold is known
+        _manifold(axis, scene.moments, alpha)
     for side in (1, -1):
-        label = "stable manifold" if side > 0 else None
-        axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
-        axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
         axis.plot([side * float(scene.moments.saddle) / alpha], [0], "o", color=RED, markersize=4)
     axis.axvline(0, color=GREY, linewidth=0.5)
     reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
@@ -128,5 +143,6 @@ def phase(response: Response, axis=None):
     axis.set_ylim(axis.get_ylim()[0], -axis.get_ylim()[0])
     axis.set_xlabel(r"rotation $\theta/\alpha$")
     axis.set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
-    axis.legend(loc="upper right", fontsize=8, frameon=False)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(loc="upper right", fontsize=8, frameon=False)
     return axis

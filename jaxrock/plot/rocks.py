@@ -1,13 +1,19 @@
 """Figures of rocks."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.mesh import Rock
 from jaxrock.plot.style import BLUE, RED
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def slenderness(rock: Rock, axes=None, *, points: int = 360):
+
+def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int = 360) -> "Sequence[Axes]":
     """Draw slenderness and frequency parameter of a rock over azimuth, each in a polar plot.
 
     **Arguments:**

@@ -1,13 +1,19 @@
 """Figures of sensitivities and of critical amplitudes."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxrock.plot.style import BLUE, RED, SAND
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
-def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis=None):
+
+def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes | None" = None) -> "Axes":
     """Draw the elasticities of one result as bars, the largest on top.
 
     **Arguments:**
@@ -31,7 +37,14 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis=None):
     return axis
 
 
-def sensitivity_map(surface: SensitivityMap, parameter: str, result: str = "max_rotation", axis=None, *, limit=None):
+def sensitivity_map(
+    surface: SensitivityMap,
+    parameter: str,
+    result: str = "max_rotation",
+    axis: "Axes | None" = None,
+    *,
+    limit: float | None = None,
+) -> "Axes":
     """Draw the elasticity of one result by one parameter over pulse duration and uplift strength.
 
     Blocks that overturn, and responses that are not smooth there, are left grey.
@@ -63,7 +76,7 @@ def sensitivity_map(surface: SensitivityMap, parameter: str, result: str = "max_
     return axis
 
 
-def critical(abscissa, ends: Critical, axis=None):
+def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) -> "Axes":
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
 
     **Arguments:**

@@ -1,9 +1,14 @@
 """Colours that all figures share, and ticks of logarithmic axes."""
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 BLUE, RED, GREY, SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
 
 
-def log_ticks(axis):
+def log_ticks(axis: "Axes") -> "Axes":
     """Label the logarithmic axes of a figure at 1, 2, 5, 10, ..., in plain numbers, and nowhere else.
 
     **Arguments:**

@@ -1,5 +1,8 @@
 """Figures of many responses: spectra and overturning maps."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
@@ -8,12 +11,15 @@ from jaxrock.responses.arguments import engine_of
 from jaxrock.studies.borders import Region, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
 _DURATION = "pulse duration $p\\,t_d$"
 
 
-def spectrum(result: Spectrum, axes=None, *, by_duration: bool = False):
+def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
     """Draw a rocking spectrum: peak rotation and peak velocity; overturned blocks at the top edge.
 
     **Arguments:**
@@ -66,8 +72,13 @@ def spectrum(result: Spectrum, axes=None, *, by_duration: bool = False):
 
 
 def overturning(
-    result: OverturningMap, axis=None, *, by_duration: bool = False, exact: bool | None = None, safe: bool = True
-):
+    result: OverturningMap,
+    axis: "Axes | None" = None,
+    *,
+    by_duration: bool = False,
+    exact: bool | None = None,
+    safe: bool = True,
+) -> "Axes":
     """Draw an overturning map: survivors by their peak rotation, overturned without impact, overturned after impacts.
 
     **Arguments:**
@@ -127,7 +138,7 @@ def overturning(
     return axis
 
 
-def draw_region(axis, region: Region, by_duration: bool = False) -> None:
+def draw_region(axis: "Axes", region: Region, by_duration: bool = False) -> None:
     """A region of overturned blocks between its borders."""
     x, edges = np.asarray(region.frequency_ratio), (region.lower, region.upper)
     if by_duration:
@@ -138,7 +149,9 @@ def draw_region(axis, region: Region, by_duration: bool = False) -> None:
         axis.plot(x, edge, color="black", linewidth=0.5)
 
 
-def borders(result: OverturningMap, axis=None, *, by_strength: bool = False, scale: float = 1.0, **line):
+def borders(
+    result: OverturningMap, axis: "Axes | None" = None, *, by_strength: bool = False, scale: float = 1.0, **line: Any
+) -> "Axes":
     """Draw the borders of an overturning map alone: to lay several over each other.
 
     **Arguments:**

@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import as_real, checked, marked, scalar, shown, strength
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -13,8 +13,9 @@ from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 
-Scalar = Inexact[ArrayLike, ""]
-AnyBlock = Block | AsymmetricBlock | FlexibleBlock
+Scalar = Inexact[Array, ""]
+RigidBlock = Block | AsymmetricBlock
+AnyBlock = RigidBlock | FlexibleBlock
 
 USUAL = Housner()  # the model of a rigid block that nothing is said about
 
@@ -47,7 +48,9 @@ def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
     return scalar("initial[0]", rotation), scalar("initial[1]", velocity)
 
 
-def steps_of_flexible(model: AbstractEquation, initial: tuple, engine: AbstractEngine | None) -> dict[str, int]:
+def steps_of_flexible(
+    model: AbstractEquation, initial: tuple[ArrayLike, ArrayLike], engine: AbstractEngine | None
+) -> dict[str, int]:
     """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
     if model is not USUAL:
         raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
@@ -16,7 +16,7 @@ from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 _WITHIN = 8  # parts of each step at whose ends the extremes are looked for
 
 
@@ -48,11 +48,11 @@ class Contact(AbstractTable):
         return along_time(self.time, {name: (getattr(self, name), "-") for name in names})
 
     @property
-    def keeps_contact(self):
+    def keeps_contact(self) -> Bool[Array, ""]:
         """Whether the ground never had to pull."""
         return self.least_normal > 0
 
-    def sticks(self, friction: ArrayLike):
+    def sticks(self, friction: ArrayLike) -> Bool[Array, "..."]:
         """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at impacts."""
         needed = jnp.maximum(self.largest_friction, jnp.maximum(*self.friction_at_impact))
         return self.keeps_contact & (jnp.asarray(friction) >= needed)
@@ -80,18 +80,18 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     check_single(block=block)
     response.trajectory.check_single()
     if isinstance(block, Block):
-        ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (1.0, 1.0)
+        ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (jnp.ones_like(block.p),) * 2
         rates = block.p, block.p
     else:
         ratios, alphas = (block.inertia_ratio, block.inertia_ratio2), (block.alpha1, block.alpha2)
-        radii = 1.0, block.radius_ratio
+        radii = jnp.ones_like(block.p1), block.radius_ratio
         rates = block.p1, block.p2
     sides = [jnp.stack([jnp.asarray(x) for x in pair]) for pair in (ratios, alphas, rates)]
     time, rotation, velocity = response.time, response.rotation, response.velocity
     horizontal, normal = jax.vmap(lambda *at: _forces(response.scene, sides, *at))(time, rotation, velocity)
     largest, least = _extremes(response, sides)
     corners = [(r * jnp.sin(a), r * jnp.cos(a)) for r, a in zip(radii, alphas)]
-    needed = tuple(_at_impacts(response, side, corners[i], corners[1 - i]) for i, side in enumerate((1.0, -1.0)))
+    needed = _at_impacts(response, 1.0, *corners), _at_impacts(response, -1.0, *corners[::-1])
     friction = _friction(horizontal, normal)
     # Between steps, and where the block rests for good and no step is taken.
     below = jnp.abs(rotation) < jnp.where(rotation < 0, alphas[1], alphas[0])

@@ -1,6 +1,6 @@
 """The history of a block under a motion."""
 
-from typing import Annotated
+from typing import Annotated, overload
 
 import equinox as eqx
 import jax
@@ -21,13 +21,13 @@ from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 
 
 class Summary(eqx.Module):
@@ -174,6 +174,32 @@ def _peaks_of(path: Trajectory) -> tuple:
     return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
 
 
+@overload
+def simulate(
+    block: RigidBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = ...,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = ...,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    samples: int = ...,
+    throw: bool = ...,
+) -> Response: ...
+
+
+@overload
+def simulate(
+    block: FlexibleBlock,
+    motion: AbstractMotion,
+    *,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    samples: int = ...,
+    throw: bool = ...,
+) -> FlexibleResponse: ...
+
+
 @arguments
 def simulate(
     block: AnyBlock,
@@ -211,7 +237,8 @@ def simulate(
     start = start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    response = Response(time, *_evaluate(path, time), summary, path)
+    rotation, velocity = _evaluate(path, time)
+    response = Response(time, rotation, velocity, summary, path)
     return response if throw else marked_result(response, (block, motion, model, start, duration))
 
 
@@ -263,7 +290,7 @@ def _on_tape(given) -> tuple[State, State, Outcome]:
     return _steps(*given, taped=True)
 
 
-def _steps(block, motion, model, initial, stop, engine, taped: bool = False, plain: bool = False):
+def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False, plain: bool = False):
     """The state at the end of a history, the states before all steps (and after the last), and what came of it.
 
     `plain`: a step is not a thing of its own, which would have derivatives by all that it starts from.

@@ -1,6 +1,6 @@
 """What becomes of a block under a motion: peak, verdict, margin."""
 
-from typing import Annotated
+from typing import Annotated, overload
 
 import jax
 import jax.numpy as jnp
@@ -22,13 +22,13 @@ from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
+from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.recipe import Passes
 
-Scalar = Inexact[ArrayLike, "..."]
+Scalar = Inexact[Array, "..."]
 
 
 class Outcome(AbstractTable):
@@ -79,6 +79,29 @@ class Outcome(AbstractTable):
         units = {"max_rotation": "rad", "max_velocity": "rad/s", "time_of_max": "s", "clearance": "rad", "error": "rad"}
         axes = scenes(self.max_rotation.ndim)
         return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in self.__dataclass_fields__}
+
+
+@overload
+def outcome(
+    block: RigidBlock,
+    motion: AbstractMotion,
+    model: AbstractEquation = ...,
+    *,
+    initial: tuple[ArrayLike, ArrayLike] = ...,
+    engine: AbstractEngine | None = ...,
+    throw: bool = ...,
+) -> Outcome: ...
+
+
+@overload
+def outcome(
+    block: FlexibleBlock,
+    motion: AbstractMotion,
+    *,
+    duration: ArrayLike | None = ...,
+    engine: AbstractEngine | None = ...,
+    throw: bool = ...,
+) -> FlexibleOutcome: ...
 
 
 @arguments
@@ -180,7 +203,7 @@ def _passes(rounds: bool) -> Passes:
     )
 
 
-def _to_outcome(block, motion, model, initial, engine, taped: bool) -> Outcome:
+def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcome:
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))

@@ -224,8 +224,11 @@ def _critical(
         )
     names = tuple(name for name in named(*one_of_many(scenes.both, 0)) if kind.keeps(name))
     wanted = names if derivatives is None and known or derivatives else ()
-    search = _all if most is None else _lowest
-    rows = search(scenes, grid, kind, wanted, most, progress)
+    rows = (
+        _all(scenes, grid, kind, wanted, progress)
+        if most is None
+        else _lowest(scenes, grid, kind, wanted, most, progress)
+    )
     if not wanted:
         rows["derivative"] = jnp.full((*rows["value"].shape, len(names)), jnp.nan)
     return Critical(**jax.tree.map(lambda x: x[0] if scenes.single else x, rows), names=names)
@@ -237,7 +240,7 @@ _REST = {
 }  # fmt: skip
 
 
-def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], most: None, progress) -> dict:
+def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], progress) -> dict:
     """Search, find, differentiate, and sort by scenes."""
 
     def run(function, z, index):

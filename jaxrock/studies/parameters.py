@@ -1,5 +1,7 @@
 """The parameters of a scene by name: what derivatives are taken by, and what is fitted."""
 
+import operator
+
 import equinox as eqx
 import jax
 from jaxtyping import Array, Inexact
@@ -65,7 +67,7 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
     for field, known in declared(type(block)).items():
         if known.follows:
             value = following(known.follows) if getattr(block, field) is None else values[known.follows]
-            new = eqx.tree_at(lambda b, field=field: getattr(b, field), new, value, is_leaf=lambda x: x is None)
+            new = eqx.tree_at(operator.attrgetter(field), new, value, is_leaf=lambda x: x is None)
     own = _of_own(block)
     if own:
         law = eqx.tree_at(

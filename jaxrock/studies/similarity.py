@@ -67,10 +67,10 @@ class Groups(eqx.Module):
         **Source:** Voyagaki, Psycharis & Mylonakis (2012), section 2.
         """
         ratio = 2 * jnp.pi / positive("pulse_duration", pulse_duration)
-        others = {name: not_nan(name, value) for name, value in others.items()}
+        known = {name: not_nan(name, value) for name, value in others.items()}
         cos_alpha = None if cos_alpha is None else share("cos_alpha", cos_alpha)
         strength, restitution = positive("uplift_strength", uplift_strength), share("restitution", restitution)
-        return cls(ratio, strength, restitution, cos_alpha, others)
+        return cls(ratio, strength, restitution, cos_alpha, known)
 
     @property
     def pulse_duration(self) -> Real:
@@ -133,7 +133,7 @@ def groups_of(block: Block, pulse: AbstractPulse, kind: str = "rigid") -> Groups
 
 def _parts(form: Callable) -> tuple[list[str], dict[str, bool]]:
     """Of a pulse: names of its amplitude and its period or duration, and of the others, with whether they are times."""
-    known = declared(form.func if isinstance(form, functools.partial) else form)
+    known = declared(form.func if isinstance(form, functools.partial) else form)  # type: ignore[arg-type]  # a class
     names = list(known)
     return names[:2], {name: known[name].unit == "s" for name in names[2:]}
 

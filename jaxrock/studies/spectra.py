@@ -158,7 +158,7 @@ def self_similar_spectrum(
     uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
-    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    pulse: Callable[..., AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -201,7 +201,7 @@ def overturning_map(
     uplift_strength: Values | None = None,
     alpha: ArrayLike = 0.2,
     restitution: Restitution | None = None,
-    pulse: Callable[[Array, Array], AbstractMotion] = SinePulse,
+    pulse: Callable[..., AbstractMotion] = SinePulse,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -253,10 +253,12 @@ class _PulseAxes(NamedTuple):
 
 def _either(name: str, values: Values | None, other: str, others: Values | None, product: float) -> Float[Array, " n"]:
     """An axis, given by itself or by what it makes a number with."""
-    if (values is None) == (others is None):
-        which = "neither is" if values is None else "both are"
-        raise ValueError(f"Argument `{name}` must be given, or `{other}` in its place, but {which}.")
-    return axis(name, values) if others is None else product / axis(other, others)
+    if values is not None and others is None:
+        return axis(name, values)
+    if others is not None and values is None:
+        return product / axis(other, others)
+    which = "neither is" if values is None else "both are"
+    raise ValueError(f"Argument `{name}` must be given, or `{other}` in its place, but {which}.")
 
 
 def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:

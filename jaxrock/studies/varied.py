@@ -1,5 +1,7 @@
 """What is varied in a search for critical values: z is the logarithm of a factor, on the motion or on its times."""
 
+import abc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,22 @@ class AbstractVaried(eqx.Module):
 
     model: AbstractEquation
     engine: AbstractEngine | None
+
+    @abc.abstractmethod
+    def scene(self, z, block, motion):
+        """What is asked for at a factor."""
+
+    @abc.abstractmethod
+    def unit(self, block, motion):
+        """What the factor multiplies."""
+
+    @abc.abstractmethod
+    def amplitude(self, value, own):
+        """Of the motion at a critical value, where its own is given [g]."""
+
+    @abc.abstractmethod
+    def keeps(self, name: str) -> bool:
+        """Whether the critical value depends on a parameter."""
 
     def margin(self, z, block, motion):
         """Margin and outcome of the scene with the factor e^z."""

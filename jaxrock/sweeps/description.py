@@ -4,11 +4,12 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
-import jax
 import numpy as np
 
 from jaxrock._aside import written_aside
+from jaxrock._precision import setting
 from jaxrock.keeping.facts import code, version_of
 from jaxrock.sweeps.labels import RECORDS, layout_name
 
@@ -22,7 +23,7 @@ def fingerprint(axes: dict[str, np.ndarray], outer: bool, program: str) -> dict[
     return hashes | {
         "order of the axes": ", ".join(axes),
         "layout": layout_name(outer),
-        "precision": "double" if jax.config.jax_enable_x64 else "single",
+        "precision": "double" if setting("jax_enable_x64") else "single",
         "function, or what it holds": program,
         "version of jaxrock": version_of("jaxrock"),
         "code of jaxrock": code(),
@@ -46,10 +47,12 @@ class Description:
     root: dict
 
     @classmethod
-    def of(cls, axes: list[str], results: dict[str, str], block: tuple[int, ...], made_by: dict[str, str], metadata):
+    def of(
+        cls, axes: list[str], results: dict[str, str], block: tuple[int, ...], made_by: dict[str, str], metadata: dict
+    ) -> "Description":
         """From names of axes, results with their types, and what Zarr says of every array."""
         about = {"axes": axes, "results": results, "block": block, "made_by": made_by}
-        root = {
+        root: dict[str, Any] = {
             "zarr_format": 3,
             "node_type": "group",
             "attributes": {"layout": made_by["layout"], _ABOUT: json.dumps(about)},

@@ -6,7 +6,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import UInt8
 
 from jaxrock._arguments import arguments, at_least
+from jaxrock._precision import setting
 
 # Wide vectors and fused multiply-add; NaN, infinity and division stay honest. The engine's tests run with them.
 _CPU_OPTIONS = {
@@ -58,7 +59,7 @@ def use_cpu_devices(count: Annotated[int | None, at_least(1, 2**16)] = None) -> 
 
 def local_devices() -> tuple[jax.Device, ...]:
     """Devices of this process that share the work: all of the default backend, or the one chosen as default."""
-    chosen = jax.config.jax_default_device
+    chosen = setting("jax_default_device")
     return (chosen,) if isinstance(chosen, jax.Device) else tuple(jax.local_devices(backend=chosen))
 
 
@@ -110,7 +111,8 @@ def meet() -> None:
     # A collective of devices would give up after some seconds; the service that started the processes waits.
     from jax._src.distributed import global_state
 
-    global_state.client.wait_at_barrier(f"jaxrock-{next(_meetings)}", _PATIENCE * 1000)
+    client: Any = global_state.client
+    client.wait_at_barrier(f"jaxrock-{next(_meetings)}", _PATIENCE * 1000)
 
 
 def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes bytes"]:

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,6 +17,10 @@ from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, own_names, shape_of
 from jaxrock.sweeps.plan import Plan
 from jaxrock.sweeps.store import create, local, opened
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 
 class Grid(eqx.Module):
@@ -43,7 +47,7 @@ class Grid(eqx.Module):
         sizes = ", ".join(f"{name}: {np.size(values)}" for name, values in self.axes.items())
         return f"Grid({layout_name(self.outer)}, {sizes}; {', '.join(names_of(self.values))})"
 
-    def to_xarray(self):
+    def to_xarray(self) -> "xarray.Dataset":
         """The results as an `xarray.Dataset`: one variable for each result, the axes as coordinates.
 
         **Returns:** the dataset; `status` is a number there, the position of its message in `Status`.
@@ -61,7 +65,7 @@ class Grid(eqx.Module):
         }
         return xarray.Dataset(variables, coordinates, {"layout": layout_name(self.outer)})
 
-    def to_pandas(self):
+    def to_pandas(self) -> "pandas.DataFrame":
         """The results as a `pandas.DataFrame`, indexed by the axes: a column for each result, a status in words.
 
         **Raises:** as `to_xarray`; ImportError without pandas.

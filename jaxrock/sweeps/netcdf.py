@@ -22,7 +22,8 @@ class _Patient:
     """
 
     def __init__(self, file, stopped: threading.Event):
-        self._file, self._stopped, self.error = file, stopped, None
+        self._file, self._stopped = file, stopped
+        self.error: BaseException | None = None
 
     def _try(self, does, *given):
         if self._stopped.is_set():

@@ -91,7 +91,7 @@ class _Checked(eqx.Module):
 # A function is a `Program`, known by its text, or one of the package, of which there is one: what a user gives lies in
 # the scene, a pytree, by whose structure `jax.jit` tells programs apart.
 @functools.lru_cache(maxsize=32)
-def _compiled(function: Callable, mesh: Mesh) -> Callable:
+def _compiled(function: Callable, mesh: Mesh) -> Any:
     """`function(*point, scene)` over the first so many rows of points of shape (rows, devices, lanes), `_Checked`."""
 
     def on_one(points, rows, scene):

@@ -84,7 +84,7 @@ class Store:
         """
         found = {name: self.axis(name) for name in self._about["axes"]}
         _refuse(self.path, [self.path / name for name, values in found.items() if values is None])
-        return found
+        return {name: values for name, values in found.items() if values is not None}
 
     def mend(self, axes: dict[str, np.ndarray]) -> list[Path]:
         """Write again what is damaged of axes and description; which files these were."""
@@ -144,9 +144,10 @@ class Store:
         leaves, damaged = [], []
         for name, array, kind, told in zip(self.names, self._arrays, self._types, record):
             part = self._part(array, self._plan.place(number))
-            leaves.append(part if part is None else part.view(kind))
             if part is None or (self._digest(number, name, part) != told).any():
                 damaged.append(self._file(name, number))
+            else:
+                leaves.append(part.view(kind))
         return None if damaged else leaves, damaged
 
     @staticmethod
@@ -264,7 +265,7 @@ def create(
             )
     group = zarr.open_group(zarr.storage.LocalStore(path), mode="w-", zarr_format=3)
     # Damaged bytes are found before anything decompresses them.
-    usual = {"compressors": (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())}
+    usual: dict[str, Any] = {"compressors": (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())}
     usual["config"] = {"write_empty_chunks": True}
     shape = shape_of(axes.values(), outer)
     for name, leaf in leaves.items():

@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,36 @@ from jaxrock.sweeps.plan import Plan, tiles
 from jaxrock.sweeps.runner import Runner
 from jaxrock.sweeps.store import Store, listed, local, made_or_mended, of_sweep
 from jaxrock.transforms.fingerprint import Traced
+
+
+@overload
+def sweep(
+    function: Callable,
+    /,
+    *,
+    outer: bool = ...,
+    store: str | Path | None = ...,
+    load: Literal[True] = ...,
+    block: int | None = ...,
+    progress: bool | None = ...,
+    version: str | None = ...,
+    **axes: ArrayLike | Sequence[float | int],
+) -> Grid: ...
+
+
+@overload
+def sweep(
+    function: Callable,
+    /,
+    *,
+    outer: bool = ...,
+    store: str | Path,
+    load: bool,
+    block: int | None = ...,
+    progress: bool | None = ...,
+    version: str | None = ...,
+    **axes: ArrayLike | Sequence[float | int],
+) -> Grid | None: ...
 
 
 @arguments
@@ -131,7 +161,7 @@ def _there(store: Store) -> np.ndarray:
         meet()
         found = exchange(found).max(axis=0)
         others = [number for number in np.flatnonzero(found == 2) if number % count != own]
-        damaged += [file for number in others if own == 0 for file in store.look(number)[1]]
+        damaged += [file for number in others if own == 0 for file in store.look(int(number))[1]]
     if own == 0 and (files := store.mended + damaged):
         warnings.warn(
             f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.", stacklevel=4
@@ -198,11 +228,12 @@ def compute(
     left = np.flatnonzero(~done).tolist()
     mine = left[own::count]
     resumed = int(plan.sizes[done].sum())
-    if resumed and own == 0 and progress is not False:
+    if store and resumed and own == 0 and progress is not False:
         print(f"{label}: {resumed:,} of {math.prod(plan.shape):,} points come from {store.path}", file=sys.stderr)
     bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
     is_whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
-    results = None if store or is_whole else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
+    kept = not store and not is_whole
+    results = [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes] if kept else []
 
     for number in mine:
         place = plan.place(number)
@@ -220,9 +251,9 @@ def compute(
         meet()
         if not store:
             _gather(results, plan, left)
-    if store:
-        results = store.read() if load else None
-    return None if results is None else jax.tree.unflatten(run.tree, results), resumed
+    if store and not load:
+        return None, resumed
+    return jax.tree.unflatten(run.tree, store.read() if store else results), resumed
 
 
 def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:

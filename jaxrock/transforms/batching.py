@@ -15,11 +15,14 @@ from jax.extend.core import Literal
 
 from jaxrock.transforms.recipe import Recipe
 
+native: Any = None
+Unsupported: Any = ()
 try:  # an extra
-    from jaxrock.native import call as native
-    from jaxrock.native.operations import Unsupported
+    from jaxrock.native import call, operations
+
+    native, Unsupported = call, operations.Unsupported
 except (ImportError, OSError):
-    native, Unsupported = None, ()
+    pass
 
 _LOG = logging.getLogger("jaxrock")
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
@@ -112,9 +115,13 @@ class Lanes:
         own = [x for x, mine in zip(leaves, self.own) if mine]
         return self._again(carefully, own, found, which, _NATIVE_LANES)
 
+    @property
+    def _passes(self) -> Any:
+        return self.recipe.passes
+
     def _by_xla(self, leaves) -> list:
         """In chunks of lanes."""
-        passes, scenes = self.recipe.passes, _Scenes(leaves, self.own, self.recipe.structure)
+        passes, scenes = self._passes, _Scenes(leaves, self.own, self.recipe.structure)
 
         def function(own, _=None):
             return scenes.each(lambda tree: self.recipe(jax.tree.leaves(tree)), own)
@@ -138,14 +145,14 @@ class Lanes:
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""
 
         def unfinished(states):
-            return ready.each(self.recipe.passes.unfinished, ready.own, states)
+            return ready.each(self._passes.unfinished, ready.own, states)
 
         def body(carry):
             limit, states, left = carry
             states = self._again(lambda part, _: quickly(limit, *part), (ready.own, states), states, left)
-            return limit + self.recipe.passes.round, states, unfinished(states)
+            return limit + self._passes.round, states, unfinished(states)
 
-        carry = jnp.int32(self.recipe.passes.round), states, unfinished(states)
+        carry = jnp.int32(self._passes.round), states, unfinished(states)
         return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
 
     def _width(self, most: int, size: int) -> int:
@@ -153,8 +160,9 @@ class Lanes:
 
     def _chunked(self, function: Callable, leaves, most: int = _LANES):
         """`function` of leaves with a leading axis, in chunks; the last is filled up with its last scene."""
-        lanes = self._width(most, self.size)
-        chunks = -(-self.size // lanes)
+        size = self.size or 0  # there is one: a single scene is not cut
+        lanes = self._width(most, size)
+        chunks = -(-size // lanes)
 
         def cut(x):
             x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - self.size, axis=0)])

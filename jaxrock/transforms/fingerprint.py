@@ -76,7 +76,7 @@ class Traced:
 
     def __init__(self, function: Callable, point: dict[str, jax.ShapeDtypeStruct]):
         closed, (self.shapes, failures), messages = traced(
-            lambda *values: function(**dict(zip(point, values))), point.values()
+            lambda *values: function(**dict(zip(point, values))), list(point.values())
         )
         self.program = Program(closed.jaxpr, jax.tree.structure((self.shapes, failures)), messages)
         self.messages, self.constants = messages, tuple(closed.consts)

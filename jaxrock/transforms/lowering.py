@@ -18,7 +18,10 @@ from jaxrock.transforms.batching import Lanes
 from jaxrock.transforms.recipe import Recipe
 
 _LOG = logging.getLogger("jaxrock")
-_called = contextvars.ContextVar("called", default=None)  # names of machine code that what is lowered now calls
+# Names of machine code that what is lowered now calls.
+_called: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar(
+    "called", default=None
+)  # names of machine code that what is lowered now calls
 
 
 @not_collected()
@@ -29,8 +32,8 @@ def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int |
     portable = exported and _called.get() is None  # by the user, for machines that may not have our machine code
     lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1, portable)
     function, codes = _kept(lanes, context.avals_in) or (lanes, lanes.codes())
-    if _called.get() is not None:
-        _called.get().extend(codes)
+    if (called := _called.get()) is not None:
+        called.extend(codes)
     return mlir.lower_fun(function)(without_mesh(context), *leaves)
 
 
@@ -62,12 +65,13 @@ def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
 
 def _exported(lanes: Lanes, shapes: list) -> tuple[jax.export.Exported, list[str]]:
     """A program with all that it is made of, and the names of the machine code that it calls."""
-    before = _called.set(lanes.codes())
+    codes = lanes.codes()
+    before = _called.set(codes)
     allowed = _Called()
     try:
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             exported = jax.export.export(jax.jit(lanes), platforms=["cpu"], disabled_checks=allowed)(*shapes)
-        return exported, sorted(set(_called.get()))
+        return exported, sorted(set(codes))
     finally:
         _called.reset(before)
 

@@ -109,6 +109,7 @@ class Recipe:
 
     def taped(self, leaves: Sequence) -> list:
         """The same on a tape."""
+        assert self.on_tape is not None
         return jax.tree.leaves(self.on_tape(self.structure.unflatten(leaves)))
 
     def derivative(self, moves: tuple[bool, ...], make: Callable) -> "Recipe":

@@ -8,15 +8,16 @@ signs of velocity and acceleration are guards too, so that a dip through the gro
 needs a turning point. Knots end arcs, so that the right-hand side of every solve is smooth.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._arguments import arguments, at_least, known
 from jaxrock._checks import inner_share
@@ -45,12 +46,12 @@ from jaxrock.transforms.branches import either
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.held import Held
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 _GAUSS = gauss_legendre_of_unit(12)
 
-_ADJOINTS = {
+_ADJOINTS: dict[type, Any] = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",
     diffrax.ForwardMode: "lax",
     diffrax.DirectAdjoint: "bounded",
@@ -137,17 +138,17 @@ class Diffrax(AbstractEngine):
         """Largest number of solves."""
         return self.max_solves or POLICY.solves + 4 * scene.most_pieces
 
-    def loop(self, unfinished, step, carry, budget: int):
+    def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
         """A loop that goes with the adjoint."""
         return eqxi.while_loop(unfinished, step, carry, max_steps=budget, kind=_ADJOINTS[type(self.adjoint)])
 
-    def limits(self, scene: Scene, piece: Int[ArrayLike, ""]) -> tuple[Scalar, Scalar]:
+    def limits(self, scene: Scene, piece: Int[Array, ""]) -> tuple[Scalar, Scalar]:
         """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
         return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scales[piece])))
 
-    def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None):
+    def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None) -> Any:
         """The arc, for `length` (p t) at most."""
         length = jnp.where(arc.side != 0, length, 0.0)
         # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
@@ -204,6 +205,7 @@ class ArcStepper(AbstractStepper):
         higher or closer to its balance there than before: its energy would not take it to some angle below all that.
         """
         scene = self.scene.on(state.side)
+        far = scene.both_moments[1]
         nodes, weights = (jnp.asarray(values, state.opening.dtype) for values in _GAUSS)
 
         def energy(moments, opening):
@@ -213,9 +215,9 @@ class ArcStepper(AbstractStepper):
         left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
         outdone = jnp.zeros_like(state.done)
         for share in (0.999, 0.7, 0.4, 0.1):
-            opening = share * jnp.minimum(state.peak, scene.far.saddle)
-            least = (scene.far.restoring(Angle.of(opening)) / scene.far.restoring_at_rest) ** 2
-            outdone = outdone | ((left < energy(scene.far, opening)) & (least >= state.closeness))
+            opening = share * jnp.minimum(state.peak, far.saddle)
+            least = (far.restoring(Angle.of(opening)) / far.restoring_at_rest) ** 2
+            outdone = outdone | ((left < energy(far, opening)) & (least >= state.closeness))
         return outdone
 
     def finish(self, state: State) -> State:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
@@ -16,8 +16,8 @@ from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
 
 
@@ -166,7 +166,7 @@ class Arc(eqx.Module):
         return -self.moments.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
 
 
-def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag) -> Scalar:
+def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) -> Scalar:
     """`value` over its leading term c t^m at the start, `jet` = its Taylor coefficients there; one at time 0."""
     lead, power = jnp.ones_like(time), jnp.ones_like(time)
     found = jnp.zeros_like(time, bool)

@@ -8,13 +8,14 @@ lane needs is not taken.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._arguments import at_least, check_fields, known
 from jaxrock._checks import inner_share
@@ -48,8 +49,8 @@ from jaxrock.status import Status
 from jaxrock.transforms.branches import either, when
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class Series(AbstractEngine):
@@ -94,7 +95,7 @@ class Series(AbstractEngine):
     def in_lanes(self) -> bool:
         return True
 
-    def loop(self, unfinished, step, carry, budget: int):
+    def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
         """A loop that stops at the last lane."""
         return jax.lax.while_loop(unfinished, step, carry)
 
@@ -111,7 +112,7 @@ class TaylorStepper(AbstractStepper):
     doubt: float = eqx.field(static=True, default=8.0)  # what is estimated here is rounding
     taped: bool = eqx.field(static=True, default=False)  # reverse mode goes through
 
-    def shaking(self, piece: Int[ArrayLike, ""], local: Scalar) -> tuple[Shaking, Scalar]:
+    def shaking(self, piece: Int[Array, ""], local: Scalar) -> tuple[Shaking, Scalar]:
         """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
         shaking, unit = self.scene.shaking(piece, local, self.order)
         return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
@@ -134,10 +135,11 @@ class TaylorStepper(AbstractStepper):
     def finish(self, state: State) -> State:
         """The free stage by energy."""
         scene = self.scene.on(state.side)
-        moments = scene.moments
+        moments: Any = scene.moments  # `Coefficients`: this engine solves no others
         moving = (state.side != 0) & ~state.overturned & (state.piece >= scene.pieces)
         moving = moving & ((state.opening != 0) | (state.velocity != 0))  # lifted for no time at all
-        here, there = Visit(moments, scene.reset), Visit(scene.both_moments[1], scene.far_reset)
+        other: Any = scene.both_moments[1]
+        here, there = Visit(moments, scene.reset), Visit(other, scene.far_reset)
         visits = (here, there) if scene.far is None else (here, there, here)
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
@@ -181,8 +183,9 @@ class TaylorStepper(AbstractStepper):
     def start(self, state: State, shaking: Shaking, unit: Scalar) -> Start:
         """Where a step starts, with time in `unit`."""
         stretch = keep(self.scene.p * unit, state.local)
+        moments: Any = self.scene.moments
         return Start(
-            self.scene.moments.bare,
+            moments.bare,
             stretch,
             state.side,
             state.uplifting,
@@ -197,8 +200,8 @@ class TaylorStepper(AbstractStepper):
         # More room than a step can take is as good as endless, and finite.
         start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
         # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
-        stepper, before, *rest = jax.lax.stop_gradient((self, state, start, room))
-        step = _Step.of(stepper, before, *rest, rocking)
+        stepper, before, begin, reach = jax.lax.stop_gradient((self, state, start, room))
+        step = _Step.of(stepper, before, begin, reach, rocking)
         cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
         hits = cut.hits
         early = cut.length < step.length

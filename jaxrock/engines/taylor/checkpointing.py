@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.policy import POLICY
 
-Scalar = Inexact[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
 _BETWEEN = POLICY.between_checkpoints
 
 

@@ -6,20 +6,20 @@ parameters: derivatives cost a few products each. The end itself moves, too, whe
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class Start(NamedTuple):
@@ -64,13 +64,13 @@ class Expansion(NamedTuple):
     restoring: list[Scalar | None]
 
 
-def _total(terms: list):
+def _total(terms: list) -> Any:
     """Their sum, in four chains side by side: additions one after the other would wait for each other."""
     chains = [sum(terms[i + 4 :: 4], start=terms[i]) for i in range(min(4, len(terms)))]
     return sum(chains[1:], start=chains[0]) if len(chains) < 4 else (chains[0] + chains[1]) + (chains[2] + chains[3])
 
 
-def _product(first: list, second: list, k: int):
+def _product(first: list, second: list, k: int) -> Any:
     """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
     terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
     return _total(terms) if terms else 0.0
@@ -112,7 +112,7 @@ class _Weights(NamedTuple):
 
     start: Start  # the weights in place of the values; zero for side and uplifting
 
-    def times(self, change: Start) -> Scalar:
+    def times(self, change: Start) -> Any:
         """The change of the end."""
         pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=_is_zero), strict=True)
         return sum((weight * moved for weight, moved in pairs if not _is_zero(moved)), start=0.0)

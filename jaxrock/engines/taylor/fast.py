@@ -8,11 +8,11 @@ care, does it afterwards.
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.events import Events, landed
@@ -26,8 +26,8 @@ from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, ste
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
 
-Scalar = Inexact[ArrayLike, ""]
-Flag = Bool[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+Flag = Bool[Array, ""]
 
 # Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
 # proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
@@ -64,7 +64,7 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     return _if(~sure(1.0), shorter, jnp.ones_like(length))
 
 
-def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Scalar, Scalar | None]) -> Scalar:
+def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
     """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
     sign = jnp.where(values[0] > 0, 1.0, -1.0)
     value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
@@ -88,7 +88,7 @@ def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slop
     """
     width, order = end - start, len(terms) - 1
     degrees = degrees if order > 10 else (degrees[0], order, order)  # the short steps of records
-    x = keep(start + width * _guess(values, tuple(None if s is None else width * s for s in slopes)), end)
+    x = keep(start + width * _guess(values, (width * slopes[0], None if slopes[1] is None else width * slopes[1])), end)
     for degree in degrees:
         value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
         change = value / slope
@@ -133,16 +133,19 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
             has_extremum & (outward * speed >= 0) & (outward * bound <= 0),
         )
 
-    whole = length, *_ = keep_by(share * longest, one), *extremum(share * longest)
-    (_, _, acceleration), _, _, twice = whole[1:]
+    length = keep_by(share * longest, one)
+    end, has_extremum, bound, twice = extremum(share * longest)
+    whole, slowing = (length, end, has_extremum, bound, twice), end[2]
 
     def shorter():
         # Where the velocity may turn twice, the part ends about where the acceleration is zero.
-        length = keep_by(share * longest * first / jnp.where(twice, first - acceleration, 1.0), one)
+        length = keep_by(share * longest * first / jnp.where(twice, first - slowing, 1.0), one)
         return length, *extremum(length)
 
     length, end, has_extremum, bound, still = _if(twice, shorter, whole)
-    return _Part(length, *end, reaches & (share == 1) & ~twice, outward, has_extremum, bound, (share > 0) & ~still)
+    opening, speed, acceleration = end
+    certain, full = (share > 0) & ~still, reaches & (share == 1) & ~twice
+    return _Part(length, opening, speed, acceleration, full, outward, has_extremum, bound, certain)
 
 
 class _Meeting(NamedTuple):
@@ -350,7 +353,7 @@ def most_steps(pieces: int) -> int:
     return POLICY.fast_steps + 3 * pieces
 
 
-def follow(stepper: TaylorStepper, state: State, limit: Int[ArrayLike, ""]) -> State:
+def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
     """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
     limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
 

@@ -62,10 +62,10 @@ class COSMOS(AbstractFormat):
 
 def _reals(name: str, lines: list[str]) -> list[float]:
     """The real header."""
-    at = next((number for number, line in enumerate(lines) if _REALS.match(line)), None)
-    if at is None:
+    at, found = next(((n, found) for n, line in enumerate(lines) if (found := _REALS.match(line))), (0, None))
+    if found is None:
         raise file_error(name, "no line announces 'Real-header values', as a COSMOS file must.")
-    count, width = map(int, _REALS.match(lines[at]).groups())
+    count, width = map(int, found.groups())
     values = []
     for number, line in enumerate(lines[at + 1 :], at + 2):
         if len(values) >= count:

@@ -38,9 +38,10 @@ def agreed_step(name: str, given: float | None, stated: float) -> float:
 
 def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
     """The unit, after a comparison of what the user and the header say (`written`, perhaps nothing)."""
-    if not written and given is None:
-        raise ValueError(f"Argument `unit` must be given for file `{name}`, whose header states none, but is None.")
     if not written:
+        if given is None:
+            told = f"Argument `unit` must be given for file `{name}`, whose header states none, but is None."
+            raise ValueError(told)
         return given
     spelling = re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s")
     stated = _SPELLINGS.get(spelling)

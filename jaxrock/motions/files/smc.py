@@ -72,7 +72,8 @@ def _whole(lines: list[str]) -> list[int] | None:
 def _real(lines: list[str]) -> list[float] | None:
     """The 50 real numbers."""
     rows = [fixed_numbers(line, 15) for line in lines[_TEXT + _WHOLE : _TEXT + _WHOLE + _REAL]]
-    return None if None in rows or sum(map(len, rows)) != 50 else [x for row in rows for x in row]
+    numbers = [x for row in rows if row is not None for x in row]
+    return None if None in rows or len(numbers) != 50 else numbers
 
 
 def _origin(lines: list[str]) -> Origin:

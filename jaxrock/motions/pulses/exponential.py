@@ -5,7 +5,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int
 
 from jaxrock._checks import not_nan, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
 from jaxrock.numerics.lookup import pick
 
 
@@ -21,22 +21,22 @@ class RectangularPulse(AbstractPulse):
         return "rectangle"
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, *, throw: bool = True):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return one_piece(self.duration)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return jnp.full_like(self.knots[1:], jnp.inf)
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.abs(self.amplitude)[None]
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         return [self.amplitude + 0.0 * local]
 
 
@@ -52,22 +52,22 @@ class TriangularPulse(AbstractPulse):
         return "triangle"
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, *, throw: bool = True):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return jnp.stack([jnp.zeros_like(self.duration), self.duration / 2, self.duration])
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return jnp.full_like(self.knots[1:], jnp.inf)
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.stack([jnp.abs(self.amplitude)] * 2)
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         slope = 2 * self.amplitude / self.duration
         rising = piece == 0
         value = jnp.where(rising, slope * local, self.amplitude - slope * local)
@@ -104,7 +104,7 @@ class ExponentialPulse(AbstractPulse):
     shape: Real = parameter("-", not_nan, symbol="beta")
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike):
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, shape: ArrayLike, *, throw: bool = True):
         set_parameters(self, amplitude=amplitude, duration=duration, shape=shape)
 
     @property
@@ -117,7 +117,7 @@ class ExponentialPulse(AbstractPulse):
         return 20.0 / jnp.maximum(jnp.abs(self.shape), 40.0)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         # The layers of a rectangle-like pulse lie at both ends; those of a spike on both sides of the peak.
         inner = jnp.where(self.shape > 0, 0.5 - self._layer, self._layer)
         zero = jnp.zeros_like(inner)
@@ -130,17 +130,17 @@ class ExponentialPulse(AbstractPulse):
         return in_layer & (jnp.abs(self.shape) < 1e24)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         scale = self.duration / jnp.clip(2 * jnp.abs(self.shape), 1e-3, 1e25)
         return jnp.where(self._curved(jnp.arange(4)), scale, jnp.inf)
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         size = jnp.abs(self.amplitude)
         outer = jnp.where(self.shape > 40, 0.0, size)
         return jnp.stack([outer, size, size, outer])
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         shape = jnp.clip(self.shape, -1e25, 1e25)
         layer, y = self._layer, local / self.duration
         spiked = shape > 0

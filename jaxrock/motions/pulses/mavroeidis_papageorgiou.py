@@ -1,6 +1,7 @@
 """The near-fault pulse of Mavroeidis and Papageorgiou."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._checks import Range, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
 from jaxrock.motions.pulses.sinusoidal import sinusoid
 
 _above_one = Range("be above 1 and finite, and at most 1e6", 1.0, np.inf, lambda x: (x > 1) & (x <= 1e6))
@@ -39,26 +40,34 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
     phase: Real = parameter("rad", _phase, symbol="nu")
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, period: ArrayLike, oscillations: ArrayLike = 2.0, phase: ArrayLike = 0.0):
+    def __init__(
+        self,
+        amplitude: ArrayLike,
+        period: ArrayLike,
+        oscillations: ArrayLike = 2.0,
+        phase: ArrayLike = 0.0,
+        *,
+        throw: bool = True,
+    ):
         set_parameters(self, amplitude=amplitude, period=period)
         set_parameters(self, oscillations=oscillations, phase=phase)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return one_piece(self.oscillations * self.period)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return (self.period / (2 * math.pi) / (1 + 1 / self.oscillations))[None]
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.abs(self.amplitude)[None] * (1 + 0.5 / self.oscillations)
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         # The product of cosines is a sum of three: at the period, and at the two side frequencies.
         time = local - self.oscillations * self.period / 2
-        total = [0.0] * (order + 1)
+        total: list[Any] = [0.0] * (order + 1)
         for weight, ratio in ((0.5, 1.0), (0.25, 1 + 1 / self.oscillations), (0.25, 1 - 1 / self.oscillations)):
             rate = ratio * 2 * math.pi / self.period
             angle = rate * time + self.phase

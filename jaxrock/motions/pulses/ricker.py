@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._checks import one_of, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
 from jaxrock.numerics.xla_cpu import keep
 
 # Peak of |y^3 - 3y| e^(-y^2/2), at y^2 = 3 - sqrt(6).
@@ -43,7 +43,13 @@ class RickerPulse(AbstractPulse):
 
     @with_throw
     def __init__(
-        self, amplitude: ArrayLike, period: ArrayLike, kind: str = "symmetric", center: ArrayLike | None = None
+        self,
+        amplitude: ArrayLike,
+        period: ArrayLike,
+        kind: str = "symmetric",
+        center: ArrayLike | None = None,
+        *,
+        throw: bool = True,
     ):
         set_parameters(self, amplitude=amplitude, period=period)
         self.kind = one_of("kind", kind, ("symmetric", "antisymmetric"))
@@ -51,18 +57,18 @@ class RickerPulse(AbstractPulse):
         self.center = default * self.period if center is None else size("center", center)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return one_piece(2 * self.center)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return (self.period / (2 * math.pi))[None]
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.abs(self.amplitude)[None]
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         # With y = rate (t - center): Gaussian g' = -rate y g, then times a polynomial in y.
         symmetric = self.kind == "symmetric"
         rate = (math.sqrt(2) if symmetric else 2 / math.sqrt(3)) * math.pi / self.period

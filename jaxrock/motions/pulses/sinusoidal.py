@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._checks import size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.motions.pulses.pulse import AbstractPulse, Real, one_piece
+from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
 from jaxrock.numerics.elementary import sine_cosine_of_any
 from jaxrock.numerics.xla_cpu import keep
 
@@ -33,22 +33,22 @@ class HalfSinePulse(AbstractPulse):
     duration: Real = parameter("s", size, symbol="t_d")
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, duration: ArrayLike):
+    def __init__(self, amplitude: ArrayLike, duration: ArrayLike, *, throw: bool = True):
         set_parameters(self, amplitude=amplitude, duration=duration)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return one_piece(self.duration)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return (self.duration / math.pi)[None]
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.abs(self.amplitude)[None]
 
-    def series(self, piece, local, unit, order):
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = math.pi / self.duration
         return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
@@ -60,26 +60,28 @@ class _OneCycle(AbstractPulse):
     period: Real = parameter("s", size, symbol="T")
 
     @with_throw
-    def __init__(self, amplitude: ArrayLike, period: ArrayLike):
+    def __init__(self, amplitude: ArrayLike, period: ArrayLike, *, throw: bool = True):
         set_parameters(self, amplitude=amplitude, period=period)
 
     @property
-    def knots(self):
+    def knots(self) -> Real:
         return one_piece(self.period)
 
     @property
-    def scales(self):
+    def scales(self) -> Real:
         return (self.period / (2 * math.pi))[None]
 
     @property
-    def bounds(self):
+    def bounds(self) -> Real:
         return jnp.abs(self.amplitude)[None]
 
 
 class SinePulse(_OneCycle):
     """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
-    def series(self, piece, local, unit, order):
+    __init__ = _OneCycle.__init__  # said again for type checkers, which would make one of the fields
+
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
         return sinusoid(self.amplitude, rate, rate * local, unit, order, local)
 
@@ -87,7 +89,9 @@ class SinePulse(_OneCycle):
 class CosinePulse(_OneCycle):
     """One full cycle of amplitude cos(2 pi t/period) [g], `period` in s, positive: it starts and ends with a jump."""
 
-    def series(self, piece, local, unit, order):
+    __init__ = _OneCycle.__init__
+
+    def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
         sine, cosine = sine_cosine_of_any(rate * local)
         value, slope = keep(self.amplitude * cosine, local), keep(-self.amplitude * sine, local) * rate * unit

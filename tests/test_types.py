@@ -1,0 +1,29 @@
+"""What type checkers are told is so. They read `references/typed_use.py` in `.ci/run`; here it runs, and every type
+that it states is held against the value."""
+
+import inspect
+
+import pytest
+
+from references import typed_use
+
+PARTS = [
+    name for name, part in vars(typed_use).items() if inspect.isfunction(part) and part.__module__ == typed_use.__name__
+]
+QUICK = {"own_record", "pictures"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in PARTS]
+)
+def test_types_are_what_checkers_are_told(name, tmp_path, monkeypatch):
+    stated = []
+
+    def held(value, kind):
+        stated.append(kind)
+        assert isinstance(value, kind), f"{type(value)} is not {kind}"
+
+    monkeypatch.setattr(typed_use, "assert_type", held)
+    part = getattr(typed_use, name)
+    part(*[tmp_path] * len(inspect.signature(part).parameters))
+    assert len(stated) == inspect.getsource(part).count("assert_type(")
