@@ -135,7 +135,8 @@ def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, mos
     found = scipy.optimize.least_squares(
         residuals, begun, slopes, bounds, x_scale=problem.scale, ftol=enough, xtol=_STILL, gtol=None, max_nfev=most
     )
-    return End(found.x, *at(tuple(found.x)), found.status > 0)
+    left, last_slopes = at(tuple(found.x))
+    return End(found.x, left, last_slopes, bool(found.status > 0))
 
 
 def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> Covariance:
