@@ -176,6 +176,13 @@ class FragilityFit(eqx.Module):
     lowest_toppled: Inexact[Array, ""]
     status: FitStatus
 
+    @property
+    def p_value(self) -> Inexact[Array, ""]:
+        """How probably outcomes that have nothing to do with the levels give a slope 1/dispersion as far from 0 (Wald's
+        test): above 0.05 the measure of intensity is useless here."""
+        # The relative error of the slope is that of the dispersion.
+        return jax.lax.erfc(1 / jnp.sqrt(2 * self.covariance[1, 1]))
+
 
 def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> FragilityFit:
     """The lognormal fragility under which outcomes are most probable (probit regression on the logarithm).

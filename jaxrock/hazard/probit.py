@@ -39,6 +39,20 @@ class ProbitFit(eqx.Module):
         """Of the intercept and the slopes."""
         return jnp.sqrt(jnp.diag(self.covariance))
 
+    @property
+    def p_values(self) -> Float[Array, " measures"]:
+        """How probably outcomes that have nothing to do with a measure give a slope as far from 0 (Wald's test)."""
+        return 2 * ndtr(-jnp.abs(self.slopes) / self.standard_errors[1:])
+
+    @property
+    def useless(self) -> tuple[str, ...]:
+        """Names of measures whose slope cannot be told from 0 (by `p_values` above 0.05), or falls where there is one
+        measure only: what they say of toppling may be chance. None of a fit that failed: its status says why."""
+        untold = self.p_values > 0.05
+        if len(self.names) == 1:
+            untold |= self.slopes < 0
+        return tuple(name for name, bad in zip(self.names, np.asarray(untold)) if bad)
+
     def __call__(self, **measures: Values) -> Float[Array, "..."]:
         """Probability to topple at measures by name, positive, which broadcast.
 
