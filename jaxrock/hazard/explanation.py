@@ -43,7 +43,7 @@ def compare_measures(
         raise ValueError(f"Argument `measures` must hold a measure, but is {shown(measures)}.")
     table = found.table(measures)
     toppled = table["verdict"] == TOPPLED if bound == "lower" else table["verdict"] != STOOD
-    clusters = table.get("source", table["motion"])
+    clusters = np.indices(found.verdict.shape)[0].ravel() // found.suite.turns
     rows = [_row(name, table[name], toppled, clusters, errors) for name in measures_by_name(measures)]
     rows.sort(key=lambda row: -np.nan_to_num(row["auc"]))
     return {column: np.array([row[column] for row in rows]) for column in rows[0]}

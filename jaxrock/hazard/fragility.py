@@ -167,6 +167,8 @@ class FragilityFit(eqx.Module):
     - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
       outcomes are separable in the usual order, the median lies between them.
     - `status`: a `FitStatus`.
+    - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test):
+      above 0.05 this measure of intensity is useless here. It holds of separable outcomes, too.
     """
 
     fragility: LogNormalFragility
@@ -175,13 +177,7 @@ class FragilityFit(eqx.Module):
     highest_survived: Inexact[Array, ""]
     lowest_toppled: Inexact[Array, ""]
     status: FitStatus
-
-    @property
-    def p_value(self) -> Inexact[Array, ""]:
-        """How probably outcomes that have nothing to do with the levels give a slope 1/dispersion as far from 0 (Wald's
-        test): above 0.05 the measure of intensity is useless here."""
-        # The relative error of the slope is that of the dispersion.
-        return jax.lax.erfc(1 / jnp.sqrt(2 * self.covariance[1, 1]))
+    p_value: Inexact[Array, ""]
 
 
 def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> FragilityFit:
@@ -241,7 +237,8 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     fit = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), fit, (median, dispersion))
     good = status == FitStatus.successful
     fit = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), fit)
-    return FragilityFit(*fit, highest_survived, lowest_toppled, status)
+    test = slope_tests((logarithm - centre)[None], toppled, survived)[0]
+    return FragilityFit(*fit, highest_survived, lowest_toppled, status, test)
 
 
 def probit(z, toppled, survived):
@@ -281,3 +278,30 @@ def probit_line(abscissas, toppled, survived):
     line, change, _ = jax.lax.while_loop(lambda carry: (carry[1] > tight) & (carry[2] < 50), step, start)
     # One step more, with derivatives by the data: those of first order are exact.
     return line + newton(line, abscissas, toppled, survived), change <= tight
+
+
+def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
+    """How probably outcomes that have nothing to do with an abscissa, given the others, give such a slope: (slopes,).
+
+    Rao's score test: at the line without it, whose slope is zero. (A test of the slope in its standard errors finds
+    less the better outcomes are parted.) Of clusters by their labels, of which there are `count`, by the scatter of
+    their scores.
+    """
+    found = []
+    for index in range(len(abscissas)):
+        others = jnp.concatenate([abscissas[:index], abscissas[index + 1 :]])
+        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), others, abscissas[index][None]])
+        if len(others):
+            line = probit_line(others, toppled, survived)[0]
+        else:
+            line = jax.scipy.special.ndtri(jnp.sum(toppled) / jnp.sum(toppled + survived))[None]
+        _, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
+        information = rows @ (-curvature[:, None] * rows.T)
+        along = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
+        scores = (along @ rows) * by_z
+        if labels is None:
+            scatter = along @ information @ along
+        else:
+            scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
+        found.append(jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter)))
+    return jnp.stack(found)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, not_negative, positive, shown
-from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line
+from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line, slope_tests
 
 
 class ProbitFit(eqx.Module):
@@ -24,6 +24,8 @@ class ProbitFit(eqx.Module):
     - `names`: of the measures; `intercept`; `slopes`: (measures,).
     - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
+    - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
+      a slope (Rao's score test, of clusters where there are any); they hold of separable outcomes, too.
     - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
     """
 
@@ -32,6 +34,7 @@ class ProbitFit(eqx.Module):
     slopes: Float[Array, " measures"]
     covariance: Float[Array, "terms terms"]
     log_likelihood: Float[Array, ""]
+    p_values: Float[Array, " measures"]
     status: FitStatus
 
     @property
@@ -40,14 +43,9 @@ class ProbitFit(eqx.Module):
         return jnp.sqrt(jnp.diag(self.covariance))
 
     @property
-    def p_values(self) -> Float[Array, " measures"]:
-        """How probably outcomes that have nothing to do with a measure give a slope as far from 0 (Wald's test)."""
-        return 2 * ndtr(-jnp.abs(self.slopes) / self.standard_errors[1:])
-
-    @property
     def useless(self) -> tuple[str, ...]:
-        """Names of measures whose slope cannot be told from 0 (by `p_values` above 0.05), or falls where there is one
-        measure only: what they say of toppling may be chance. None of a fit that failed: its status says why."""
+        """Names of measures whose slope cannot be told from 0 (`p_values` above 0.05), or falls where there is one
+        measure only: what they say of toppling may be chance."""
         untold = self.p_values > 0.05
         if len(self.names) == 1:
             untold |= self.slopes < 0
@@ -99,7 +97,7 @@ def fit_probit(
 
     **Raises:** ValueError for arguments outside their ranges, or of other shapes, and for fewer than two clusters.
 
-    **Source:** Liang & Zeger (1986), clusters; Bell & McCaffrey (2002), the jackknife.
+    **Source:** Liang & Zeger (1986), clusters; Bell & McCaffrey (2002), the jackknife; Rao (1948), the test of slopes.
     """
     if not isinstance(measures, Mapping) or not measures or not all(isinstance(name, str) for name in measures):
         raise ValueError(f"Argument `measures` must hold lists by name, but is {shown(measures)}.")
@@ -154,4 +152,5 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
     numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood
-    return *(jnp.where(converged, x, jnp.nan) for x in numbers), status
+    tests = slope_tests(abscissas, toppled, survived, None if errors == "information" else labels, count)
+    return *(jnp.where(converged, x, jnp.nan) for x in numbers), tests, status

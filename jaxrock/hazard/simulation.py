@@ -17,7 +17,15 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, checked, one_of
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising_list
+from jaxrock.hazard.fragility import (
+    FitStatus,
+    FragilityFit,
+    TabulatedFragility,
+    fit_fragility,
+    probit,
+    rising_list,
+    slope_tests,
+)
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
@@ -115,7 +123,7 @@ class SimulatedFragility(eqx.Module):
         if motions == 1 or fit.status != FitStatus.successful:
             return fit
         clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
-        return eqx.tree_at(lambda f: f.covariance, fit, clustered)
+        return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, clustered)
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -161,13 +169,17 @@ class SimulatedFragility(eqx.Module):
 
 @eqx.filter_jit
 def _clustered(fit: FragilityFit, levels, toppled, draws):
-    """Covariance of (ln median, ln dispersion) where what one motion (a row) does at all levels is one outcome."""
+    """Covariance of (ln median, ln dispersion), and the test of the slope, where what one motion (a row) does at all
+    levels is one outcome."""
     median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
     rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
     scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
     motions = toppled.shape[0]
-    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance
+    abscissas = jnp.tile(jnp.log(levels), motions)[None]
+    labels = jnp.repeat(jnp.arange(motions), levels.size)
+    test = slope_tests(abscissas, toppled.ravel(), draws - toppled.ravel(), labels, motions)[0]
+    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance, test
 
 
 @arguments

@@ -189,11 +189,19 @@ class _Problem(NamedTuple):
         """SciPy's least squares from a place."""
         from scipy.optimize import least_squares
 
-        room = 1e-9 * (self.upper - self.lower)
+        room, known = 1e-9 * (self.upper - self.lower), {}
+
+        def at(x):
+            """Values and slopes, which SciPy asks for one after the other."""
+            if x.tobytes() not in known:
+                known.clear()
+                known[x.tobytes()] = _with_slopes(self.kind, x, self.times)
+            return known[x.tobytes()]
+
         return least_squares(
-            lambda x: np.asarray(_model(self.kind, x, self.times)) - self.target,
+            lambda x: np.asarray(at(x)[0]) - self.target,
             np.clip(place, self.lower + room, self.upper - room),
-            jac=lambda x: np.asarray(_slopes(self.kind, x, self.times)),
+            jac=lambda x: np.asarray(at(x)[1]),
             bounds=(self.lower, self.upper),
             x_scale="jac",
             xtol=1e-12,
@@ -223,7 +231,6 @@ def _range(name: str, value) -> tuple[float, float]:
     return low, high
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _model(kind: _Kind, place, times):
     """What is compared, at all times."""
     values = kind.values(place)
@@ -238,29 +245,33 @@ def _models(kind: _Kind, places, times):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _slopes(kind: _Kind, place, times):
-    return jax.jacfwd(lambda place: _model(kind, place, times))(place)
+def _with_slopes(kind: _Kind, place, times):
+    def twice(place):
+        value = _model(kind, place, times)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(place)
+    return value, slopes
 
 
 def _velocity(pulse: AbstractMotion, times: Float[Array, " n"]) -> Float[Array, " n"]:
     """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
     knots, lengths = pulse.knots, pulse.lengths
     nodes, weights = (jnp.asarray(values) for values in (_NODES, _WEIGHTS))
+    piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
+    local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
+    width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / _PARTS
+    part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, _PARTS - 1)
+    # All parts of all pieces, and what is left to each time of the part that it lies in: in one go, to compile less.
+    every, parts = jnp.repeat(jnp.arange(lengths.size), _PARTS), jnp.tile(jnp.arange(_PARTS), lengths.size)
+    pieces = jnp.concatenate([every, piece])
+    begins = jnp.concatenate([parts * lengths[every] / _PARTS, part * width])
+    widths = jnp.concatenate([lengths[every] / _PARTS, local - part * width])
 
     def gain(piece, begin, width):
-        at = jax.vmap(lambda local: pulse.series(piece, local, jnp.ones_like(local), 0)[0])
-        return at(begin + width * (1 + nodes) / 2) @ weights * width / 2
+        places = begin + width * (1 + nodes) / 2
+        return jax.vmap(lambda place: pulse.series(piece, place, jnp.ones_like(place), 0)[0])(places) @ weights * width
 
-    pieces, parts = jnp.arange(lengths.size), jnp.arange(_PARTS)
-    gains = jax.vmap(lambda piece: jax.vmap(lambda part: gain(piece, part * lengths[piece] / _PARTS,
-                                                              lengths[piece] / _PARTS))(parts))(pieces)  # fmt: skip
-    before = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gains.ravel())])
-
-    def at(time):
-        piece = jnp.clip(count_up_to(knots, time) - 1, 0, lengths.size - 1)
-        local = jnp.clip(time - knots[piece], 0.0, lengths[piece])
-        width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / _PARTS
-        part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, _PARTS - 1)
-        return before[piece * _PARTS + part] + gain(piece, part * width, local - part * width)
-
-    return jax.vmap(at)(times)
+    gains = jax.vmap(gain)(pieces, begins, widths) / 2
+    before = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gains[: every.size])])
+    return before[piece * _PARTS + part] + gains[every.size :]

@@ -36,7 +36,7 @@ class Suite(eqx.Module):
       block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
 
     `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
-    turned, and `azimuth` (motions,) by how much, or None.
+    turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
 
     **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move; for
     components without azimuths, and azimuths without components.
@@ -48,6 +48,7 @@ class Suite(eqx.Module):
     peak_velocity: Float[Array, " motions"]
     sources: tuple[str, ...] = eqx.field(static=True)
     azimuth: Float[np.ndarray, " motions"] | None
+    turns: int = eqx.field(static=True)
 
     @arguments
     def __init__(
@@ -58,9 +59,11 @@ class Suite(eqx.Module):
     ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
-        self.azimuth, sources = None, None
+        self.azimuth, self.turns, sources = None, 1, None
         if azimuth is not None or any(isinstance(each, Components) for each in motions):
+            records = len(motions)
             motions, names, sources, self.azimuth = _turned(motions, names, azimuth)
+            self.turns = len(motions) // records
         self.groups = tuple(map(_ensemble, motions))
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
         self.names = tuple(own if names is None else names)

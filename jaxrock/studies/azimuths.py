@@ -124,7 +124,7 @@ def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBloc
     return stacked(jax.tree.map(lambda *x: jnp.stack(x), *found))
 
 
-def _in_plane(rock: Rock | Callable, azimuth: float) -> Block | AsymmetricBlock:
+def _in_plane(rock: Rock | Callable, azimuth: float):
     if not isinstance(rock, Rock):
         return rock(azimuth)
     section = rock.section(azimuth)
