@@ -71,7 +71,7 @@ def test_measures_that_are_refused(measure, message):
 # --------------------------------------------------------------------------------------- what explains most
 
 RANDOM = np.random.default_rng(11)
-COUNT = 300
+COUNT = 120
 MOTIONS = [rk.SinePulse(RANDOM.uniform(0.2, 1.0, COUNT), RANDOM.uniform(0.3, 1.5, COUNT))]
 
 
@@ -92,7 +92,7 @@ def test_the_measure_that_decides_comes_first(cause, best):
     found = outcomes(cause)
     table = rk.hazard.compare_measures(found, ["PGA", "PGV"])
     assert table["measure"][0] == best and (np.diff(table["auc"]) < 0).all()
-    assert table["dispersion"][0] == pytest.approx(0.2, rel=0.3)
+    assert table["dispersion"][0] == pytest.approx(0.2, rel=0.4)
     columns = found.table()
     fit = rk.hazard.fit_probit({best: columns[best]}, columns["verdict"], clusters=columns["motion"])
     assert table["slope"][0] == float(fit.slopes[0]) and table["status"][0] == "successful"
@@ -114,12 +114,12 @@ def test_a_useless_measure_is_flagged():
 
 def test_bounds_and_too_few_records():
     found = outcomes(lambda a, v: v)
-    found.verdict[:60] = -1
+    found.verdict[:30] = -1
     lower, upper = (rk.hazard.compare_measures(found, ["PGV"], bound=each)["median"][0] for each in ("lower", "upper"))
     assert lower > upper
     one = rk.motions.Suite([rk.SinePulse(0.5, 1.0)])
-    blank = np.zeros((1, 1, 1, 1))
-    alone = rk.hazard.SuiteOutcomes(one, found.blocks, np.ones(1), (1,), blank.astype(np.int8), blank, blank)
+    blank, scale = np.zeros((1, 2, 1, 1)), np.array([1.0, 2.0])
+    alone = rk.hazard.SuiteOutcomes(one, found.blocks, scale, (1,), blank.astype(np.int8), blank, blank)
     with pytest.raises(ValueError, match="must name at least two clusters"):
         rk.hazard.compare_measures(alone, ["PGA"])
     with pytest.raises(ValueError, match="`measures` must hold a measure"):
@@ -143,27 +143,32 @@ def test_p_values_by_an_established_package(kind):
     assert "a" not in fit.useless
 
 
-def test_the_flag_errs_as_often_as_it_says():
-    """One in twenty of measures that say nothing does not get it, though outcomes go together in threes."""
-    clusters, told = np.arange(120) // 3, 0
-    level = np.exp(RANDOM.normal(size=40))[clusters]
+@pytest.mark.parametrize("each", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_flag_errs_as_often_as_it_says(each):
+    """One in twenty of measures that say nothing does not get it, where outcomes go together in threes, too."""
+    clusters, told = np.arange(COUNT) // each, 0
+    level = np.exp(RANDOM.normal(size=COUNT))[clusters]
     for _ in range(200):
-        draws = RANDOM.random(40)[clusters]
+        draws = RANDOM.random(COUNT)[clusters]
         told += float(rk.hazard.fit_probit({"x": level}, draws < 0.5, clusters=clusters).p_values[0]) <= 0.05
     assert 2 <= told <= 20
 
 
 def test_what_parts_outcomes_well_is_not_flagged():
     """A test of the slope in its own standard errors would take the best of all measures for useless."""
-    level = np.geomspace(0.1, 1.0, 20)
-    for fell, status in ((level > 0.3, "separable"), ((level > 0.3) ^ (np.arange(20) == 4), "successful")):
-        fit = rk.hazard.fit_probit({"x": level}, fell)
-        assert fit.status == getattr(rk.hazard.FitStatus, status)
-        assert float(fit.p_values[0]) < 1e-3 and fit.useless == ()
-    falling = rk.hazard.fit_probit({"x": level}, (level < 0.3) ^ (np.arange(20) == 15))
-    assert falling.useless == ("x",)
+    level, order = np.geomspace(0.1, 1.0, COUNT), np.arange(COUNT)
+
+    def fit(fell):
+        return rk.hazard.fit_probit({"x": level}, fell, clusters=order)
+
+    for fell, status in ((order > 60, "separable"), ((order > 60) ^ (order == 30), "successful")):
+        found = fit(fell)
+        assert found.status == getattr(rk.hazard.FitStatus, status)
+        assert float(found.p_values[0]) < 1e-6 and found.useless == ()
+    assert fit((order < 60) ^ (order == 90)).useless == ("x",)
 
 
+@pytest.mark.slow
 def test_the_flag_of_a_lognormal_fit():
     """That of a probit fit, of clusters: what one motion does at all levels goes together."""
     levels = np.geomspace(0.1, 2.0, 8)
