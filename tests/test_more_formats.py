@@ -161,6 +161,7 @@ def test_response_spectra(file):
     np.testing.assert_array_equal(found.damping, [0.02, 0.05])
     for row, damping in enumerate(found.damping):
         np.testing.assert_allclose(found.displacement[row], 0.0254 * period / (1 + damping), rtol=6e-4)
+        np.testing.assert_allclose(found.velocity[row], 6 * 0.0254 * period / (1 + damping), rtol=6e-4)
         np.testing.assert_allclose(found.acceleration[row], period / (1 + damping), rtol=6e-4)
         np.testing.assert_allclose(found.pseudo_velocity[row], 0.0254 * 2 * np.pi / (1 + damping), rtol=6e-4)
     assert (found.origin.format, found.origin.unit) == ("v3", "inches")

@@ -18,7 +18,7 @@ _STATUSES = ("successful", "separable", "not_growing", "not_converged")
 @arguments
 def compare_measures(
     found: SuiteOutcomes,
-    measures: Mapping[str, Callable] | Sequence[str],
+    measures: Mapping[str, str | Callable] | Sequence[str],
     *,
     bound: Annotated[str, word_of("lower", "upper")] = "lower",
     errors: Annotated[str, word_of("clusters", "jackknife")] = "clusters",

@@ -87,14 +87,14 @@ class SuiteOutcomes(eqx.Module):
         """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
         return np.any(np.maximum.accumulate(self.verdict == TOPPLED, axis=1) & (self.verdict == STOOD), axis=1)
 
-    def table(self, measures: Mapping[str, Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def table(self, measures: Mapping[str, str | Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
 
         **Arguments:**
 
-        - `measures`: names as in `simulated_fragility`, such as `["IA", "SA(0.5)"]`, or functions of a motion by the
-          names of their columns, such as `{"Arias": rk.intensity.arias}`; each is taken of the motion as it was scaled.
-          None: none beside the peaks.
+        - `measures`: names as in `simulated_fragility`, such as `["IA", "SA(0.5)"]`, or such names or functions of a
+          motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each is taken of the motion as
+          it was scaled. None: none beside the peaks.
 
         **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters,
         PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1 toppled, 0 stood, -1 undecided).
@@ -122,8 +122,8 @@ def measures_by_name(measures) -> dict[str, Measure]:
     """Measures by the names of their columns."""
     if measures is None:
         return {}
-    if isinstance(measures, Mapping) and all(map(callable, measures.values())):
-        return {str(name): measure_of("measures", function) for name, function in measures.items()}
+    if isinstance(measures, Mapping):
+        return {str(name): measure_of("measures", each) for name, each in measures.items()}
     if isinstance(measures, (list, tuple)):
         return {kind.name: kind for kind in (measure_of("measures", each) for each in measures)}
     raise ValueError(f"Argument `measures` must hold names, or functions by name, but is {shown(measures)}.")
