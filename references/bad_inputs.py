@@ -241,7 +241,11 @@ CALLS: dict[str, Call] = {
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
     "AbstractMotion.acceleration": Call(pulse().acceleration, {"time": [0.1, 0.2]}),
     "AbstractMotion.__mul__": Call(lambda factor: pulse() * factor, {"factor": 2.0}),
-    "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"]}),
+    "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"], "azimuth": None}),
+    "Suite.components": Call(
+        rk.motions.Suite,
+        {"motions": [rk.motions.Components(record(), record())], "names": ["a"], "azimuth": [0.0, 0.5]},
+    ),
     "peak_acceleration": Call(rk.intensity.peak_acceleration, {"motion": pulse()}),
     "peak_velocity": Call(rk.intensity.peak_velocity, {"motion": pulse()}),
     "intensity.peak_displacement": Call(rk.intensity.peak_displacement, {"motion": pulse()}),

@@ -147,8 +147,8 @@ def fused(
     **Arguments:**
 
     - `record`: of the accelerometer, whose baseline may drift.
-    - `displacement`: (n,) samples of the ground at the same place, n at least 4, the first at the record's first; where
-      it ends before the record, or after it, the record is cut there, or it is. At rest at first.
+    - `displacement`: (n,) samples of the ground at the same place, n at least 4, the first at the record's first; at
+      rest at first. The shorter of the two ends both.
     - `dt`: time between its samples [s], positive.
     - `unit`: of the displacement: "m", "cm" or "mm".
     - `corner`: of the Butterworth filters of this `order`, run forwards and backwards [Hz]: below, the displacement is
