@@ -112,7 +112,7 @@ class SuiteOutcomes(eqx.Module):
         peaks = {"PGA": self.suite.peak_acceleration, "PGV": self.suite.peak_velocity}
         columns |= {name: np.asarray(peak)[motion] * strength for name, peak in peaks.items()}
         for name, kind in kinds.items():
-            if name not in peaks or not kind.is_own:
+            if name not in peaks or kind.power is None:
                 columns[name] = scaled_strengths(kind, self.suite, self.scale)[motion, scale]
         results = {"rotation_over_alpha": self.rotation, "margin": self.margin, "verdict": self.verdict}
         return columns | {name: each.ravel() for name, each in results.items()}

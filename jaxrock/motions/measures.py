@@ -12,13 +12,13 @@ from jaxrock.motions.files.parsing import NUMBER
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 
-# As OpenQuake calls them, with their units.
+# As OpenQuake calls them: with their units, and the power of a motion's scale with which they grow.
 _NAMED = {
-    "PGA": (intensity.peak_acceleration, "g"),
-    "PGV": (intensity.peak_velocity, "m/s"),
-    "PGD": (intensity.peak_displacement, "m"),
-    "IA": (intensity.arias, "m/s"),
-    "CAV": (intensity.cumulative_absolute_velocity, "m/s"),
+    "PGA": (intensity.peak_acceleration, "g", 1.0),
+    "PGV": (intensity.peak_velocity, "m/s", 1.0),
+    "PGD": (intensity.peak_displacement, "m", 1.0),
+    "IA": (intensity.arias, "m/s", 2.0),
+    "CAV": (intensity.cumulative_absolute_velocity, "m/s", 1.0),
 }
 _AT_PERIOD = {"SA": (intensity.spectral_acceleration, "g"), "SV": (intensity.spectral_velocity, "m/s")}
 NAMES = (*_NAMED, *(f"{name}(period)" for name in _AT_PERIOD))
@@ -26,11 +26,12 @@ _SPECTRAL = re.compile(rf"({'|'.join(_AT_PERIOD)})\(({NUMBER})\)")
 
 
 class Measure(NamedTuple):
-    """A measure of intensity: its name, and a function of a motion; whether it is one of the package's own."""
+    """A measure of intensity: its name, a function of a motion, and the power of a motion's scale with which it grows,
+    which is known of the package's own."""
 
     name: str
     function: Callable[[AbstractMotion], float]
-    is_own: bool = True
+    power: float | None = None
 
 
 def unit_of(name: str) -> str:
@@ -47,11 +48,12 @@ def measure_of(name: str, value: str | Callable) -> Measure:
     spectral = _SPECTRAL.fullmatch(value) if isinstance(value, str) else None
     if spectral:
         function, period = _AT_PERIOD[spectral[1]][0], float(spectral[2])
-        return Measure(value, lambda motion: float(function(motion, period)))
+        return Measure(value, lambda motion: float(function(motion, period)), 1.0)
     if isinstance(value, str) and value in _NAMED:
-        return Measure(value, _NAMED[value][0])
+        function, _, power = _NAMED[value]
+        return Measure(value, function, power)
     if callable(value) and not isinstance(value, type):
-        return Measure(getattr(value, "__name__", type(value).__name__), value, False)
+        return Measure(getattr(value, "__name__", type(value).__name__), value)
     words = ", ".join(repr(word) for word in NAMES)
     raise ValueError(f"Argument `{name}` must be one of {words}, or a function of a motion, but is {shown(value)}.")
 
@@ -62,7 +64,7 @@ def strengths(name: str, measure: Measure, suite: Suite) -> np.ndarray:
     **Raises:** ValueError for one that is not a positive number.
     """
     peaks = {"PGA": suite.peak_acceleration, "PGV": suite.peak_velocity}
-    if measure.is_own and measure.name in peaks:
+    if measure.power is not None and measure.name in peaks:
         return np.asarray(peaks[measure.name], float)
     values = [_number(name, measure, motion) for motion in suite.motions()]
     for value, title in zip(values, suite.names):
@@ -85,6 +87,8 @@ def power_of(name: str, measure: Measure, motions: Iterable[AbstractMotion]) -> 
 
     **Raises:** ValueError for one that grows otherwise, or not.
     """
+    if measure.power is not None:
+        return measure.power
     motion = next(iter(motions))
     one, two, three = (_number(name, measure, scaled) for scaled in (motion, 2.0 * motion, 3.0 * motion))
     with np.errstate(all="ignore"):
