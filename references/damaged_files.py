@@ -45,6 +45,42 @@ def _v2() -> str:
     return text + announced + _lines(values, "%10.3f", 8)
 
 
+def _v1() -> str:
+    head = "Uncorrected Accelerogram Data             Processed: 02/13/12, CGS  146be002\n" + "text\n" * 10
+    head += (
+        f"Units of uncor data are sec and g .        Max  = {np.abs(SAMPLES).max():6.3f} g , at  30.590 sec.\ntext\n"
+    )
+    head += _lines(np.zeros(100, int), "%5d", 16) + _lines(np.zeros(50), "%10.7f", 8)
+    announced = f" {SAMPLES.size} Accelerogram points at 200 pts/sec in units of g .      Format: (8f10.7)\n"
+    return head + announced + _lines(SAMPLES, "%10.7f", 8) + "/&  ----------  End of Data for Channel  1  ----------\n"
+
+
+def _v1_pairs() -> str:
+    values = np.round(10 * SAMPLES, 3)
+    head = "UNCORRECTED ACCELEROGRAM DATA              PROCESSED: 06/30/2011\n" + "text\n" * 9
+    head += f"NO. OF POINTS = {values.size:6d}  RECORD LENGTH =  0.220 SEC\n"
+    head += f"UNITS OF UNCOR ACCEL ARE SEC AND G/10.     MAX  = {np.abs(SAMPLES).max():6.3f} G, AT   6.365 SEC\ntext\n"
+    head += _lines(np.zeros(100, int), "%5d", 16) + _lines(np.zeros(50), "%10.3f", 8)
+    pairs = np.stack([0.01 * np.arange(values.size), values], axis=1).ravel()
+    return head + _lines(pairs, "%7.3f", 10) + "/&  ----------  END OF DATA FOR CHANNEL  1  ----------\n"
+
+
+def _v3() -> str:
+    period, damping = np.array([0.1, 0.2, 0.5]), (0.02, 0.05)
+    room = np.zeros(97)
+    head = "Response and Fourier amplitude spectra (3 periods,  .10 -   .5 sec)   for\n" + "text\n" * 20
+    head += "Units for spectra are inches and sec, except Sa is in fraction of g.\ntext\n"
+    head += _lines(np.zeros(100), "%10.3f", 8) + _lines(np.array(damping), "%10.3f", 8)
+    head += _lines(np.concatenate([period, room]), "%10.3f", 8) + "Fourier amplitude spectra in in/sec.\n"
+    body = _lines(np.zeros(100), "%10.2E", 8)
+    for share in damping:
+        place = period / (1 + share)
+        body += f"Damping =  {share:.2f}. Data of Sd,Sv,Sa,Pssv,ttSd,ttSv,ttSa :\n"
+        for values in (place, 6 * place, place, 2 * np.pi * place / period, *[period] * 3):
+            body += _lines(np.concatenate([values, room]), "%10.3E", 8)
+    return head + body + "/&   ----------  End of spectral data for channel  1  ----------\n"
+
+
 def _esm() -> str:
     values = SAMPLES * 980.665
     peak = values[np.abs(values).argmax()]
@@ -119,6 +155,11 @@ def _of_record(record: rk.Record) -> dict[str, np.ndarray]:
     return {"rows": np.asarray(record.samples)[:, None], "dt": np.asarray(record.dt)}
 
 
+def _of_spectra(found: rk.motions.ResponseSpectra) -> dict[str, np.ndarray]:
+    spectra = [getattr(found, name).T for name in ("displacement", "velocity", "acceleration", "pseudo_velocity")]
+    return {"rows": np.concatenate([found.period[:, None], *spectra], axis=1), "damping": found.damping}
+
+
 def _of_rocks(seen: rk.inverse.Observations) -> dict[str, np.ndarray]:
     names = ["alpha", "p", "restitution", "alpha_sd", "p_sd", "rotation", "rotation_sd", "seen"]
     columns = [np.asarray(getattr(seen, name), float) for name in names]
@@ -152,6 +193,9 @@ FILES = {
     "AT2": _record(_at2(_lines(SAMPLES, "%15.7E", 5)), ".AT2"),
     "AT2 of free form": _record(_at2("\n".join(map(repr, SAMPLES.tolist())) + "\n"), ".AT2"),
     "V2": _record(_v2(), ".V2"),
+    "V1": _record(_v1(), ".V1"),
+    "V1 with times": _record(_v1_pairs(), ".V1"),
+    "V3": File(_v3(), rk.motions.read_spectra, _of_spectra, ".V3"),
     "ESM": _record(_esm(), ".ASC"),
     "COSMOS": _record(_cosmos(), ".V2c"),
     "SMC": _record(_smc(), ".smc"),

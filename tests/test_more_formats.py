@@ -1,4 +1,4 @@
-"""COSMOS, SMC and K-NET, where records come from, components, ObsPy's traces, writing, a million samples."""
+"""V1, V3, COSMOS, SMC and K-NET, where records come from, components, ObsPy's traces, writing, a million samples."""
 
 import time
 import types
@@ -10,7 +10,8 @@ import jaxrock as rk
 from references.damaged_files import FILES, SAMPLES
 
 CM = 980.665
-COSMOS, SMC, KNET = (FILES[name].text for name in ("COSMOS", "SMC", "K-NET"))
+COSMOS, SMC, KNET, V1, V3 = (FILES[name].text for name in ("COSMOS", "SMC", "K-NET", "V1", "V3"))
+PAIRS = FILES["V1 with times"].text
 
 
 @pytest.fixture
@@ -73,11 +74,20 @@ def test_knet_takes_the_offset_off(file, name):
         (KNET.replace("3920", "39200"), "a.NS", "line 9 states a peak of"),
         (KNET.replace("100Hz", "0Hz"), "a.NS", "must state a positive frequency"),
         ("RESPONSE AND FOURIER AMPLITUDE SPECTRA\n 1 2 3\n", "a.V3", r"holds response spectra \(V3\)"),
-        ("UNCORRECTED ACCELEROGRAM DATA\n 1 2 3\n", "a.V1", r"holds uncorrected pairs \(V1\)"),
+        (V1.replace(" 23 Acc", " 22 Acc"), "a.V1", "announces 22 samples, but 23 follow"),
+        (V1.replace("units of g .", "units of g/10"), "a.V1", "line 12 states a peak of 0.[0-9]+ g, but the largest"),
+        (V1.replace("units of g .", "units of counts ."), "a.V1", "line 28 states the unit 'counts'"),
+        (V1.replace("at 200 pts", "at 0 pts"), "a.V1", "line 28 states 0 samples a second"),
+        (V1[: V1.index(" 23 Acc")], "a.V1", "header must state 'No. of points' and 'Units"),
+        (PAIRS.replace("=     23", "=     24"), "a.V1", "announces 48 times and samples, but 46 follow"),
+        (PAIRS.replace("SEC AND G/10", "SEC AND G"), "a.V1", "line 12 states a peak of"),
+        (PAIRS.replace("  0.010 ", "  0.030 "), "a.V1", "the times of its samples do not increase"),
+        (PAIRS.replace("\n    0    0", "\n    x    0", 1), "a.V1", "lines 14 to 27 should hold the numbers"),
+        (PAIRS.replace("UNCORRECTED", "SOME"), "a.V1", "no line begins with 'Uncorrected accelerogram data'"),
     ],
 )
 def test_what_is_mislabelled_is_refused(file, text, name, message):
-    assert text not in (COSMOS, SMC, KNET), "nothing was replaced"
+    assert text not in (COSMOS, SMC, KNET, V1, PAIRS), "nothing was replaced"
     with pytest.raises(ValueError, match=f"^File `{name}`: .*{message}"):
         rk.read_record(file(text, name))
 
@@ -93,6 +103,93 @@ def test_what_is_mislabelled_is_refused(file, text, name, message):
 )
 def test_origin(file, text, origin):
     assert tuple(rk.read_record(file(text)).origin) == (*origin, "motion.txt")
+
+
+# --------------------------------------------------------------------------------------------- V1 and V3
+
+
+@pytest.mark.parametrize(
+    "text, digits, dt, unit",
+    [
+        pytest.param(V1, 1e-12, 0.005, "g", id="samples"),
+        pytest.param(V1[: V1.index("/&")], 1e-12, 0.005, "g", id="without end"),
+        pytest.param(PAIRS, 5e-5, 0.01, "g", id="times and tenths of g"),
+        pytest.param(V1 + V1.replace("Channel  1", "Channel  2"), 1e-12, 0.005, "g", id="two channels"),
+    ],
+)
+def test_uncorrected_accelerograms(file, text, digits, dt, unit):
+    record = rk.read_record(file(text))
+    np.testing.assert_allclose(record.samples, SAMPLES, atol=digits)
+    assert (float(record.dt), record.origin.format, record.origin.unit) == (dt, "v1", unit)
+
+
+def test_channels_and_origin_of_an_uncorrected_accelerogram(file):
+    lines = V1.splitlines()
+    lines[1], lines[3] = (
+        "Record of Mon Feb 13, 2012 13:06:45.0 PST             (Avol1 v9.2)",
+        "Start time:  2/13/12, 21:06",
+    )
+    lines[4], lines[5], lines[6] = (
+        "Station No. 89146   40.941N, 123.633W",
+        "Willow Creek          CGS",
+        "Chan  1: 360 Deg",
+    )
+    first, second = "\n".join(lines) + "\n", "\n".join(lines).replace("Chan  1: 360 Deg", "Chan  2:  Up") + "\n"
+    record = rk.read_record(file(first + second), column=1)
+    expected = "Record of Mon Feb 13, 2012 13:06:45.0 PST", "Willow Creek", "Up", "2/13/12, 21:06", "89146"
+    assert tuple(record.origin)[:5] == expected
+    with pytest.raises(ValueError, match="`column` must be 0 to 1, a channel of V1 file"):
+        rk.read_record(file(first + second), column=2)
+
+
+def test_times_that_are_not_equally_spaced(file):
+    """As film was digitised: straight lines between the samples are followed, at the step that is asked for."""
+    path = file(PAIRS.replace("  0.050 ", "  0.057 "))
+    with pytest.raises(ValueError, match="`dt` must be given for file `motion.txt`, whose samples are not equally"):
+        rk.read_record(path)
+    times = 0.01 * np.arange(23)
+    times[5] = 0.057
+    record = rk.read_record(path, dt=0.001)
+    expected = np.interp(0.001 * np.arange(221), times, np.round(10 * SAMPLES, 3) / 10)
+    np.testing.assert_allclose(record.samples, expected, atol=1e-12)
+
+
+def test_response_spectra(file):
+    found = rk.motions.read_spectra(file(V3))
+    period = np.array([0.1, 0.2, 0.5])
+    np.testing.assert_array_equal(found.period, period)
+    np.testing.assert_array_equal(found.damping, [0.02, 0.05])
+    for row, damping in enumerate(found.damping):
+        np.testing.assert_allclose(found.displacement[row], 0.0254 * period / (1 + damping), rtol=6e-4)
+        np.testing.assert_allclose(found.velocity[row], 6 * 0.0254 * period / (1 + damping), rtol=6e-4)
+        np.testing.assert_allclose(found.acceleration[row], period / (1 + damping), rtol=6e-4)
+        np.testing.assert_allclose(found.pseudo_velocity[row], 0.0254 * 2 * np.pi / (1 + damping), rtol=6e-4)
+    assert (found.origin.format, found.origin.unit) == ("v3", "inches")
+
+
+def block_of(share):
+    """The lines of one damping."""
+    at = V3.index(f"Damping =  {share}")
+    return V3[at : V3.index("Damping", at + 1) if "Damping" in V3[at + 1 :] else V3.index("/&")]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (V3[: V3.index("/&")], "should end the channel: the file is cut off"),
+        (V3.replace(block_of("0.02"), ""), r"states dampings \[0.02, 0.05\], but spectra follow for \[0.05\]"),
+        (V3.replace("(3 periods", "(2 periods"), "announces 2 periods, but the numbers of a list go on"),
+        (V3.replace("inches", "furlongs"), "header must state 1 to 100 periods, units of inches or cm"),
+        (V3.replace("     0.200     0.500", "     0.500     0.200"), "the 3 periods before line 51 do not increase"),
+        (V3.replace("     0.200     0.500", "     0.300     0.500"), "its pseudo-velocity at 0.3 s is not that of"),
+        (V3.replace(" 9.804E-02", " 9.80XE-02"), "should hold samples, but is"),
+        (V1, "no line begins with 'Response and Fourier amplitude spectra'"),
+    ],
+)
+def test_spectra_that_are_refused(file, text, message):
+    assert text != V3, "nothing was replaced"
+    with pytest.raises(ValueError, match=f"^File `motion.txt`: .*{message}"):
+        rk.motions.read_spectra(file(text))
 
 
 # ------------------------------------------------------------------------------------------- components
@@ -171,6 +268,32 @@ def test_traces_that_are_refused(given, message):
         rk.motions.record_of_trace(given, "g")
 
 
+def channels(*names, **changed):
+    return [trace(stats=types.SimpleNamespace(**vars(trace().stats) | {"channel": name} | changed)) for name in names]
+
+
+@pytest.mark.parametrize("names", [("HNE", "HNN", "HNZ"), ("HNZ", "HNE", "HNN"), ("HN1", "HN2", "HNZ"), ("HNE", "HNN")])
+def test_a_stream_of_obspy(names):
+    found = rk.motions.components_of_stream(channels(*names), "m/s2")
+    flat = [name for name in names if name != "HNZ"]
+    assert [found.first.origin.component, found.second.origin.component] == flat
+    assert (found.vertical is None) == ("HNZ" not in names)
+
+
+@pytest.mark.parametrize(
+    "stream, message",
+    [
+        (channels("HNE"), "must hold two or three traces of ObsPy, but has 1"),
+        (channels("HNE", "HNZ"), "must hold two horizontal components, but \\['HNZ'\\] are vertical"),
+        (channels("HNE") + channels("HNN", station="XYZ"), "must be of one station, but is of \\['US.ABC', 'US.XYZ'"),
+        (3.0, "must hold two or three traces of ObsPy, but is 3.0"),
+    ],
+)
+def test_streams_that_are_refused(stream, message):
+    with pytest.raises(ValueError, match=message):
+        rk.motions.components_of_stream(stream, "g")
+
+
 def test_what_is_written_is_read_again(tmp_path):
     origin = rk.motions.Origin("LOMA PRIETA", "WAHO", "090")
     record = rk.Record(SAMPLES, 1 / 256, "some\nname", origin)
@@ -192,7 +315,7 @@ def test_a_folder_is_no_file(path):
         rk.motions.write_at2(rk.Record(SAMPLES, 0.01), path)
 
 
-@pytest.mark.parametrize("kind", ["AT2", "CSV", "V2"])
+@pytest.mark.parametrize("kind", ["AT2", "CSV", "V2", "V1"])
 def test_a_million_samples_in_seconds(tmp_path, kind):
     """In one second on a quiet core; where lines are looked at one by one it takes twenty."""
     count = 1_000_000
@@ -201,8 +324,10 @@ def test_a_million_samples_in_seconds(tmp_path, kind):
         "AT2": f"PEER\nA, B, C\nACCELERATION IN UNITS OF G\nNPTS= {count}, DT= .005 SEC\n",
         "CSV": "time,acceleration\n",
         "V2": f"{count} POINTS OF ACCEL DATA EQUALLY SPACED AT  .010 SEC.  (UNITS: G)\n",
+        "V1": f"Uncorrected Accelerogram Data\n{count} Accelerogram points at 100 pts/sec in units of g. "
+        "Format: (8f10.7)\n",
     }
-    text = np.char.mod({"AT2": "%15.7E", "CSV": "%10.7f", "V2": "%10.7f"}[kind], values).astype(str)
+    text = np.char.mod({"AT2": "%15.7E", "CSV": "%10.7f", "V2": "%10.7f", "V1": "%10.7f"}[kind], values).astype(str)
     if kind == "CSV":
         lines = [f"{0.01 * k:.2f},{x}" for k, x in enumerate(text)]
     else:

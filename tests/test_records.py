@@ -452,7 +452,7 @@ def test_even_spacing_is_demanded_to_a_thousandth(file, jitter, fine):
         ({"unit": "ft"}, r"^Argument `unit` must be one of 'g', 'm/s2', 'cm/s2', but is 'ft'\.$"),
         (
             {"format": "sac"},
-            r"^Argument `format` must be one of 'at2', 'v2', 'esm', .*'csv', but is 'sac'\.$",
+            r"^Argument `format` must be one of 'at2', 'v2', 'v1', 'esm', .*'csv', but is 'sac'\.$",
         ),
         ({"dt": 0.0}, r"Argument `dt` must be positive and finite, from 1e-9 to 1e9, but is 0\.0"),
         ({"dt": float("nan")}, "Argument `dt` must be positive and finite, from 1e-9 to 1e9, but is nan"),

@@ -88,8 +88,20 @@ def test_long_table(found):
     np.testing.assert_allclose(table["alpha1"][row], ROCKS.alpha1)
     np.testing.assert_allclose(table["PGA"][row], 2.5 * float(rk.intensity.peak_acceleration(RECORDS[2])))
     np.testing.assert_allclose(table["Arias"][row], 2.5**2 * rk.intensity.arias(RECORDS[2]), rtol=1e-12)
+    named = found.table(["IA", "PGV", "SA(0.5)"])
+    np.testing.assert_allclose(named["IA"], table["Arias"], rtol=1e-12)
+    spectral = rk.intensity.spectral_acceleration(RECORDS[2], 0.5)
+    np.testing.assert_allclose(named["SA(0.5)"][row], 2.5 * spectral, rtol=1e-12)
+    durations = found.table({"D": rk.intensity.significant_duration})["D"]  # which does not grow with the scale
+    np.testing.assert_allclose(durations[row], rk.intensity.significant_duration(RECORDS[2]), rtol=1e-9)
     frame = pytest.importorskip("pandas").DataFrame(table)
     assert frame.groupby("motion").size().eq(12).all()
+
+
+@pytest.mark.parametrize("measures", [{"a": "SA"}, ["Arias"]])
+def test_measures_of_other_names(measures):
+    with pytest.raises(ValueError, match="`measures` must"):
+        by_hand().table(measures)
 
 
 @pytest.mark.parametrize(

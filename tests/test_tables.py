@@ -111,11 +111,12 @@ TABLES = {
     ),
     "fragility": made(
         rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=jnp.eye(2),
-        log_likelihood=ONE, highest_survived=ONE, lowest_toppled=ONE, status=rk.hazard.FitStatus.separable,
+        log_likelihood=ONE, highest_survived=ONE, lowest_toppled=ONE, p_value=ONE,
+        status=rk.hazard.FitStatus.separable,
     ),
     "probit": made(
         rk.hazard.ProbitFit, names=("PGA", "PGV"), intercept=ONE, slopes=jnp.ones(2), covariance=jnp.eye(3),
-        log_likelihood=ONE, status=rk.hazard.FitStatus.successful,
+        p_values=jnp.ones(2), log_likelihood=ONE, status=rk.hazard.FitStatus.successful,
     ),
     "calibration": made(
         rk.inverse.BlockCalibration, values={"alpha": ONE, "alpha_sd": ONE}, covariance=jnp.eye(2), log_likelihood=ONE,

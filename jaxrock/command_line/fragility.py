@@ -15,7 +15,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("records", nargs="+", metavar="RECORD", help="files of accelerograms, of any format")
     parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
     parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
-    parser.add_argument("--measure", choices=("PGA", "PGV"), default="PGA", help="what levels are: PGA [g], PGV [m/s]")
+    parser.add_argument(
+        "--measure", default="PGA", help="what levels are: PGA [g], PGV [m/s], PGD, IA, CAV, SA(0.5), SV(0.5)"
+    )
     parser.add_argument(
         "--levels", type=number, nargs=2, default=(0.1, 2.0), metavar=("FROM", "TO"), help="(default 0.1 2)"
     )
@@ -48,7 +50,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
 
 def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
     """Lines of the table."""
-    unit = {"PGA": "g", "PGV": "m/s"}[found.measure]
+    unit = found.unit
     again = int(np.sum(~found.monotone))
     entries = [
         Entry("scenes", "scenes", found.verdict.size),

@@ -10,6 +10,7 @@ from jaxrock.hazard.curves import (
     survival_probability as survival_probability,
     toppling_rate as toppling_rate,
 )
+from jaxrock.hazard.explanation import compare_measures as compare_measures
 from jaxrock.hazard.fragility import (
     AbstractFragility as AbstractFragility,
     FitStatus as FitStatus,

@@ -171,6 +171,8 @@ class FragilityFit(AbstractTable):
     - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
       outcomes are separable in the usual order, the median lies between them.
     - `status`: a `FitStatus`.
+    - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test):
+      above 0.05 this measure of intensity is useless here. It holds of separable outcomes, too.
     """
 
     fragility: LogNormalFragility
@@ -179,6 +181,7 @@ class FragilityFit(AbstractTable):
     highest_survived: Inexact[Array, ""]
     lowest_toppled: Inexact[Array, ""]
     status: FitStatus
+    p_value: Inexact[Array, ""]
 
     @property
     def _columns(self):
@@ -187,7 +190,9 @@ class FragilityFit(AbstractTable):
         errors = jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
         told = {"median": self.fragility.median, "dispersion": self.fragility.dispersion}
         told |= {f"standard_error_of_ln_{name}": errors[..., i] for i, name in enumerate(("median", "dispersion"))}
-        told |= {n: getattr(self, n) for n in ("log_likelihood", "highest_survived", "lowest_toppled", "status")}
+        told |= {
+            n: getattr(self, n) for n in ("log_likelihood", "highest_survived", "lowest_toppled", "p_value", "status")
+        }
         axes = scenes(self.log_likelihood.ndim)
         return {name: Column(axes, values, units.get(name, "-")) for name, values in told.items()}
 
@@ -249,8 +254,9 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     fit = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), fit, (median, dispersion))
     good = status == FitStatus.successful
     fit = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), fit)
+    test = slope_tests((logarithm - centre)[None], toppled, survived)[0]
     fragility, covariance, likelihood = fit
-    return FragilityFit(fragility, covariance, likelihood, highest_survived, lowest_toppled, status)
+    return FragilityFit(fragility, covariance, likelihood, highest_survived, lowest_toppled, status, test)
 
 
 def probit(z, toppled, survived):
@@ -290,3 +296,30 @@ def probit_line(abscissas, toppled, survived):
     line, change, _ = jax.lax.while_loop(lambda carry: (carry[1] > tight) & (carry[2] < 50), step, start)
     # One step more, with derivatives by the data: those of first order are exact.
     return line + newton(line, abscissas, toppled, survived), change <= tight
+
+
+def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
+    """How probably outcomes that have nothing to do with an abscissa, given the others, give such a slope: (slopes,).
+
+    Rao's score test: at the line without it, whose slope is zero. (A test of the slope in its standard errors finds
+    less the better outcomes are parted.) Of clusters by their labels, of which there are `count`, by the scatter of
+    their scores.
+    """
+    found = []
+    for index in range(len(abscissas)):
+        others = jnp.concatenate([abscissas[:index], abscissas[index + 1 :]])
+        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), others, abscissas[index][None]])
+        if len(others):
+            line = probit_line(others, toppled, survived)[0]
+        else:
+            line = jax.scipy.special.ndtri(jnp.sum(toppled) / jnp.sum(toppled + survived))[None]
+        _, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
+        information = rows @ (-curvature[:, None] * rows.T)
+        along = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
+        scores = (along @ rows) * by_z
+        if labels is None:
+            scatter = along @ information @ along
+        else:
+            scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
+        found.append(jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter)))
+    return jnp.stack(found)

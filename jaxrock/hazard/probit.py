@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, not_negative, positive, shown
 from jaxrock._tables import AbstractTable, Column
-from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line
+from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line, slope_tests
 
 
 class ProbitFit(AbstractTable):
@@ -25,6 +25,8 @@ class ProbitFit(AbstractTable):
     - `names`: of the measures; `intercept`; `slopes`: (measures,).
     - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
+    - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
+      a slope (Rao's score test, of clusters where there are any); they hold of separable outcomes, too.
     - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
     """
 
@@ -33,6 +35,7 @@ class ProbitFit(AbstractTable):
     slopes: Float[Array, " measures"]
     covariance: Float[Array, "terms terms"]
     log_likelihood: Float[Array, ""]
+    p_values: Float[Array, " measures"]
     status: FitStatus
 
     @property
@@ -42,6 +45,7 @@ class ProbitFit(AbstractTable):
             "term": Column(("term",), terms),
             "value": Column(("term",), jnp.concatenate([self.intercept[None], self.slopes])),
             "standard_error": Column(("term",), self.standard_errors),
+            "p_value": Column(("term",), jnp.concatenate([jnp.full(1, jnp.nan), self.p_values])),
             "log_likelihood": Column((), self.log_likelihood),
             "status": Column((), self.status),
         }
@@ -50,6 +54,15 @@ class ProbitFit(AbstractTable):
     def standard_errors(self) -> Float[Array, " terms"]:
         """Of the intercept and the slopes."""
         return jnp.sqrt(jnp.diag(self.covariance))
+
+    @property
+    def useless(self) -> tuple[str, ...]:
+        """Names of measures whose slope cannot be told from 0 (`p_values` above 0.05), or falls where there is one
+        measure only: what they say of toppling may be chance."""
+        untold = self.p_values > 0.05
+        if len(self.names) == 1:
+            untold |= self.slopes < 0
+        return tuple(name for name, bad in zip(self.names, np.asarray(untold)) if bad)
 
     def __call__(self, **measures: Values) -> Float[Array, "..."]:
         """Probability to topple at measures by name, positive, which broadcast.
@@ -97,7 +110,7 @@ def fit_probit(
 
     **Raises:** ValueError for arguments outside their ranges, or of other shapes, and for fewer than two clusters.
 
-    **Source:** Liang & Zeger (1986), clusters; Bell & McCaffrey (2002), the jackknife.
+    **Source:** Liang & Zeger (1986), clusters; Bell & McCaffrey (2002), the jackknife; Rao (1948), the test of slopes.
     """
     if not isinstance(measures, Mapping) or not measures or not all(isinstance(name, str) for name in measures):
         raise ValueError(f"Argument `measures` must hold lists by name, but is {shown(measures)}.")
@@ -152,4 +165,5 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
     numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood
-    return *(jnp.where(converged, x, jnp.nan) for x in numbers), status
+    tests = slope_tests(abscissas, toppled, survived, None if errors == "information" else labels, count)
+    return *(jnp.where(converged, x, jnp.nan) for x in numbers), tests, status

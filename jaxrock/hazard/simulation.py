@@ -5,8 +5,7 @@ verdict of every scene is kept, so that nothing is made monotone before a lognor
 without a verdict bounds the probability from both sides.
 """
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -14,14 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int8
 
-from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, one_of
+from jaxrock._arguments import arguments
+from jaxrock._checks import Values, checked, one_of
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising_list
+from jaxrock.hazard.fragility import (
+    FitStatus,
+    FragilityFit,
+    TabulatedFragility,
+    fit_fragility,
+    probit,
+    rising_list,
+    slope_tests,
+)
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
@@ -41,8 +49,9 @@ def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
 class SimulatedFragility(AbstractTable):
     """What became of blocks under scaled motions.
 
-    - `levels`: (levels,) of the measure; `measure`: "PGA" [g] or "PGV" [m/s].
-    - `names`: of the motions; `peak_acceleration` [g], `peak_velocity` [m/s]: (motions,) before they were scaled.
+    - `levels`: (levels,) of the measure; `measure`: its name, "PGA" [g], say.
+    - `names`: of the motions; `peak_acceleration` [g], `peak_velocity` [m/s], `strength` (the measure): (motions,)
+      before they were scaled; the measure grows with the `power` of the scale.
     - `verdict`: (motions, levels, draws) 1 toppled, 0 stood, -1 undecided (the verdict was too close to call, or could
       not be computed).
     """
@@ -53,10 +62,17 @@ class SimulatedFragility(AbstractTable):
     peak_velocity: Float[Array, " motions"]
     names: tuple[str, ...] = eqx.field(static=True)
     measure: str = eqx.field(static=True)
+    strength: Float[np.ndarray, " motions"] | None = None
+    power: float = eqx.field(static=True, default=1.0)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the levels; empty where it is not known."""
+        return unit_of(self.measure)
 
     @property
     def _columns(self):
-        axes, unit = ("motion", "level"), {"PGA": "g", "PGV": "m/s"}[self.measure]
+        axes, unit = ("motion", "level"), self.unit or "that of the measure"
         rows = {name: values.reshape(self.verdict.shape[:2]) for name, values in self.table().items()}
         told = {"motion": Column(("motion",), np.array(self.names)), "level": Column(("level",), self.levels, unit)}
         units = {"peak_acceleration": "g", "peak_velocity": "m/s"}
@@ -116,7 +132,7 @@ class SimulatedFragility(AbstractTable):
         if motions == 1 or fit.status != FitStatus.successful:
             return fit
         clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
-        return eqx.tree_at(lambda f: f.covariance, fit, clustered)
+        return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, clustered)
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -145,7 +161,10 @@ class SimulatedFragility(AbstractTable):
     def table(self) -> dict[str, np.ndarray]:
         """Columns with a row for every motion and level: names, level, peaks [g], [m/s], trials, toppled, undecided."""
         motions, levels, draws = self.verdict.shape
-        factors = _factors(self.levels, self.peak_acceleration, self.peak_velocity, self.measure)
+        strength = self.strength
+        if strength is None:
+            strength = self.peak_velocity if self.measure == "PGV" else self.peak_acceleration
+        factors = _factors(self.levels, strength, self.power)
         return {
             "motion": np.repeat(np.array(self.names), levels),
             "level": np.tile(np.asarray(self.levels), motions),
@@ -159,13 +178,17 @@ class SimulatedFragility(AbstractTable):
 
 @eqx.filter_jit
 def _clustered(fit: FragilityFit, levels, toppled, draws):
-    """Covariance of (ln median, ln dispersion) where what one motion (a row) does at all levels is one outcome."""
+    """Covariance of (ln median, ln dispersion), and the test of the slope, where what one motion (a row) does at all
+    levels is one outcome."""
     median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
     rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -z])  # of z by ln median and ln dispersion
     scores = jax.vmap(lambda toppled: rows @ probit(z, toppled, draws - toppled)[1])(toppled)
     motions = toppled.shape[0]
-    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance
+    abscissas = jnp.tile(jnp.log(levels), motions)[None]
+    labels = jnp.repeat(jnp.arange(motions), levels.size)
+    test = slope_tests(abscissas, toppled.ravel(), draws - toppled.ravel(), labels, motions)[0]
+    return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance, test
 
 
 @arguments
@@ -175,7 +198,7 @@ def simulated_fragility(
     levels: Values,
     model: AbstractEquation = Housner(),
     *,
-    measure: Annotated[str, word_of("PGA", "PGV")] = "PGA",
+    measure: str | Callable[[AbstractMotion], float] = "PGA",
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SimulatedFragility:
@@ -187,7 +210,9 @@ def simulated_fragility(
     - `motions`: a `Suite`, or what makes one.
     - `levels`: (levels,) of the measure, positive and rising; two or more.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
-    - `measure`: what the levels are: "PGA", peak acceleration [g], or "PGV", peak velocity [m/s].
+    - `measure`: what the levels are: "PGA" [g], "PGV" [m/s], "PGD" [m], "IA" (Arias) or "CAV" [m/s], "SA(0.5)" [g] or
+      "SV(0.5)" [m/s] at a period [s]; or a function of a motion that grows as a power of its scale, such as
+      `lambda m: rk.intensity.average_spectral_acceleration(m, [0.2, 0.5, 1.0])`.
 
     **Returns:** a `SimulatedFragility`: its `tabulated()` and `fit().fragility` go into `toppling_rate` and
     `survival_probability` with a hazard curve of the same measure.
@@ -198,12 +223,17 @@ def simulated_fragility(
     """
     levels = rising_list("levels", levels)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
-    factors = _factors(levels, suite.peak_acceleration, suite.peak_velocity, measure)
+    kind = measure_of("measure", measure)
+    strength = strengths("measure", kind, suite)
+    power = power_of("measure", kind, suite.motions())
+    factors = _factors(levels, strength, power)
+    strongest = factors * np.asarray(suite.peak_acceleration)[:, None]
+    checked("levels", strongest.max(axis=0), "keep all motions at 1e9 g or below", lambda x: x <= 1e9)
     verdict = scenes(stacked(block), suite, factors, model, engine, progress).verdict
-    return SimulatedFragility(levels, verdict, suite.peak_acceleration, suite.peak_velocity, suite.names, measure)
+    peaks = suite.peak_acceleration, suite.peak_velocity
+    return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power)
 
 
-def _factors(levels, accelerations, velocities, measure: str) -> np.ndarray:
+def _factors(levels, strength, power: float) -> np.ndarray:
     """By how much every motion is scaled at every level."""
-    peaks = accelerations if measure == "PGA" else velocities
-    return np.asarray(levels)[None, :] / np.asarray(peaks)[:, None]
+    return (np.asarray(levels)[None, :] / np.asarray(strength)[:, None]) ** (1 / power)

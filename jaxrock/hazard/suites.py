@@ -21,6 +21,7 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.measures import Measure, measure_of, scaled_strengths
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
@@ -95,35 +96,46 @@ class SuiteOutcomes(AbstractTable):
         """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
         return np.any(np.maximum.accumulate(self.verdict == TOPPLED, axis=1) & (self.verdict == STOOD), axis=1)
 
-    def table(self, measures: Mapping[str, Callable[[AbstractMotion], float]] | None = None) -> dict[str, np.ndarray]:
+    def table(self, measures: Mapping[str, str | Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
 
         **Arguments:**
 
-        - `measures`: functions of a motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each
-          is taken of the motion as it was scaled. None: none beside the peaks.
+        - `measures`: names as in `simulated_fragility`, such as `["IA", "SA(0.5)"]`, or such names or functions of a
+          motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each is taken of the motion as
+          it was scaled. None: none beside the peaks.
 
-        **Returns:** motion, scale, facing, block, the block's parameters, PGA [g], PGV [m/s], the measures,
-        rotation_over_alpha, margin, verdict (1 toppled, 0 stood, -1 undecided).
+        **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters,
+        PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1 toppled, 0 stood, -1 undecided).
 
-        **Raises:** ValueError for measures that are no functions.
+        **Raises:** ValueError for measures that are no functions, or other names.
         """
-        measures = {} if measures is None else measures
-        if not isinstance(measures, Mapping) or not all(map(callable, measures.values())):
-            raise ValueError(f"Argument `measures` must hold functions by name, but is {shown(measures)}.")
-        shape = self.verdict.shape
-        motion, scale, facing, block = (places.ravel() for places in np.indices(shape))
+        kinds = measures_by_name(measures)
+        motion, scale, facing, block = (places.ravel() for places in np.indices(self.verdict.shape))
         strength = self.scale[scale]
-        columns = {"motion": np.array(self.suite.names)[motion], "scale": strength,
-                   "facing": np.array(self.facing)[facing], "block": block}  # fmt: skip
+        columns = {"motion": np.array(self.suite.names)[motion]}
+        if self.suite.azimuth is not None:
+            columns |= {"source": np.array(self.suite.sources)[motion], "azimuth": self.suite.azimuth[motion]}
+        columns |= {"scale": strength, "facing": np.array(self.facing)[facing], "block": block}
         columns |= {leaf.name: np.asarray(leaf.value)[block] for leaf in leaves_of(self.blocks)}
         peaks = {"PGA": self.suite.peak_acceleration, "PGV": self.suite.peak_velocity}
         columns |= {name: np.asarray(peak)[motion] * strength for name, peak in peaks.items()}
-        for name, measure in measures.items():
-            cells = np.array([[float(measure(s * m)) for s in self.scale] for m in self.suite.motions()])
-            columns[name] = cells[motion, scale]
+        for name, kind in kinds.items():
+            if name not in peaks or kind.power is None:
+                columns[name] = scaled_strengths(kind, self.suite, self.scale)[motion, scale]
         results = {"rotation_over_alpha": self.rotation, "margin": self.margin, "verdict": self.verdict}
         return columns | {name: each.ravel() for name, each in results.items()}
+
+
+def measures_by_name(measures) -> dict[str, Measure]:
+    """Measures by the names of their columns."""
+    if measures is None:
+        return {}
+    if isinstance(measures, Mapping):
+        return {str(name): measure_of("measures", each) for name, each in measures.items()}
+    if isinstance(measures, (list, tuple)):
+        return {kind.name: kind for kind in (measure_of("measures", each) for each in measures)}
+    raise ValueError(f"Argument `measures` must hold names, or functions by name, but is {shown(measures)}.")
 
 
 @arguments
@@ -142,7 +154,7 @@ def suite_outcomes(
     **Arguments:**
 
     - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (blocks,) many.
-    - `motions`: a `Suite`, or what makes one.
+    - `motions`: a `Suite`, or what makes one; `Suite(components, azimuth=...)` of records with two components.
     - `scale`: factors on all motions, a number (1: as recorded) or a list, positive and rising.
     - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block is a mirror image.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.

@@ -7,10 +7,16 @@ one in `files`.
 from jaxrock.motions import intensity as intensity
 from jaxrock.motions.components import (
     Components as Components,
+    components_of_stream as components_of_stream,
     read_components as read_components,
 )
 from jaxrock.motions.files.example import example_record as example_record
+from jaxrock.motions.files.fema_p695 import fema_p695 as fema_p695
 from jaxrock.motions.files.reading import read_record as read_record
+from jaxrock.motions.files.spectra import (
+    ResponseSpectra as ResponseSpectra,
+    read_spectra as read_spectra,
+)
 from jaxrock.motions.files.traces import record_of_trace as record_of_trace
 from jaxrock.motions.files.writing import (
     write_at2 as write_at2,
@@ -19,6 +25,11 @@ from jaxrock.motions.files.writing import (
 from jaxrock.motions.motion import (
     AbstractMotion as AbstractMotion,
     WithVertical as WithVertical,
+)
+from jaxrock.motions.pulse_fit import (
+    PulseFit as PulseFit,
+    PulseStatus as PulseStatus,
+    fit_pulse as fit_pulse,
 )
 from jaxrock.motions.pulses import *  # noqa: F403  (those of files that were added)
 from jaxrock.motions.pulses.exponential import (

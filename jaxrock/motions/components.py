@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, list_of
+from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import finite, scalar, shown
+from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import read_record
+from jaxrock.motions.files.traces import record_of_trace
 from jaxrock.motions.record import Record
 
 _VERTICAL = re.compile(r"\W*(U(P|D|-D|P-DOWN|P/DOWN)?|D(OW|W)N|V(ER\w*)?|..?Z|Z)\W*", re.IGNORECASE)
@@ -76,10 +78,6 @@ def is_vertical(record: Record) -> bool:
     return bool(_VERTICAL.fullmatch(record.origin.component))
 
 
-def _is_column(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 0)
-
-
 @arguments
 def read_components(
     paths: str | os.PathLike | Sequence[str | os.PathLike],
@@ -114,10 +112,40 @@ def read_components(
         records = [read_record(path, **given) for path in paths]
     if len(records) not in (2, 3):
         raise ValueError(f"Argument `columns` must hold two or three columns, but holds {len(records)}.")
+    return _together("paths", records)
+
+
+def _together(name: str, records: list[Record]) -> Components:
+    """Two or three records as components: which is vertical they say, or else it is the last of three."""
     upward = [k for k, record in enumerate(records) if is_vertical(record)]
     if len(upward) > 1 or len(records) == 2 and upward:
         said = [records[k].origin.component for k in upward]
-        raise ValueError(f"Argument `paths` must hold two horizontal components, but {said} are vertical.")
+        raise ValueError(f"Argument `{name}` must hold two horizontal components, but {said} are vertical.")
     vertical = records.pop(upward[0] if upward else 2) if len(records) == 3 else None
     first, second = records
     return Components(first, second, vertical)
+
+
+@arguments
+def components_of_stream(stream: Any, unit: Annotated[str, word_of(*PER_G)]) -> Components:
+    """The traces of one station in a stream of ObsPy, as components.
+
+    **Arguments:**
+
+    - `stream`: an `obspy.Stream`, or a list, of two or three traces: one of each channel.
+    - `unit`: as in `record_of_trace`.
+
+    **Returns:** `Components`, the horizontal ones in the order of the traces. Of a stream of many stations:
+    `[components_of_stream(stream.select(station=each), unit) for each in stations]`.
+
+    **Raises:** as `record_of_trace` and `Components`; ValueError for another number of traces, or for two stations.
+    """
+    traces = list(stream) if isinstance(stream, Iterable) and not isinstance(stream, (str, bytes)) else []
+    if len(traces) not in (2, 3):
+        said = f"has {len(traces)}" if traces else f"is {shown(stream)}"
+        raise ValueError(f"Argument `stream` must hold two or three traces of ObsPy, but {said}.")
+    records = [record_of_trace(trace, unit) for trace in traces]
+    stations = {(record.origin.station, record.origin.code) for record in records}
+    if len(stations) > 1:
+        raise ValueError(f"Argument `stream` must be of one station, but is of {sorted(each for each, _ in stations)}.")
+    return _together("stream", records)

@@ -1,5 +1,5 @@
-"""What is done to records before they shake anything: from displacement and velocity, baseline, taper, filter,
-resample, cut, scale. Known records only: NumPy and SciPy do it, not JAX.
+"""What is done to records before they shake anything: from displacement and velocity, fused with a displacement,
+baseline, taper, filter, resample, cut, scale. Known records only: NumPy and SciPy do it, not JAX.
 
 Every function gives a new `Record` that keeps the name and the origin.
 """
@@ -94,8 +94,13 @@ def from_displacement(
     """
     values, dt = _series("displacement", displacement, dt, unit)
     values = _smoothed(values - values[0], dt, _corner("corner", corner, dt), order)
-    spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values, bc_type=((1, 0.0), "not-a-knot"))
-    return Record(spline(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
+    return Record(_spline(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
+
+
+def _spline(displacement: np.ndarray, dt: float) -> scipy.interpolate.CubicSpline:
+    """Through samples of a ground that is at rest at first."""
+    time = dt * np.arange(displacement.size)
+    return scipy.interpolate.CubicSpline(time, displacement, bc_type=((1, 0.0), "not-a-knot"))
 
 
 @arguments
@@ -125,6 +130,45 @@ def from_velocity(
     values = _smoothed(values, dt, _corner("corner", corner, dt), order)
     spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
     return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
+
+
+@arguments
+def fused(
+    record: Record,
+    displacement: Values,
+    dt: ArrayLike,
+    *,
+    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    corner: Annotated[float, known(positive)] = 0.5,
+    order: Order = 4,
+) -> Record:
+    """A record whose slow part comes from a displacement: what a displacement sensor and an accelerometer say together.
+
+    **Arguments:**
+
+    - `record`: of the accelerometer, whose baseline may drift.
+    - `displacement`: (n,) samples of the ground at the same place, n at least 4, the first at the record's first; at
+      rest at first. The shorter of the two ends both.
+    - `dt`: time between its samples [s], positive.
+    - `unit`: of the displacement: "m", "cm" or "mm".
+    - `corner`: of the Butterworth filters of this `order`, run forwards and backwards [Hz]: below, the displacement is
+      believed, above, the accelerometer. Below half of both sampling rates.
+
+    **Returns:** a `Record` of the accelerometer's time step: the record, and after a low-pass what the second
+    derivative of the displacement's spline differs from it. Low-pass and high-pass add to one: what both agree on stays
+    as it is.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Smyth & Wu (2007), the two sensors; complementary filters.
+    """
+    samples, step = _samples(record)
+    values, dt = _series("displacement", displacement, dt, unit)
+    corner = _corner("corner", corner, max(step, dt))
+    count = min(samples.size, int(np.floor((values.size - 1) * dt / step * (1 + 1e-12))) + 1)
+    slow = _spline(_smoothed(values - values[0], dt, corner, order), dt)(step * np.arange(count), 2) / GRAVITY
+    # Filtered before it is differentiated, at its own rate: fast noise would come back as slow.
+    return _like(record, samples[:count] - _smoothed(samples, step, corner, order)[:count] + slow)
 
 
 @arguments

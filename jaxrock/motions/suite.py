@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import Values, finite
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
+from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import with_room
@@ -18,37 +20,56 @@ from jaxrock.motions.record import with_room
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
 
+def _is_motion(value) -> bool:
+    return isinstance(value, (AbstractMotion, Components))
+
+
 class Suite(eqx.Module):
     """Ground motions of any kinds, with their peaks.
 
     **Arguments:**
 
-    - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n.
-    - `names`: of the motions; None: those of records, or the kind, with numbers.
+    - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Or a list of
+      `Components`, each of which is one motion for every azimuth.
+    - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
+    - `azimuth`: (azimuths,) of components [rad], from the first one towards the second: in which vertical planes a
+      block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
 
-    `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,).
+    `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
+    turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
 
-    **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move.
+    **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move; for
+    components without azimuths, and azimuths without components.
     """
 
     groups: tuple[AbstractMotion, ...]  # each of many motions; of samples that all of it share, there is one set
     names: tuple[str, ...] = eqx.field(static=True)
     peak_acceleration: Float[Array, " motions"]
     peak_velocity: Float[Array, " motions"]
+    sources: tuple[str, ...] = eqx.field(static=True)
+    azimuth: Float[np.ndarray, " motions"] | None
+    turns: int = eqx.field(static=True)
 
     @arguments
     def __init__(
         self,
-        motions: Annotated[Sequence[AbstractMotion], list_of(AbstractMotion, "motions")],
+        motions: Annotated[Sequence[AbstractMotion | Components], list_of(_is_motion, "motions")],
         names: Annotated[Sequence[str] | None, list_of(str, "words")] = None,
+        azimuth: Values | None = None,
     ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
+        self.azimuth, self.turns, sources = None, 1, None
+        if azimuth is not None or any(isinstance(each, Components) for each in motions):
+            records = len(motions)
+            motions, names, sources, self.azimuth = _turned(motions, names, azimuth)
+            self.turns = len(motions) // records
         self.groups = tuple(map(_ensemble, motions))
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
         self.names = tuple(own if names is None else names)
         if len(self.names) != len(own):
             raise ValueError(f"Argument `names` must name {len(own)} motions, but has {len(self.names)} names.")
+        self.sources = self.names if sources is None else sources
         self.peak_acceleration = jnp.concatenate([_each(peak_acceleration, group) for group in self.groups])
         self.peak_velocity = jnp.concatenate([_each(peak_velocity, group) for group in self.groups])
         for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
@@ -63,6 +84,23 @@ class Suite(eqx.Module):
         for group in self.groups:
             for index in range(size_of(group)):
                 yield one_of_many(group, index)
+
+
+def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None):
+    """Components at all azimuths: motions, their names, the names of their records, and the azimuth of each."""
+    if azimuth is None or not all(isinstance(each, Components) for each in motions):
+        raise ValueError("Arguments `motions` and `azimuth` must be given for components alone, all of them.")
+    angles = np.asarray(finite("azimuth", azimuth), float)
+    if angles.ndim != 1 or angles.size == 0:
+        raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
+    own = [each.first.name or f"record {number + 1}" for number, each in enumerate(motions)]
+    names = own if names is None else names
+    if len(names) != len(motions):
+        raise ValueError(f"Argument `names` must name {len(motions)} motions, but has {len(names)} names.")
+    turned = [each.along(angle) for each in motions for angle in angles]
+    titles = [f"{name}, {np.degrees(angle):.4g} deg" for name in names for angle in angles]
+    sources = tuple(name for name in names for _ in angles)
+    return turned, titles, sources, np.tile(angles, len(motions))
 
 
 def _ensemble(motion: AbstractMotion) -> AbstractMotion:

@@ -41,8 +41,8 @@ def fragility(
         dense = np.geomspace(levels[0], levels[-1], 300)
         label = f"lognormal: {float(fit.median):.3g}, {float(fit.dispersion):.2g}"
         axis.plot(dense, fit(dense), color=RED, linewidth=1.2, label=label)
-    unit = {"PGA": "PGA [g]", "PGV": "PGV [m/s]"}[simulated.measure]
-    axis.set(xscale="log", xlabel=unit, ylabel="probability to topple", ylim=(-0.02, 1.02))
+    unit = f" [{simulated.unit}]" if simulated.unit else ""
+    axis.set(xscale="log", xlabel=simulated.measure + unit, ylabel="probability to topple", ylim=(-0.02, 1.02))
     axis.legend(loc="upper left", fontsize=8, frameon=False)
     return log_ticks(axis)
 

@@ -3,6 +3,10 @@
 Imports `responses` and `sweeps`. Start with `spectra`.
 """
 
+from jaxrock.studies.azimuths import (
+    AzimuthOutcomes as AzimuthOutcomes,
+    azimuth_outcomes as azimuth_outcomes,
+)
 from jaxrock.studies.borders import (
     Borders as Borders,
     Region as Region,

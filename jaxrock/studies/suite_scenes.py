@@ -59,7 +59,7 @@ def scenes(
     bar = Progress(factors.size * draws, "suite", progress)
     found = []
     for motion, row in zip(suite.motions(), factors):
-        found.append(_of_one(with_room(motion), lanes, jnp.tile(jnp.asarray(row), draws), model, engine))
+        found.append(of_motion(with_room(motion), lanes, jnp.tile(jnp.asarray(row), draws), model, engine))
         bar.add(count * draws)
     shape = len(suite), draws, count
     parts = (np.stack([np.asarray(x) for x in part]).reshape(shape).swapaxes(1, 2) for part in zip(*found))
@@ -67,8 +67,8 @@ def scenes(
 
 
 @jax.jit
-def _of_one(motion, blocks, factors, model, engine) -> Scenes:
-    """All scenes of one motion, side by side."""
+def of_motion(motion, blocks, factors, model, engine) -> Scenes:
+    """All scenes of one motion, side by side: stacked blocks, each with its factor."""
 
     def one(lane, factor):
         block = one_of_many(blocks, lane)

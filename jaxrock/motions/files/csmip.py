@@ -1,6 +1,6 @@
 """V2, the format of CSMIP (also of USC) for corrected acceleration: channels of columns of fixed width.
 
-A V1 file (uncorrected) of evenly spaced samples announces them likewise; spectra (V3) are refused by what they are.
+Spectra (V3) are refused by what they are: see `spectra`; uncorrected accelerograms (V1) are read by `csmip_v1`.
 """
 
 import re
@@ -29,32 +29,26 @@ _CHANNEL = re.compile(
 )
 
 
-_OTHER = re.compile(
-    r"^\s*(?:UNCORRECTED ACCELEROGRAM|.*RESPONSE (?:AND FOURIER AMPLITUDE )?SPECTRA\b(?!.*:))", re.IGNORECASE
-)
+_SPECTRA = re.compile(r"^.*RESPONSE (?:AND FOURIER AMPLITUDE )?SPECTRA\b(?!.*:)", re.IGNORECASE)
 
 
 class CSMIP(AbstractFormat):
-    """CSMIP V2, and V1 where it is evenly spaced."""
+    """CSMIP V2."""
 
     name = "v2"
     suffixes = (".v2",)
 
     def recognises(self, lines):
-        return any(map(_CHANNEL.match, lines)) or any(map(_OTHER.match, lines[:1]))
+        return any(map(_CHANNEL.match, lines)) or any(map(_SPECTRA.match, lines[:1]))
 
     def read(self, name, lines, dt, unit, column):
         channels = [number for number, line in enumerate(lines) if _CHANNEL.match(line)]
         if not channels:
-            other = _OTHER.match(lines[0])
-            if other:
-                kind = "response spectra (V3)" if "SPECTRA" in other[0].upper() else "uncorrected pairs (V1)"
-                raise file_error(name, f"holds {kind}, but not evenly spaced accelerations: take its V2 file.")
+            if _SPECTRA.match(lines[0]):
+                said = "take its V2 file, or `jaxrock.motions.read_spectra`"
+                raise file_error(name, f"holds response spectra (V3), but no accelerations: {said}.")
             raise file_error(name, "no line announces 'POINTS OF ACCEL DATA', as a corrected V2 file must.")
-        channel = 0 if column is None else column
-        if channel >= len(channels):
-            allowed = f"be 0 to {len(channels) - 1}, a channel of V2 file `{name}`"
-            raise ValueError(f"Argument `column` must {allowed}, but is {channel}.")
+        channel = chosen_channel(name, "V2", column, len(channels))
         at = channels[channel]
         count, step, written, width = _CHANNEL.match(lines[at]).groups()
         unit = agreed_unit(name, at + 1, unit, written)
@@ -62,13 +56,22 @@ class CSMIP(AbstractFormat):
         width = int(width or 10)
         samples = announced_columns(name, lines, at + 1, int(count), width)
         if channel == len(channels) - 1:
-            _check_end(name, lines, at + 1, width)
+            check_last_columns(name, lines, at + 1, width)
         if unit == "cm/s2":
             _check_peak(name, lines, channels[channel - 1] + 1 if channel else 0, at, samples)
-        return Accelerogram(samples, dt, unit, *_told(lines[:at]))
+        return Accelerogram(samples, dt, unit, *told(lines[:at], r"\s*CORRECTED ACCELEROGRAM", (2, 6, 7)))
 
 
-def _check_end(name: str, lines: list[str], start: int, width: int) -> None:
+def chosen_channel(name: str, kind: str, column: int | None, count: int) -> int:
+    """Which channel of a file of so many is asked for: the first, if none is."""
+    channel = 0 if column is None else column
+    if channel >= count:
+        allowed = f"be 0 to {count - 1}, a channel of {kind} file `{name}`"
+        raise ValueError(f"Argument `column` must {allowed}, but is {channel}.")
+    return channel
+
+
+def check_last_columns(name: str, lines: list[str], start: int, width: int) -> None:
     """The last line of a channel, at which a file may end, is whole."""
     rows = [
         row for row, line in enumerate(lines[start:], start) if line.strip() and fixed_numbers(line, width) is not None
@@ -89,17 +92,19 @@ def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.nd
             check_peak(name, row + 1, to_float(found[1]), samples)
 
 
-def _told(lines: list[str]) -> tuple[str, Origin]:
-    """Event, station and channel in the lines before a channel's samples: in a title, and as what they are."""
-    # The text header of each channel starts with this line; the three have fixed places in it.
-    starts = [row for row, line in enumerate(lines) if re.match(r"\s*CORRECTED ACCELEROGRAM", line, re.IGNORECASE)]
+def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[str, Origin]:
+    """Event, station and channel in the lines before a channel's samples: in a title, and as what they are.
+
+    `first`: how the text header of a channel begins; `places` of the three in it, counted in lines.
+    """
+    starts = [row for row, line in enumerate(lines) if re.match(first, line, re.IGNORECASE)]
     header = lines[starts[-1] :] if starts else []
-    parts = [re.split(r"(?<![:\s])\s{3,}|\s{2,}\(", header[row].strip())[0] for row in (2, 6, 7) if row < len(header)]
+    parts = [re.split(r"(?<![:\s])\s{3,}|\s{2,}\(", header[row].strip())[0] for row in places if row < len(header)]
     parts = [" ".join(part.split()) for part in parts]
     event, station, channel = (*parts, "", "", "")[:3]
     text = "\n".join(header[:10])
-    start = re.search(r"TRIGGER TIME:\s*(.*)", text, re.IGNORECASE)
-    code = re.search(r"STATION NO\.?\s*(\S+)", text, re.IGNORECASE)
+    start = re.search(r"(?:TRIGGER|START) TIME:\s*(.*)", text, re.IGNORECASE)
+    code = re.search(r"STATION (?:NO\.?|ID\.)\s*(\S+)", text, re.IGNORECASE)
     component = re.sub(r"^CHAN\s*\w*\s*:\s*", "", channel, flags=re.IGNORECASE)
-    told = (" ".join(found[1].split()) if found else "" for found in (start, code))
-    return ", ".join(filter(None, parts)), Origin(event, station, component, *told)
+    words = (" ".join(found[1].split()) if found else "" for found in (start, code))
+    return ", ".join(filter(None, parts)), Origin(event, station, component, *words)

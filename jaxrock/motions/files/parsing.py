@@ -111,11 +111,12 @@ def announced_samples(
     count: int,
     parse: Callable[[str], list[float] | None],
     at_once: Callable[[list[str]], np.ndarray | None] = lambda lines: None,
+    what: str = "samples",
 ) -> np.ndarray:
     """The `count` samples that must follow line number `start`, and nothing more.
 
     `parse(line)`: the numbers in a line, or None if it holds anything else. `at_once(lines)`: those of all, or None
-    where lines have to be looked at one by one.
+    where lines have to be looked at one by one. `what`: the numbers are, in words.
     """
     block = data_lines(lines, start)
     rest = lines[start + len(block) :]
@@ -125,7 +126,7 @@ def announced_samples(
             return values
     values = _one_by_one(name, lines, start, count, parse)
     if len(values) != count or count == 0:
-        raise file_error(name, f"header announces {count} samples, but {len(values)} follow.")
+        raise file_error(name, f"header announces {count} {what}, but {len(values)} follow.")
     return np.array(values)
 
 
@@ -149,10 +150,12 @@ def _one_by_one(name: str, lines: list[str], start: int, count: int, parse: Call
     return values
 
 
-def announced_columns(name: str, lines: list[str], start: int, count: int, width: int) -> np.ndarray:
+def announced_columns(
+    name: str, lines: list[str], start: int, count: int, width: int, what: str = "samples"
+) -> np.ndarray:
     """`announced_samples` in columns `width` wide, which may touch."""
     parse, at_once = functools.partial(fixed_numbers, width=width), functools.partial(numbers_of_width, width=width)
-    return announced_samples(name, lines, start, count, parse, at_once)
+    return announced_samples(name, lines, start, count, parse, at_once, what)
 
 
 def fixed_numbers(line: str, width: int) -> list[float] | None:

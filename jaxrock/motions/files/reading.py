@@ -18,6 +18,7 @@ from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
 from jaxrock.motions.files.cosmos import COSMOS
 from jaxrock.motions.files.csmip import CSMIP
+from jaxrock.motions.files.csmip_v1 import CSMIPUncorrected
 from jaxrock.motions.files.esm import ESM
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.knet import KNET
@@ -30,6 +31,7 @@ from jaxrock.motions.record import Record
 _WITH_HEADERS = (
     AT2(),
     CSMIP(),
+    CSMIPUncorrected(),
     ESM(),
     COSMOS(),
     SMC(),
@@ -61,16 +63,17 @@ def read_record(
     **Arguments:**
 
     - `path`: the file.
-    - `format`: "at2" (PEER), "v2" (CSMIP, also USC), "esm" (ASCII of the Engineering Strong-Motion database), "cosmos"
-      (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset), or "csv" (columns of text separated
-      by commas, semicolons, tabs or blanks). None recognises it from the content, then from the suffix.
-    - `dt`: time between samples [s], positive. Needed for text without times; elsewhere it must agree
-      with the file to 1e-3.
+    - `format`: "at2" (PEER), "v2" (CSMIP, also USC), "v1" (CSMIP, uncorrected), "esm" (ASCII of the Engineering
+      Strong-Motion database), "cosmos" (V1, V2, V2c), "smc" (USGS), "knet" (K-NET and KiK-net, without their offset),
+      or "csv" (columns of text separated by commas, semicolons, tabs or blanks). None recognises it from the content,
+      then from the suffix.
+    - `dt`: time between samples [s], positive. Needed for text without times, and for V1 files whose samples are not
+      equally spaced, which are followed along straight lines; elsewhere it must agree with the file to 1e-3.
     - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls.
-      V2: the channel (None: the first). The others hold one record.
+      V1, V2: the channel (None: the first). The others hold one record.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
     the file says of it. Its first sample is at time 0, whatever the times in the file.

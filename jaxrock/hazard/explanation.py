@@ -1,0 +1,77 @@
+"""Which measure of intensity explains overturning: a probit fit by each, side by side."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
+
+import numpy as np
+
+from jaxrock._arguments import arguments, word_of
+from jaxrock._checks import shown
+from jaxrock.hazard.fragility import FitStatus
+from jaxrock.hazard.probit import fit_probit
+from jaxrock.hazard.suites import SuiteOutcomes, measures_by_name
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED
+
+_STATUSES = ("successful", "separable", "not_growing", "not_converged")
+
+
+@arguments
+def compare_measures(
+    found: SuiteOutcomes,
+    measures: Mapping[str, str | Callable] | Sequence[str],
+    *,
+    bound: Annotated[str, word_of("lower", "upper")] = "lower",
+    errors: Annotated[str, word_of("clusters", "jackknife")] = "clusters",
+) -> dict[str, np.ndarray]:
+    """How well measures of intensity, each alone, explain what became of the scenes of a suite.
+
+    **Arguments:**
+
+    - `found`: from `suite_outcomes`.
+    - `measures`: as in its `table`.
+    - `bound`: whether what is undecided stood ("lower") or toppled ("upper").
+    - `errors`: as in `fit_probit`; scenes of one record go together.
+
+    **Returns:** columns for `pandas.DataFrame`, by falling auc: measure; auc (how probably a scene that toppled had
+    more of it than one that stood); median (at which half topple) and dispersion; slope, standard_error, p_value,
+    useless (the slope cannot be told from 0, or falls); log_likelihood; status (a name of `FitStatus`). Numbers of a
+    fit that failed are NaN; where it is "separable" and auc 1, the measure parts what toppled from what stood.
+
+    **Raises:** ValueError for outcomes of one record, and as `SuiteOutcomes.table`.
+    """
+    if not measures:
+        raise ValueError(f"Argument `measures` must hold a measure, but is {shown(measures)}.")
+    table = found.table(measures)
+    toppled = table["verdict"] == TOPPLED if bound == "lower" else table["verdict"] != STOOD
+    clusters = np.indices(found.verdict.shape)[0].ravel() // found.suite.turns
+    rows = [_row(name, table[name], toppled, clusters, errors) for name in measures_by_name(measures)]
+    rows.sort(key=lambda row: -np.nan_to_num(row["auc"]))
+    return {column: np.array([row[column] for row in rows]) for column in rows[0]}
+
+
+def _row(name: str, values: np.ndarray, toppled: np.ndarray, clusters: np.ndarray, errors: str) -> dict:
+    fit = fit_probit({name: values}, toppled, clusters=clusters, errors=errors)
+    slope = float(fit.slopes[0])
+    rises = slope > 0
+    return {
+        "measure": name,
+        "auc": _auc(values, toppled),
+        "median": float(np.exp(-float(fit.intercept) / slope)) if rises else np.nan,
+        "dispersion": 1 / slope if rises else np.nan,
+        "slope": slope,
+        "standard_error": float(fit.standard_errors[1]),
+        "p_value": float(fit.p_values[0]),
+        "useless": bool(fit.useless),
+        "log_likelihood": float(fit.log_likelihood),
+        "status": next(word for word in _STATUSES if fit.status == getattr(FitStatus, word)),
+    }
+
+
+def _auc(values: np.ndarray, toppled: np.ndarray) -> float:
+    """How probably one that toppled has the larger value (a tie counts half): Mann and Whitney's statistic."""
+    from scipy.stats import mannwhitneyu
+
+    if toppled.all() or not toppled.any():
+        return float("nan")
+    first, second = values[toppled], values[~toppled]
+    return float(mannwhitneyu(first, second).statistic / (first.size * second.size))

@@ -1,0 +1,128 @@
+"""V1, the format of CSMIP for uncorrected accelerograms: columns of samples, or of times and samples from a film."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrock._text import file_error
+from jaxrock.motions.files.csmip import check_last_columns, chosen_channel, told
+from jaxrock.motions.files.format import AbstractFormat, Accelerogram
+from jaxrock.motions.files.parsing import (
+    NUMBER,
+    agreed_step,
+    agreed_unit,
+    announced_columns,
+    fixed_numbers,
+    to_float,
+)
+
+_FIRST = re.compile(r"^\s*UNCORRECTED ACCELEROGRAM DATA\b", re.IGNORECASE)
+# " 13200 Accelerogram points at 200 pts/sec in units of g .      Format: (8f9.6)"
+_SAMPLES = re.compile(
+    rf"^\s*(\d+)\s+ACCELEROGRAM POINTS AT\s+({NUMBER})\s+(?:PTS|POINTS)/SEC\s+IN UNITS OF\s+([^\s.,;]+)[\s.,]*"
+    r"FORMAT:\s*\(\s*\d*[FE](\d+)\.\d+\s*\)",
+    re.IGNORECASE,
+)
+# Of times and samples there is no such line: the text header says their number and unit.
+_COUNT = re.compile(r"NO\.\s*OF POINTS\s*=\s*(\d+)", re.IGNORECASE)
+_UNIT = re.compile(r"UNITS\s+(?:OF UNCOR\w*\s+(?:ACCEL\w*|DATA)\s+)?ARE SEC\w*\s+AND\s+([^\s.,;]+)", re.IGNORECASE)
+_PEAK = re.compile(rf"\bMAX\s*=\s*({NUMBER})\s*(\S+?)\s*,", re.IGNORECASE)
+_TEXT, _WHOLE, _REAL = 13, 7, 7  # lines of each header
+_PAIR = 7  # characters of a time, and of a sample
+_TENTHS = re.compile(r"g/10", re.IGNORECASE)
+
+
+class CSMIPUncorrected(AbstractFormat):
+    """CSMIP V1."""
+
+    name = "v1"
+    suffixes = (".v1",)
+
+    def recognises(self, lines):
+        return bool(lines) and bool(_FIRST.match(lines[0]))
+
+    def read(self, name, lines, dt, unit, column):
+        starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+        if not starts:
+            raise file_error(name, "no line begins with 'Uncorrected accelerogram data', as a V1 file must.")
+        channel = chosen_channel(name, "V1", column, len(starts))
+        at, end = starts[channel], (*starts[1:], len(lines))[channel]
+        announced = next((number for number in range(at, end) if _SAMPLES.match(lines[number])), None)
+        block = _samples(name, lines, announced) if announced is not None else _pairs(name, lines, at)
+        if channel == len(starts) - 1:
+            check_last_columns(name, lines, block.start, block.width)
+        unit = agreed_unit(name, block.line, unit, _TENTHS.sub("g", block.unit))
+        samples = block.samples / 10 if _TENTHS.fullmatch(block.unit) else block.samples
+        _check_peak(name, lines, at, samples, unit)
+        if block.times is None:
+            dt = agreed_step(name, dt, block.step)
+        else:
+            dt, samples = _even(name, dt, block.times, samples)
+        return Accelerogram(samples, dt, unit, *told(lines[at : block.start], _FIRST.pattern, (1, 5, 6)))
+
+
+class _Block(NamedTuple):
+    """Samples in `unit`, which `line` states; their time step, or their times [s]; where and how they are printed."""
+
+    samples: np.ndarray
+    unit: str
+    line: int
+    start: int
+    width: int
+    step: float = 0.0
+    times: np.ndarray | None = None
+
+
+def _samples(name: str, lines: list[str], at: int) -> _Block:
+    """What is announced as samples alone."""
+    announced = _SAMPLES.match(lines[at])
+    assert announced is not None  # that is why this is called
+    count, rate, unit, width = announced.groups()
+    if not to_float(rate) > 0:
+        raise file_error(name, f"line {at + 1} states {rate} samples a second.")
+    samples = announced_columns(name, lines, at + 1, int(count), int(width))
+    return _Block(samples, unit, at + 1, at + 1, int(width), 1 / to_float(rate))
+
+
+def _pairs(name: str, lines: list[str], at: int) -> _Block:
+    """Times and samples, after three headers."""
+    header, start = lines[at : at + _TEXT], at + _TEXT + _WHOLE + _REAL
+    found = [next(((at + row + 1, m[1]) for row, line in enumerate(header) if (m := pattern.search(line))), None)
+             for pattern in (_COUNT, _UNIT)]  # fmt: skip
+    points, units = found
+    if points is None or units is None:
+        raise file_error(name, "header must state 'No. of points' and 'Units ... are sec and', as that of a V1 file.")
+    (_, count), (line, unit) = points, units
+    wholes, reals = lines[at + _TEXT : start - _REAL], lines[start - _REAL : start]
+    if not all(re.fullmatch(r"[\s\d-]+", row) for row in wholes) or None in (fixed_numbers(row, 10) for row in reals):
+        raise file_error(name, f"lines {at + _TEXT + 1} to {start} should hold the numbers of a V1 file's headers.")
+    values = announced_columns(name, lines, start, 2 * int(count), _PAIR, "times and samples")
+    return _Block(values[1::2], unit, line, start, _PAIR, times=values[::2])
+
+
+def _even(name: str, dt: float | None, times: np.ndarray, samples: np.ndarray) -> tuple[float, np.ndarray]:
+    """The time step [s] and samples of pairs: those that are there, or on the straight lines between them."""
+    if times.size < 2 or not (np.diff(times) > 0).all():
+        raise file_error(name, "the times of its samples do not increase.")
+    step = (times[-1] - times[0]) / (times.size - 1)
+    rounding = 1e-3 if step > 2e-3 else 0.0  # three digits are printed
+    if np.abs(times - times[0] - step * np.arange(times.size)).max() <= rounding + 1e-9:
+        return agreed_step(name, dt, float(f"{step:.12g}")), samples
+    if dt is None:
+        said = "whose samples are not equally spaced (straight lines between them are followed)"
+        raise ValueError(f"Argument `dt` must be given for file `{name}`, {said}, but is None.")
+    even = dt * np.arange(int(np.floor((times[-1] - times[0]) / dt * (1 + 1e-12))) + 1)
+    return dt, np.interp(even, times - times[0], samples)
+
+
+def _check_peak(name: str, lines: list[str], at: int, samples: np.ndarray, unit: str) -> None:
+    """The largest sample is what the text header states, to the digits that it prints and a twentieth."""
+    for row, line in enumerate(lines[at : at + _TEXT], at + 1):
+        found = _PEAK.search(line)
+        if found and found[2].lower() == "g" and unit == "g":
+            stated, largest = abs(to_float(found[1])), float(np.abs(samples).max())
+            if abs(largest - stated) > 0.05 * stated + 10.0 ** -len(found[1].partition(".")[2]):
+                raise file_error(
+                    name, f"line {row} states a peak of {stated:g} g, but the largest sample is {largest:g}."
+                )

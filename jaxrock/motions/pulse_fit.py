@@ -1,0 +1,278 @@
+"""The pulse in a record: parameters of any class of pulses, by nonlinear least squares with exact derivatives.
+
+Where a pulse may begin is found by correlation for a grid of its other parameters; from the best of these SciPy's
+least squares descends.
+"""
+
+import functools
+import inspect
+import itertools
+from collections.abc import Callable, Mapping
+from typing import Annotated, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxrock._arguments import arguments, at_least, pair, word_of
+from jaxrock._checks import finite, scalar, shown
+from jaxrock._parameters import check_single
+from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.pulses import UNITS
+from jaxrock.motions.record import Record
+from jaxrock.numerics.gauss_legendre import gauss_legendre
+from jaxrock.numerics.lookup import count_up_to
+from jaxrock.status import Enumeration, item
+
+_NODES, _WEIGHTS = gauss_legendre(6)
+_PARTS = 64  # of every smooth piece of a pulse
+_LENGTHS = 14  # periods or durations that are tried
+_USUAL = {"oscillations": (1.01, 8.0), "shape": (-30.0, 30.0), "phase": (-np.pi, np.pi)}
+_FIRST = {"oscillations": (1.2, 2.0, 3.0), "shape": (-4.0, 0.0, 4.0), "phase": (0.0, np.pi / 2)}  # where it is tried
+
+
+class PulseStatus(Enumeration):
+    """What became of a fit of a pulse; `PulseStatus[fit.status]` is the message."""
+
+    successful = item("The sum of squares has a minimum there.")
+    at_an_end = item("The least sum of squares lies at an end of a range: widen it, or take another pulse.")
+    not_converged = item("The minimum of the sum of squares was not reached.")
+
+
+class PulseFit(eqx.Module):
+    """What `fit_pulse` finds.
+
+    - `motion`: the pulse after its `delay` [s] in the record; `pulse`: the same from time 0.
+    - `values`: its parameters by name, the delay among them; `at_ends`: names of those at an end of their range.
+    - `explained`: share of the squares of the record's velocity (or acceleration) that the pulse explains, at most 1.
+    - `residual`: the record without the pulse: fit another one to it.
+    - `status`: a `PulseStatus`.
+    """
+
+    pulse: AbstractMotion
+    values: dict[str, float]
+    explained: float
+    residual: Record
+    status: PulseStatus
+    at_ends: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def delay(self) -> float:
+        """When the pulse begins [s]."""
+        return self.values["delay"]
+
+    @property
+    def motion(self) -> AbstractMotion:
+        """The pulse as it stands in the record."""
+        return self.pulse.shifted(self.delay)
+
+
+@arguments
+def fit_pulse(
+    record: Record,
+    pulse: Callable[..., AbstractMotion],
+    ranges: Mapping | None = None,
+    *,
+    of: Annotated[str, word_of("velocity", "acceleration")] = "velocity",
+    starts: Annotated[int, at_least(1, 100)] = 6,
+) -> PulseFit:
+    """The pulse of a class that comes nearest to a record, by least squares.
+
+    **Arguments:**
+
+    - `record`: a `Record`, its baseline corrected.
+    - `pulse`: makes a motion of its parameters, proportional to `amplitude`: a class such as
+      `rk.MavroeidisPapageorgiouPulse`, or a function; what `functools.partial` gives by name is not looked for.
+    - `ranges`: (low, high) of parameters by name, of `delay` [s], too. What is left out has a usual one: times from
+      four samples to the whole record, `oscillations` 1.01 to 8, `shape` -30 to 30, phases half a turn either way;
+      parameters of other names must have one.
+    - `of`: what is compared at all samples: "velocity", as is usual for pulses near faults, or "acceleration".
+    - `starts`: from how many descents begin: the best of a grid, each where it correlates best with the record.
+
+    **Returns:** a `PulseFit`. There may be lower minima that no start leads to.
+
+    **Raises:** ValueError for arguments outside their ranges, and for a record that does not move.
+
+    **Source:** Mavroeidis & Papageorgiou (2003), fits to velocities; Branch, Coleman & Li (1999), the descent.
+    """
+    check_single(record=record)
+    if ranges is not None and not isinstance(ranges, Mapping):
+        raise ValueError(f"Argument `ranges` must hold pairs by name, but is {shown(ranges)}.")
+    problem = _Problem.of(record, pulse, ranges or {}, of)
+    found = min((problem.descend(place) for place in problem.starts(starts)), key=lambda result: result.cost)
+    values = {name: float(value) for name, value in problem.kind.values(found.x).items()}
+    best = pulse(**{name: value for name, value in values.items() if name != "delay"})
+    slack = 1e-6 * (problem.upper - problem.lower)
+    ended = (found.x - problem.lower < slack) | (problem.upper - found.x < slack)
+    at_ends = tuple(name for name, end in zip(problem.kind.names, ended) if end and name not in ("amplitude", "phase"))
+    status = PulseStatus.at_an_end if at_ends else PulseStatus.successful
+    status = status if found.status > 0 else PulseStatus.not_converged
+    explained = 1 - 2 * float(found.cost) / float(problem.target @ problem.target)
+    rest = np.asarray(record.samples, float) - np.asarray(best.shifted(values["delay"]).acceleration(problem.times))
+    return PulseFit(best, values, explained, Record(rest, record.dt, record.name, record.origin), status, at_ends)
+
+
+class _Kind(NamedTuple):
+    """What is made of a place: parameters, times but the delay as their logarithms."""
+
+    pulse: Callable[..., AbstractMotion]
+    names: tuple[str, ...]
+    logarithmic: tuple[bool, ...]
+    of: str
+
+    def values(self, place) -> dict:
+        """Parameters by name."""
+        return {name: jnp.exp(x) if log else x for name, x, log in zip(self.names, place, self.logarithmic)}
+
+
+class _Problem(NamedTuple):
+    """What a record's pulse is to come near to, at `times`, and the ends of places."""
+
+    kind: _Kind
+    target: Float[np.ndarray, " n"]
+    times: Float[np.ndarray, " n"]
+    lower: Float[np.ndarray, " parameters"]
+    upper: Float[np.ndarray, " parameters"]
+
+    @classmethod
+    def of(cls, record: Record, pulse: Callable, ranges: Mapping, of: str) -> "_Problem":
+        """The problem, checked."""
+        samples, dt = np.asarray(record.samples, float), float(record.dt)
+        if samples.size < 8 or not np.abs(samples).max() > 0:
+            raise ValueError("Argument `record` must move, and have 8 samples at least.")
+        times, most = dt * np.arange(samples.size), 30 * np.abs(samples).max()
+        velocity = GRAVITY * np.concatenate([[0.0], np.cumsum((samples[1:] + samples[:-1]) * dt / 2)])
+        names = (*_parameters(pulse), "delay")
+        for name in set(ranges) - set(names):
+            raise ValueError(f"Argument `ranges` must hold {', '.join(names)}, but holds {shown(name)}.")
+        usual = _USUAL | {name: (4 * dt, times[-1]) for name in names if UNITS.get(name) == "s"}
+        usual |= {"delay": (0.0, times[-1]), "amplitude": (-most, most)}
+        ends = np.array([_range(name, ranges.get(name, usual.get(name))) for name in names])
+        logarithmic = tuple(
+            name != "delay" and UNITS.get(name) == "s" and low > 0 for name, (low, _) in zip(names, ends)
+        )
+        ends = np.where(np.array(logarithmic)[:, None], np.log(np.where(ends > 0, ends, 1.0)), ends)
+        return cls(_Kind(pulse, names, logarithmic, of), velocity if of == "velocity" else samples, times, *ends.T)
+
+    def starts(self, count: int) -> list[np.ndarray]:
+        """The best places of a grid, each with the delay and the amplitude that fit best there."""
+        from scipy.signal import correlate
+
+        names = self.kind.names
+        places = np.array(list(itertools.product(*map(self._tried, range(len(names))))))
+        seen, size, found = np.asarray(_models(self.kind, places, self.times)), self.target.size, []
+        allowed = (self.times >= self.lower[-1] - 1e-9) & (self.times <= self.upper[-1] + 1e-9)
+        for place, one in zip(places, seen):
+            products = correlate(self.target, one, method="fft")[size - 1 :]
+            squares = np.maximum(np.cumsum(one**2)[::-1], 1e-300)  # of what is within the record after each delay
+            gains = np.where(allowed & (squares > 1e-3 * squares[0]), products**2 / squares, -np.inf)
+            at = int(np.argmax(gains))
+            place[names.index("amplitude")], place[-1] = products[at] / squares[at], self.times[at]
+            found.append((gains[at], place))
+        found.sort(key=lambda each: -each[0])
+        return [place for _, place in found[:count]]
+
+    def _tried(self, index: int) -> np.ndarray:
+        """Where a parameter is tried; the amplitude and the delay follow."""
+        name, low, high = self.kind.names[index], self.lower[index], self.upper[index]
+        if name in ("amplitude", "delay"):
+            return np.array([1.0 if name == "amplitude" else 0.0])
+        if UNITS.get(name) == "s":
+            return np.linspace(low, high, _LENGTHS)
+        first = np.array(_FIRST.get(name, ()))
+        first = first[(first > low) & (first < high)]
+        return first if first.size else low + (high - low) * np.array([0.25, 0.5, 0.75])
+
+    def descend(self, place: np.ndarray):
+        """SciPy's least squares from a place."""
+        from scipy.optimize import least_squares
+
+        room, known = 1e-9 * (self.upper - self.lower), {}
+
+        def at(x):
+            """Values and slopes, which SciPy asks for one after the other."""
+            if x.tobytes() not in known:
+                known.clear()
+                known[x.tobytes()] = _with_slopes(self.kind, x, self.times)
+            return known[x.tobytes()]
+
+        return least_squares(
+            lambda x: np.asarray(at(x)[0]) - self.target,
+            np.clip(place, self.lower + room, self.upper - room),
+            jac=lambda x: np.asarray(at(x)[1]),
+            bounds=(self.lower, self.upper),
+            x_scale="jac",
+            xtol=1e-12,
+            ftol=1e-12,
+            gtol=1e-12,
+            max_nfev=200,
+        )
+
+
+def _parameters(pulse: Callable) -> list[str]:
+    """Names of the numbers that a function makes a pulse of."""
+    told = inspect.signature(pulse).parameters.values()
+    names = [each.name for each in told
+             if each.kind is each.POSITIONAL_OR_KEYWORD and not isinstance(each.default, str | None)]  # fmt: skip
+    if "amplitude" not in names or "delay" in names:
+        raise ValueError(f"Argument `pulse` must have an `amplitude`, and no `delay`, but has {', '.join(names)}.")
+    return names
+
+
+def _range(name: str, value) -> tuple[float, float]:
+    """Both ends of the range of a parameter."""
+    if value is None:
+        raise ValueError(f"Argument `ranges` must hold a range of `{name}`, but does not.")
+    low, high = (float(scalar(f"ranges[{name}]", finite(f"ranges[{name}]", end))) for end in pair("ranges", value))
+    if not low < high:
+        raise ValueError(f"Argument `ranges` must rise, but that of `{name}` is {low:g} to {high:g}.")
+    return low, high
+
+
+def _model(kind: _Kind, place, times):
+    """What is compared, at all times."""
+    values = kind.values(place)
+    times = times - values.pop("delay")
+    pulse = kind.pulse(**values)
+    return GRAVITY * _velocity(pulse, times) if kind.of == "velocity" else pulse.acceleration(times)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _models(kind: _Kind, places, times):
+    return jax.lax.map(lambda place: _model(kind, place, times), places)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _with_slopes(kind: _Kind, place, times):
+    def twice(place):
+        value = _model(kind, place, times)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(place)
+    return value, slopes
+
+
+def _velocity(pulse: AbstractMotion, times: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
+    knots, lengths = pulse.knots, pulse.lengths
+    nodes, weights = (jnp.asarray(values) for values in (_NODES, _WEIGHTS))
+    piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
+    local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
+    width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / _PARTS
+    part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, _PARTS - 1)
+    # All parts of all pieces, and what is left to each time of the part that it lies in: in one go, to compile less.
+    every, parts = jnp.repeat(jnp.arange(lengths.size), _PARTS), jnp.tile(jnp.arange(_PARTS), lengths.size)
+    pieces = jnp.concatenate([every, piece])
+    begins = jnp.concatenate([parts * lengths[every] / _PARTS, part * width])
+    widths = jnp.concatenate([lengths[every] / _PARTS, local - part * width])
+
+    def gain(piece, begin, width):
+        places = begin + width * (1 + nodes) / 2
+        return jax.vmap(lambda place: pulse.series(piece, place, jnp.ones_like(place), 0)[0])(places) @ weights * width
+
+    gains = jax.vmap(gain)(pieces, begins, widths) / 2
+    before = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gains[: every.size])])
+    return before[piece * _PARTS + part] + gains[every.size :]

@@ -1,0 +1,131 @@
+"""A rock in every vertical plane under both horizontal components of a record: the planar bound over azimuths.
+
+Every plane is followed by itself, with the rock's section and the record's component in it. What couples planes
+(twisting, rolling along an edge, sliding) is not modelled.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int8
+
+from jaxrock._arguments import arguments
+from jaxrock._checks import Values, finite, scalar, shown, size
+from jaxrock._parameters import broadcast, check_single, one_of_many
+from jaxrock._progress import Progress
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.mesh import Rock
+from jaxrock.blocks.rigid import Block
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rigid import Housner
+from jaxrock.motions.components import Components
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.record import with_room
+from jaxrock.responses.current_model import current_model
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, stacked
+
+
+class AzimuthOutcomes(eqx.Module):
+    """What becomes of a rock in every vertical plane.
+
+    - `azimuth`: (azimuths,) of the planes, in the rock's axes [rad]; `scale`: (scales,) of the record.
+    - `blocks`: the rock in them, with parameters of shape (azimuths,).
+    - `verdict`, `rotation`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
+    """
+
+    azimuth: Float[np.ndarray, " azimuths"]
+    scale: Float[np.ndarray, " scales"]
+    blocks: Block | AsymmetricBlock
+    verdict: Int8[np.ndarray, "azimuths scales"]
+    rotation: Float[np.ndarray, "azimuths scales"]
+    margin: Float[np.ndarray, "azimuths scales"]
+
+    @property
+    def toppled(self) -> Int8[np.ndarray, " scales"]:
+        """The planar bound at every scale: 1 if some plane topples, 0 if all stand, -1 if that is undecided."""
+        some, undecided = ((self.verdict == each).any(axis=0) for each in (TOPPLED, UNDECIDED))
+        return np.where(some, TOPPLED, np.where(undecided, UNDECIDED, STOOD)).astype(np.int8)
+
+    @property
+    def weakest(self) -> Float[np.ndarray, " scales"]:
+        """At every scale the azimuth of the lowest margin [rad], of planes that are decided; NaN if none is."""
+        known = np.where(np.isnan(self.margin), np.inf, self.margin)
+        return np.where(np.isfinite(known).any(axis=0), self.azimuth[known.argmin(axis=0)], np.nan)
+
+
+@arguments
+def azimuth_outcomes(
+    rock: Rock | Callable,
+    components: Components,
+    azimuth: Values | None = None,
+    scale: Values = 1.0,
+    model: AbstractEquation = Housner(),
+    *,
+    orientation: ArrayLike = 0.0,
+    vertical: bool = True,
+    engine: AbstractEngine | None = None,
+    progress: bool | None = None,
+) -> AzimuthOutcomes:
+    """What becomes of a rock whose slenderness varies with azimuth, in every vertical plane of it.
+
+    **Arguments:**
+
+    - `rock`: a `Rock`; or a function of an azimuth [rad] that gives the `Block` or `AsymmetricBlock` in its plane, side
+      1 of which is towards the azimuth.
+    - `components`: both horizontal components of a record, perhaps the vertical one.
+    - `azimuth`: (azimuths,) of planes, in the rock's axes [rad]; None: 36 from 0 to pi. Each holds both of its sides.
+    - `scale`: factors on the record, a number or a list, positive and rising.
+    - `orientation`: azimuth of the record's first component in the rock's axes [rad].
+    - `vertical`: whether the vertical component shakes it, too, if there is one.
+    - `model`, `engine`, `progress`: as in `rocking_spectrum`.
+
+    **Returns:** an `AzimuthOutcomes`: `weakest` is the direction to which a rock is turned for the planar bound, and
+    `components.along(weakest - orientation)` the record there.
+
+    **Raises:** ValueError for arguments outside their ranges, and for a function that gives no block, or blocks of two
+    kinds.
+    """
+    if not isinstance(rock, Rock) and (not callable(rock) or isinstance(rock, type)):
+        raise ValueError(f"Argument `rock` must be a Rock, or a function of an azimuth, but is {shown(rock)}.")
+    angles = np.linspace(0, np.pi, 36, endpoint=False) if azimuth is None else np.asarray(finite("azimuth", azimuth))
+    if angles.ndim != 1 or angles.size == 0:
+        raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
+    scales = np.atleast_1d(np.asarray(size("scale", scale), float))
+    if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
+        raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
+    first = float(scalar("orientation", finite("orientation", orientation)))
+    blocks = _blocks(rock, angles)
+    model = current_model(model, blocks, components.first, scales)
+    bar, found = Progress(angles.size * scales.size, "azimuths", progress), []
+    for index, angle in enumerate(angles):
+        motion: AbstractMotion = components.along(angle - first)
+        if vertical and components.vertical is not None:
+            motion = motion.with_vertical(components.vertical)
+        lanes = broadcast(one_of_many(blocks, index), scales.shape)
+        found.append(of_motion(with_room(motion), lanes, jnp.asarray(scales), model, engine))
+        bar.add(scales.size)
+    parts = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
+    return AzimuthOutcomes(angles, scales, blocks, *parts)
+
+
+def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBlock:
+    """The rock in all planes, its parameters of shape (azimuths,)."""
+    found = [_in_plane(rock, float(angle)) for angle in angles]
+    for block in found:
+        if not isinstance(block, Block | AsymmetricBlock):
+            raise ValueError(f"Argument `rock` must give a Block or an AsymmetricBlock, but gives {shown(block)}.")
+        check_single(rock=block)
+    if len({jax.tree.structure(block) for block in found}) > 1:
+        raise ValueError("Argument `rock` must give blocks of one kind for all azimuths, but gives several.")
+    return stacked(jax.tree.map(lambda *x: jnp.stack(x), *found))
+
+
+def _in_plane(rock: Rock | Callable, azimuth: float):
+    if not isinstance(rock, Rock):
+        return rock(azimuth)
+    section = rock.section(azimuth)
+    return AsymmetricBlock.from_corners(section.right, section.left, section.centre, section.gyration_radius)

@@ -1,0 +1,180 @@
+"""Fragilities by any measure of intensity, which measures say something, and which explain most."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import jaxrock as rk
+
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}  # compiles in half the time
+DURATION = np.array([0.1, 0.3, 0.5, 0.8, 1.3])
+PULSES = [rk.RectangularPulse(jnp.ones(5), DURATION)]
+BLOCK = rk.Block(0.2, 2.0, 0.9)
+WALL = np.asarray(0.2 / rk.closed_form.single_lobe.safety_wall(2.0 * DURATION, -jnp.inf))  # amplitude that topples
+G = 9.81
+
+
+def mean_of_two(motion):
+    return float(np.sqrt(rk.intensity.spectral_acceleration(motion, [0.3, 0.6]).prod()))
+
+
+@pytest.mark.parametrize(
+    "measure, of_unit, power",
+    [
+        ("PGA", lambda t: 1.0, 1),
+        ("PGV", lambda t: G * t, 1),
+        ("CAV", lambda t: G * t, 1),
+        ("IA", lambda t: np.pi / 2 * G * t, 2),
+        (rk.intensity.arias, lambda t: np.pi / 2 * G * t, 2),
+        ("SA(0.6)", lambda t: rk.intensity.spectral_acceleration(rk.RectangularPulse(1.0, t), 0.6), 1),
+        (mean_of_two, lambda t: mean_of_two(rk.RectangularPulse(1.0, t)), 1),
+    ],
+    ids=lambda x: getattr(x, "__name__", str(x)),
+)
+def test_stripes_by_every_measure(measure, of_unit, power):
+    """Slender blocks topple above the safety wall in closed form, whatever the levels are called."""
+    unit = np.array([float(of_unit(t)) for t in DURATION])
+    walls = unit * WALL**power
+    levels = np.geomspace(0.5 * walls.min(), 2 * walls.max(), 12)
+    found = rk.hazard.simulated_fragility(BLOCK, PULSES, levels, measure=measure, **QUICK)
+    np.testing.assert_array_equal(found.verdict[:, :, 0] == 1, levels > walls[:, None])
+    assert found.power == power and found.undecided == 0
+    table = found.table()
+    np.testing.assert_allclose(table["peak_acceleration"], ((levels / unit[:, None]) ** (1 / power)).ravel(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name, unit", [("IA", "m/s"), ("SA(0.5)", "g"), ("PGD", "m"), ("mine", "")])
+def test_units(name, unit):
+    found = rk.hazard.SimulatedFragility(
+        jnp.array([0.1, 0.2]), np.zeros((1, 2, 1), np.int8), jnp.ones(1), jnp.ones(1), ("a",), name
+    )
+    assert found.unit == unit
+
+
+@pytest.mark.parametrize(
+    "measure, message",
+    [
+        ("SA", "`measure` must be one of 'PGA', 'PGV', 'PGD', 'IA', 'CAV', 'SA.period.', 'SV.period.', or a function"),
+        ("SA(0)", "`period` must be from 0.001"),
+        (lambda motion: 3.0, "`measure` must grow as a power of a motion's scale, but is 3, 3 and 3 of a motion"),
+        (rk.intensity.significant_duration, "`measure` must grow as a power of a motion's scale"),
+        (lambda motion: "x", "`measure` must give one number of a motion"),
+        (lambda motion: 0.0, "`measure` must be positive for all motions, but is 0 for"),
+    ],
+)
+def test_measures_that_are_refused(measure, message):
+    with pytest.raises(ValueError, match=message):
+        rk.hazard.simulated_fragility(BLOCK, PULSES, [0.1, 0.2], measure=measure, **QUICK)
+
+
+# --------------------------------------------------------------------------------------- what explains most
+
+RANDOM = np.random.default_rng(11)
+COUNT = 120
+MOTIONS = [rk.SinePulse(RANDOM.uniform(0.2, 1.0, COUNT), RANDOM.uniform(0.3, 1.5, COUNT))]
+
+
+def outcomes(cause):
+    """Verdicts that a function of a motion's (PGA, PGV) alone decides, with scatter."""
+    suite = rk.motions.Suite(MOTIONS)
+    strength = np.log(cause(np.asarray(suite.peak_acceleration), np.asarray(suite.peak_velocity)))
+    fell = strength + 0.2 * RANDOM.normal(size=COUNT) > np.median(strength)
+    verdict = fell.astype(np.int8)[:, None, None, None]
+    blank = np.zeros(verdict.shape)
+    return rk.hazard.SuiteOutcomes(
+        suite, rk.Block(np.array([0.2]), np.array([2.0])), np.ones(1), (1,), verdict, blank, blank
+    )
+
+
+@pytest.mark.parametrize("cause, best", [(lambda a, v: v, "PGV"), (lambda a, v: a, "PGA")])
+def test_the_measure_that_decides_comes_first(cause, best):
+    found = outcomes(cause)
+    table = rk.hazard.compare_measures(found, ["PGA", "PGV"])
+    assert table["measure"][0] == best and (np.diff(table["auc"]) < 0).all()
+    assert table["dispersion"][0] == pytest.approx(0.2, rel=0.4)
+    columns = found.table()
+    fit = rk.hazard.fit_probit({best: columns[best]}, columns["verdict"], clusters=columns["motion"])
+    assert table["slope"][0] == float(fit.slopes[0]) and table["status"][0] == "successful"
+    fell = columns["verdict"] == 1
+    pairs = columns[best][fell][:, None] > columns[best][~fell]
+    assert table["auc"][0] == pytest.approx(pairs.mean(), rel=1e-12)
+
+
+def chance(motion):
+    """A measure that has nothing to do with the motion's strength."""
+    return 1.5 + np.sin(1e6 * float(motion.period if hasattr(motion, "period") else motion.motion.period))
+
+
+def test_a_useless_measure_is_flagged():
+    found = outcomes(lambda a, v: v)
+    table = rk.hazard.compare_measures(found, {"PGV": rk.intensity.peak_velocity, "chance": chance})
+    assert dict(zip(table["measure"], table["useless"])) == {"PGV": False, "chance": True}
+
+
+def test_bounds_and_too_few_records():
+    found = outcomes(lambda a, v: v)
+    found.verdict[:30] = -1
+    lower, upper = (rk.hazard.compare_measures(found, ["PGV"], bound=each)["median"][0] for each in ("lower", "upper"))
+    assert lower > upper
+    one = rk.motions.Suite([rk.SinePulse(0.5, 1.0)])
+    blank, scale = np.zeros((1, 2, 1, 1)), np.array([1.0, 2.0])
+    alone = rk.hazard.SuiteOutcomes(one, found.blocks, scale, (1,), blank.astype(np.int8), blank, blank)
+    with pytest.raises(ValueError, match="must name at least two clusters"):
+        rk.hazard.compare_measures(alone, ["PGA"])
+    with pytest.raises(ValueError, match="`measures` must hold a measure"):
+        rk.hazard.compare_measures(found, [])
+
+
+@pytest.mark.parametrize("kind", ["one", "two"])
+def test_p_values_by_an_established_package(kind):
+    """Rao's score test of statsmodels."""
+    statsmodels = pytest.importorskip("statsmodels.api")
+    measures = {"a": np.exp(RANDOM.normal(size=200)), "b": np.exp(RANDOM.normal(size=200))}
+    measures = measures if kind == "two" else {"a": measures["a"]}
+    fell = np.log(measures["a"]) + 2 * RANDOM.normal(size=200) > 0
+    fit = rk.hazard.fit_probit(measures, fell)
+    design = np.stack([np.ones(200), *map(np.log, measures.values())], axis=1)
+    family = statsmodels.families.Binomial(statsmodels.families.links.Probit())
+    for column, found in enumerate(fit.p_values, 1):
+        without = statsmodels.GLM(fell.astype(float), np.delete(design, column, 1), family=family).fit(tol=1e-14)
+        expected = without.score_test(design[:, column : column + 1])[1]
+        np.testing.assert_allclose(found, np.ravel(expected)[0], rtol=1e-4, atol=1e-12)
+    assert "a" not in fit.useless
+
+
+@pytest.mark.parametrize("each", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_flag_errs_as_often_as_it_says(each):
+    """One in twenty of measures that say nothing does not get it, where outcomes go together in threes, too."""
+    clusters, told = np.arange(COUNT) // each, 0
+    level = np.exp(RANDOM.normal(size=COUNT))[clusters]
+    for _ in range(200):
+        draws = RANDOM.random(COUNT)[clusters]
+        told += float(rk.hazard.fit_probit({"x": level}, draws < 0.5, clusters=clusters).p_values[0]) <= 0.05
+    assert 2 <= told <= 20
+
+
+def test_what_parts_outcomes_well_is_not_flagged():
+    """A test of the slope in its own standard errors would take the best of all measures for useless."""
+    level, order = np.geomspace(0.1, 1.0, COUNT), np.arange(COUNT)
+
+    def fit(fell):
+        return rk.hazard.fit_probit({"x": level}, fell, clusters=order)
+
+    for fell, status in ((order > 60, "separable"), ((order > 60) ^ (order == 30), "successful")):
+        found = fit(fell)
+        assert found.status == getattr(rk.hazard.FitStatus, status)
+        assert float(found.p_values[0]) < 1e-6 and found.useless == ()
+    assert fit((order < 60) ^ (order == 90)).useless == ("x",)
+
+
+@pytest.mark.slow
+def test_the_flag_of_a_lognormal_fit():
+    """That of a probit fit, of clusters: what one motion does at all levels goes together."""
+    levels = np.geomspace(0.1, 2.0, 8)
+    fell = RANDOM.binomial(10, scipy.stats.norm.cdf(np.log(levels / 0.5) / 3.0), (5, 8))
+    verdict = (np.arange(10) < fell[:, :, None]).astype(np.int8)
+    ones, labels = jnp.ones(5), np.repeat(np.arange(5), 8)
+    found = rk.hazard.SimulatedFragility(jnp.asarray(levels), verdict, ones, ones, tuple("abcde"), "PGA").fit()
+    other = rk.hazard.fit_probit({"x": np.tile(levels, 5)}, fell.ravel(), 10.0, clusters=labels)
+    assert float(found.p_value) == pytest.approx(float(other.p_values[0]), rel=1e-9)

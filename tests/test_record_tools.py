@@ -1,0 +1,181 @@
+"""What records are made of: a displacement fused with an accelerometer, and the pulse in a record."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jaxrock as rk
+from jaxrock.motions.straight import straight
+
+DT = 0.01
+TIME = DT * np.arange(2001)
+GROUND = rk.Record(
+    0.25 * np.sin(2 * np.pi * 1.1 * TIME) * np.exp(-(((TIME - 9) / 2.5) ** 2))
+    + 0.03 * np.sin(2 * np.pi * 0.15 * TIME) * np.exp(-(((TIME - 10) / 3) ** 2)),
+    DT,
+)
+PLACE = straight(GROUND).displacement
+NOISE = np.random.default_rng(8)
+
+# ------------------------------------------------------------------------------------------------ fused
+
+
+@pytest.mark.parametrize("step", [1, 2, 10])
+def test_what_both_sensors_agree_on_stays(step):
+    """Also where the displacement is sampled less often than the acceleration."""
+    found = rk.processing.fused(GROUND, PLACE[::step], step * DT, corner=0.5)
+    np.testing.assert_allclose(found.samples[:-100], GROUND.samples[:-100], atol=1e-3 if step == 10 else 2e-5)
+
+
+def test_two_bad_sensors_make_a_good_one():
+    """The accelerometer drifts, the displacement is noisy: together they know the ground's displacement."""
+    drifting = rk.Record(GROUND.samples + 0.003 * np.cos(0.2 * TIME) + 0.002, DT)
+    noisy = PLACE + NOISE.normal(0, 1e-3, TIME.size)
+    found = rk.processing.fused(drifting, 100 * noisy, DT, unit="cm", corner=0.3)
+    wrong = [np.abs(straight(each).displacement - PLACE).max() for each in (drifting, found)]
+    assert wrong[0] > 2.0 and wrong[1] < 0.02
+    alone = rk.processing.from_displacement(noisy, DT)
+    errors = [np.std(np.asarray(each.samples - GROUND.samples)[100:-100]) for each in (alone, found)]
+    assert errors[0] > 1.0 and errors[1] < 2e-3
+
+
+def test_fast_noise_of_a_displacement_does_not_come_back_as_slow():
+    """It is sampled ten times as often as the acceleration, with a hum of 97 Hz that would look like 3 Hz."""
+    fine = np.interp(0.001 * np.arange(20001), TIME, PLACE) + 1e-4 * np.sin(2 * np.pi * 97 * 0.001 * np.arange(20001))
+    found = rk.processing.fused(GROUND, fine, 0.001, corner=0.5)
+    np.testing.assert_allclose(found.samples[10:-100], GROUND.samples[10:-100], atol=1e-3)
+
+
+def test_the_shorter_one_ends_both():
+    assert rk.processing.fused(GROUND, PLACE[:1501], DT).samples.size == 1501
+    longer = np.concatenate([PLACE, np.full(300, PLACE[-1])])
+    assert rk.processing.fused(GROUND, longer, DT).samples.size == TIME.size
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"corner": 50.0}, "`corner` must be above 0 and below half the sampling rate, 50 Hz"),
+        ({"dt": 0.5, "corner": 2.0}, "`corner` must be above 0 and below half the sampling rate, 1 Hz"),
+        ({"displacement": [0.0, 1.0]}, "at least 4 samples"),
+        ({"unit": "g"}, "`unit` must be one of 'm', 'cm', 'mm'"),
+    ],
+)
+def test_what_cannot_be_fused(given, message):
+    with pytest.raises(ValueError, match=message):
+        rk.processing.fused(**{"record": GROUND, "displacement": PLACE, "dt": DT} | given)
+
+
+# ---------------------------------------------------------------------------------------------- pulses
+
+
+def sampled(pulse, noise=0.0, dt=0.005, end=8.0):
+    time = dt * np.arange(round(end / dt) + 1)
+    return rk.Record(np.asarray(pulse.acceleration(time)) + NOISE.normal(0, noise, time.size), dt)
+
+
+@pytest.mark.parametrize(
+    "pulse, parameters, delay, digits",
+    [
+        (
+            rk.MavroeidisPapageorgiouPulse,
+            {"amplitude": 0.3, "period": 1.3, "oscillations": 1.8, "phase": 0.7},
+            2.3,
+            1e-3,
+        ),
+        (rk.SinePulse, {"amplitude": -0.2, "period": 0.8}, 1.2345, 1e-3),
+        (rk.TriangularPulse, {"amplitude": 0.4, "duration": 0.9}, 3.0, 1e-3),
+        pytest.param(
+            *(functools.partial(rk.RickerPulse, kind="antisymmetric"), {"amplitude": 0.3, "period": 1.1}, 1.0, 1e-3),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=lambda x: getattr(x, "__name__", None),
+)
+def test_a_pulse_is_found_again(pulse, parameters, delay, digits):
+    fit = rk.motions.fit_pulse(sampled(pulse(**parameters).shifted(delay)), pulse, starts=3)
+    assert fit.status == rk.motions.PulseStatus.successful and fit.explained > 1 - 1e-5
+    for name, value in (parameters | {"delay": delay}).items():
+        assert fit.values[name] == pytest.approx(value, rel=digits, abs=digits), name
+    assert np.abs(fit.residual.samples).max() < 0.02 * 0.4
+
+
+def exponential(time, amplitude, duration, shape):
+    """Voyagaki et al. (2012), equation 2.1, in NumPy."""
+    x = np.clip(time / duration, 0.0, 1.0)
+    rise = np.expm1(2 * shape * np.minimum(x, 1 - x)) / np.expm1(shape)
+    return amplitude * np.where((time >= 0) & (time <= duration), rise, 0.0)
+
+
+def sine(time, amplitude, period):
+    return amplitude * np.where((time >= 0) & (time <= period), np.sin(2 * np.pi * time / period), 0.0)
+
+
+@pytest.mark.parametrize(
+    "form, pulse, truth, of",
+    [
+        (sine, rk.SinePulse, (0.3, 1.0, 2.0), "velocity"),
+        pytest.param(exponential, rk.ExponentialPulse, (0.3, 1.0, 1.5, 2.0), "velocity", marks=pytest.mark.slow),
+        pytest.param(exponential, rk.ExponentialPulse, (0.3, 1.0, 1.5, 2.0), "acceleration", marks=pytest.mark.slow),
+    ],
+)
+def test_a_pulse_in_noise_is_a_least_square(form, pulse, truth, of):
+    """SciPy's search without derivatives, from the truth, finds nothing lower."""
+    time, fine = 0.005 * np.arange(1601), 0.001 * np.arange(8001)
+    record = rk.Record(form(time - truth[-1], *truth[:-1]) + NOISE.normal(0, 0.02, time.size), 0.005)
+    ranges = {"duration": (0.3, 3.0), "shape": (-8, 8)} if pulse is rk.ExponentialPulse else None
+    fit = rk.motions.fit_pulse(record, pulse, ranges, of=of, starts=2)
+    target = straight(record).velocity if of == "velocity" else np.asarray(record.samples)
+
+    def cost(x):
+        if of == "acceleration":
+            return np.sum((form(time - x[-1], *x[:-1]) - target) ** 2)
+        samples = form(fine - x[-1], *x[:-1])
+        velocity = 9.81 * 0.001 * np.concatenate([[0.0], np.cumsum((samples[1:] + samples[:-1]) / 2)])
+        return np.sum((velocity[::5] - target) ** 2)
+
+    found = np.array(list(fit.values.values()))
+    best = minimize(cost, truth, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-12})
+    assert cost(found) <= best.fun * (1 + 1e-3)
+    assert 1 - cost(found) / np.sum(target**2) == pytest.approx(fit.explained, abs=1e-4)
+
+
+def test_the_pulse_that_is_left_out_and_the_one_that_is_left():
+    two = rk.SinePulse(0.4, 1.2).shifted(1.0) + rk.SinePulse(0.2, 0.5).shifted(4.0)
+    record = sampled(two)
+    first = rk.motions.fit_pulse(record, rk.SinePulse, {"period": (0.3, 3.0)}, starts=2)
+    second = rk.motions.fit_pulse(first.residual, rk.SinePulse, {"period": (0.3, 3.0)}, starts=2)
+    assert (first.values["period"], second.values["period"]) == (
+        pytest.approx(1.2, rel=2e-3),
+        pytest.approx(0.5, rel=1e-2),
+    )
+    assert float(first.motion.end) == pytest.approx(2.2, rel=1e-2)
+
+
+def test_an_end_of_a_range_is_told():
+    fit = rk.motions.fit_pulse(
+        sampled(rk.SinePulse(0.4, 1.2).shifted(1.0)), rk.SinePulse, {"period": (1.5, 3.0)}, starts=1
+    )
+    assert fit.status == rk.motions.PulseStatus.at_an_end and fit.at_ends == ("period",)
+
+
+def made(amplitude, width):
+    return rk.SinePulse(amplitude, width)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"pulse": made}, "`ranges` must hold a range of `width`, but does not"),
+        ({"pulse": lambda period: rk.SinePulse(1.0, period)}, "`pulse` must have an `amplitude`"),
+        ({"ranges": {"duration": (1, 2)}}, "`ranges` must hold amplitude, period, delay, but holds 'duration'"),
+        ({"ranges": {"period": (2.0, 1.0)}}, "`ranges` must rise, but that of `period` is 2 to 1"),
+        ({"record": rk.Record(np.zeros(50), 0.1)}, "`record` must move"),
+        ({"of": "displacement"}, "`of` must be one of 'velocity', 'acceleration'"),
+    ],
+)
+def test_what_cannot_be_fitted(given, message):
+    with pytest.raises(ValueError, match=message):
+        rk.motions.fit_pulse(**{"record": GROUND, "pulse": rk.SinePulse} | given)
