@@ -115,21 +115,15 @@ def test_beside_newton(alpha, radius, dip):
     until = 0.8
     wheel = Wheel(alpha, p, 0.75, radius, 0.9)
     response = rk.simulate(block, motion, rk.models.Rolling(radius), initial=(0.08, 0.1), duration=until, **EXACT)
-    times = np.linspace(0.0, until, 101)[:-1]
+    contact = rk.contact_forces(response, block)
     push = lambda t: 0.35 * np.sin(2 * np.pi * t / 0.9)
+    times = np.asarray(response.time)[:-1]
     found, fell = by_newton([wheel, wheel], push, DIPS[dip], (0.08, 0.1), times, until)
     assert not fell and np.isfinite(found).all() and response.impact_times.size >= 1
-    rotation, velocity = response(times)
-    np.testing.assert_allclose(rotation, found[0], atol=2e-9)
-    np.testing.assert_allclose(velocity, found[1], atol=2e-8)
-    contact = rk.contact_forces(response, block)
-    here = np.isin(np.asarray(contact.time).round(12), times.round(12))
-    if here.any():
-        np.testing.assert_allclose(np.asarray(contact.horizontal)[here], found[2][: here.sum()], atol=1e-6)
-    for name, values in (("horizontal", found[2]), ("normal", found[3])):
-        told = np.interp(times, contact.time, getattr(contact, name))
-        jumps = np.abs(np.asarray(response.impact_times)[:, None] - times).min(axis=0) < 0.02
-        np.testing.assert_allclose(told[~jumps], values[~jumps], atol=2e-3)
+    np.testing.assert_allclose(response.rotation[:-1], found[0], atol=2e-9)
+    np.testing.assert_allclose(response.velocity[:-1], found[1], atol=2e-8)
+    np.testing.assert_allclose(contact.horizontal[:-1], found[2], atol=1e-7)
+    np.testing.assert_allclose(contact.normal[:-1], found[3], atol=1e-7)
 
 
 @pytest.mark.slow
@@ -314,6 +308,8 @@ def test_rocks_that_a_mesh_allows():
     assert ends[0] <= drawn.alpha1.min() < drawn.alpha1.max() <= ends[1] and drawn.alpha1.std() > 0.01
     noisy = rk.blocks.draw_rocks(rock, 0.0, 200, tolerance=(0.005, 0.005), resolution=0.002, seed=1)
     assert float(noisy.alpha1.std()) > 1e-3 and (np.asarray(noisy.alpha1) > 0).all()
+    wild = rk.blocks.draw_rocks(rock, 0.0, 50, tolerance=(0.001, 0.001), resolution=0.03)  # many draws do not stand
+    assert wild.alpha1.shape == (50,) and (np.asarray(wild.alpha2) > 0).all()
     with pytest.raises(ValueError, match="`tolerance` must be a pair of which the second is not smaller"):
         rk.blocks.draw_rocks(rock, 0.0, 3, tolerance=(0.02, 0.005))
 
