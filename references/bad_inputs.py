@@ -200,6 +200,15 @@ CALLS: dict[str, Call] = {
     "Rock.from_mesh": Call(rk.blocks.Rock.from_mesh, {"mesh": "/nowhere/a.stl", "unit": "m", "tolerance": 0.01}),
     "Rock.section": Call(stone().section, {"azimuth": 0.3, "base": "wide"}),
     "Rock.slenderness": Call(stone().slenderness, {"azimuth": [0.3, 0.4]}),
+    "Rock.arms": Call(stone().arms, {"azimuth": 0.3, "opening": [0.1, 0.2]}),
+    "Rock.edges": Call(stone().edges, {"azimuth": 0.3, "knots": 4}),
+    "Rock.widths": Call(stone().widths, {"azimuth": 0.3}),
+    "Edge": Call(rk.blocks.Edge, {"radius": [0.2, 0.3], "angle": [0.1, 0.2]}),
+    "shared_plane": Call(rk.blocks.shared_plane, {"rocks": [stone()], "excess": 0.2, "planes": 8}),
+    "draw_rocks": Call(
+        rk.blocks.draw_rocks,
+        {"rock": stone(), "azimuth": 0.3, "draws": 3, "tolerance": (0.01, 0.02), "resolution": 1e-3, "seed": 1},
+    ),
     "FlexibleBlock": Call(
         rk.FlexibleBlock,
         {
@@ -290,6 +299,7 @@ CALLS: dict[str, Call] = {
     "processing.scaled": Call(rk.processing.scaled, {"record": record(), "factor": 2.0}),
     # Models and engines
     "Spring": Call(rk.Spring, {"kind": "SM1", "law": "linear"}),
+    "Rolling": Call(rk.models.Rolling, {"edge": 0.2, "other": 0.1, "inertia_ratio": 0.7}),
     "Equation": Call(
         rk.Equation,
         {"restoring": lambda x, block: block.alpha - x, "arm": None, "dissipation": None, "falls_flat": True},
@@ -706,7 +716,7 @@ NOT_CALLED = {
     "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "Sensitivity", "SensitivityMap",
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
-    "Borders", "Region", "overturning_borders",
+    "Borders", "Region", "overturning_borders", "WeakPlane",
     "Origin", "AzimuthOutcomes", "PulseFit", "PulseStatus", "ResponseSpectra",
 }  # fmt: skip
 

@@ -18,8 +18,8 @@ in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="source distribut
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Minutes of compilation, of what `test_arcs`, `test_block_calibration`, `test_borders`, `test_closed_forms`,
 # `test_critical`, `test_derivatives`, `test_asymmetric_rocks`, `test_flexible`, `test_found_record`, `test_hazard`,
-# `test_histories`, `test_inverse`, `test_search`, `test_similarity`, `test_spectra` and `test_springs` judge. All
-# of them are asked for names and arguments by `test_what_notebooks_call_there_is`.
+# `test_histories`, `test_inverse`, `test_rolling`, `test_search`, `test_similarity`, `test_spectra`, `test_springs`
+# and `test_suite_outcomes` judge. All of them are asked for names and arguments by `test_what_notebooks_call_there_is`.
 SLOW = {
     "02_who_overturns",
     "03_a_block_of_your_own",
@@ -37,6 +37,9 @@ SLOW = {
     "14_flexible_blocks",
     "15_calibrate_a_block",
     "17_the_critical_record",
+    "18_a_museum_and_its_basement",
+    "19_which_intensity_measure",
+    "20_from_mesh_to_fragility",
     "errata",
 }
 

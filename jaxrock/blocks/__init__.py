@@ -5,7 +5,15 @@ Imports `numerics`. Start with `rigid`; another law of restitution is a class li
 
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
+from jaxrock.blocks.edge import Edge as Edge
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
 from jaxrock.blocks.mesh import Rock as Rock
-from jaxrock.blocks.random import draw_blocks as draw_blocks
+from jaxrock.blocks.planes import (
+    WeakPlane as WeakPlane,
+    shared_plane as shared_plane,
+)
+from jaxrock.blocks.random import (
+    draw_blocks as draw_blocks,
+    draw_rocks as draw_rocks,
+)
 from jaxrock.blocks.rigid import Block as Block

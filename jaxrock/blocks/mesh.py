@@ -10,10 +10,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from jaxrock._arguments import arguments, path_of, word_of
+from jaxrock._arguments import arguments, at_least, path_of, word_of
 from jaxrock._checks import Values, finite, positive, scalar, shown
+from jaxrock.blocks.edge import Edge, fitted_edge
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_SMOOTH = 0.2  # of the longest arm of the weight, by which a smooth edge may differ from the faces of a mesh
 _SHARE = 0.01  # of the height, within which vertices stand on the ground
 
 
@@ -114,12 +116,81 @@ class Rock(NamedTuple):
         """
         azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
         narrow = self._between(azimuth)
-        points = np.stack([(self.vertices - self.centre)[:, :2] @ _direction(azimuth), self.vertices[:, 2]], axis=1)
+        points = self._projected(azimuth)
         last = [_rolled(points * [side, 1], corner * [side, 1], self.centre[2]) * [side, 1]
                 for side, corner in ((1, narrow.right), (-1, narrow.left))]  # fmt: skip
         right, left = (not np.allclose(end, corner) for end, corner in zip(last, (narrow.right, narrow.left)))
         found = narrow._replace(rolls=(right, left))
         return found._replace(right=last[0], left=last[1]) if base == "wide" else found
+
+    @arguments
+    def arms(self, azimuth: ArrayLike, opening: Values) -> Float[np.ndarray, "2 openings"]:
+        """How far out it touches the ground, from its centre of mass, when it has opened on its base by an angle.
+
+        **Arguments:**
+
+        - `azimuth`: as in `section`.
+        - `opening`: (openings,) opening angles [rad].
+
+        **Returns:** (2, openings) distances along the ground to the right and to the left [m]: the arm of the weight,
+        which rights it where it is positive.
+
+        **Raises:** ValueError for arguments that are not finite, or of another shape.
+        """
+        angles = np.asarray(finite("opening", opening), float)
+        if angles.ndim != 1:
+            raise ValueError(f"Argument `opening` must be a list, but has shape {angles.shape}.")
+        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
+        narrow, points = self._between(azimuth), self._projected(azimuth)
+        sides = (1.0, narrow.right), (-1.0, narrow.left)
+        return np.stack([_arms(points * [way, 1], end * [way, 1], self.centre[2], angles) for way, end in sides])
+
+    @arguments
+    def edges(self, azimuth: ArrayLike, knots: Annotated[int, at_least(2, 64)] = 8) -> tuple[Edge, Edge]:
+        """The rounded edges on which it rolls to the right and to the left, for `jaxrock.models.Rolling`.
+
+        **Arguments:**
+
+        - `azimuth`: as in `section`.
+        - `knots`: at how many opening angles, from 0 to its balance, the radius of curvature is told.
+
+        **Returns:** a pair of `Edge`: those whose points of contact are nearest to the vertices, by least squares; each
+        is taken to touch the ground midway between the faces next to it. Of a side that does not roll, a sharp one. It
+        warns where the arm of the weight differs from that of the mesh (`arms`) by more than a fifth of the longest:
+        such a base is made of faces, on which a rock does not roll smoothly.
+
+        **Raises:** ValueError for arguments outside their ranges.
+        """
+        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
+        section, points = self.section(azimuth), self._projected(azimuth)
+
+        def edge(way, corner, rolls):
+            return self._edge(points * [way, 1], corner * [way, 1], knots) if rolls else Edge(0.0)
+
+        right, left = section.rolls
+        return edge(1.0, section.right, right), edge(-1.0, section.left, left)
+
+    def _edge(self, points: np.ndarray, corner: np.ndarray, knots: int) -> Edge:
+        """The rounded edge to the right of a corner."""
+        radius, alpha = (
+            np.hypot(corner[0], self.centre[2] - corner[1]),
+            np.arctan2(corner[0], self.centre[2] - corner[1]),
+        )
+        contact, opening = _touching(points, corner)
+        arms = contact[:, 0] * np.cos(opening) + (contact[:, 1] - self.centre[2]) * np.sin(opening)
+        last = int(np.argmax(arms <= 0)) + 1 if (arms <= 0).any() else arms.size
+        opening, arms = opening[:last], arms[:last]
+        found = fitted_edge(opening, arms / radius - np.sin(alpha - opening), knots)
+        angles = np.linspace(0.0, opening[-1], 200)
+        own = _arms(points, corner, self.centre[2], angles)
+        off = np.abs(radius * (np.sin(alpha - angles) + np.asarray(found.run(angles))) - own).max()
+        if off > _SMOOTH * own.max():
+            warnings.warn(
+                f"The base is made of faces: on a smooth edge the arm of the weight is up to {off:.3g} m off, of "
+                f"{own.max():.3g} m. See also what bounds it, by `base` of `AsymmetricBlock.from_mesh`.",
+                stacklevel=4,
+            )
+        return found
 
     @arguments
     def slenderness(self, azimuth: Values) -> Float[np.ndarray, "azimuths"]:
@@ -128,6 +199,15 @@ class Rock(NamedTuple):
         if azimuths.ndim != 1:
             raise ValueError(f"Argument `azimuth` must be a list, but has shape {azimuths.shape}.")
         return np.array([self._between(each).slenderness[0] for each in azimuths])
+
+    @arguments
+    def widths(self, azimuth: ArrayLike) -> Float[np.ndarray, " n"]:
+        """How far all vertices lie in the direction of an azimuth from the centre of mass [m]."""
+        return (self.vertices - self.centre)[:, :2] @ _direction(float(scalar("azimuth", finite("azimuth", azimuth))))
+
+    def _projected(self, azimuth: float) -> Float[np.ndarray, "n 2"]:
+        """Width, from the centre of mass, and height of all vertices."""
+        return np.stack([self.widths(azimuth), self.vertices[:, 2]], axis=1)
 
     def _between(self, azimuth: float) -> Section:
         """The section by the points on the ground alone."""
@@ -148,7 +228,8 @@ def section_of(mesh: Any, azimuth: ArrayLike, base: str, unit: str, tolerance: A
         ends = [max(rock.section(azimuth, each).slenderness) for each in ("narrow", "wide")]
         warnings.warn(
             f"The base is rounded: the rock rolls on before it is in balance, at {ends[0]:.3g} rad if it rocked about "
-            f"the ground it stands on, at {ends[1]:.3g} rad if about where it rolls to. See both, with `base`.",
+            f"the ground it stands on, at {ends[1]:.3g} rad if about where it rolls to. See both, with `base`; or let "
+            "it roll, by the model `jaxrock.models.Rolling(*rock.edges(azimuth))`.",
             stacklevel=4,
         )
     return found
@@ -177,6 +258,32 @@ def _surface(mesh: Any):
 
 def _direction(azimuth: float) -> np.ndarray:
     return np.array([np.cos(azimuth), np.sin(azimuth)])
+
+
+def _arms(points: np.ndarray, corner: np.ndarray, height: float, opening: np.ndarray) -> np.ndarray:
+    """Width of the lowest point from a corner outward, from the centre of mass, when all has turned to the right."""
+    beyond = np.concatenate([[corner], points[points[:, 0] > corner[0]]]) - [0.0, height]
+    found = []
+    for sine, cosine in zip(np.sin(opening), np.cos(opening)):  # one by one: a scan has millions of vertices
+        lowest = beyond[(beyond @ [-sine, cosine]).argmin()]
+        found.append(lowest @ [cosine, sine])
+    return np.array(found)
+
+
+def _touching(points: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that touch the ground one after the other beyond a corner, and the opening angles at which each does."""
+    chain, angles = [corner], [0.0]
+    while angles[-1] < np.pi / 2:
+        beyond = points[points[:, 0] > chain[-1][0] + 1e-9 * np.ptp(points[:, 0])]
+        if not len(beyond):
+            break
+        slopes = np.arctan2(beyond[:, 1] - chain[-1][1], beyond[:, 0] - chain[-1][0])
+        chain.append(beyond[slopes.argmin()])
+        angles.append(slopes.min())
+    turns = np.append(angles[1:], np.pi / 2)  # of the faces after each
+    midway = (np.array(angles) + turns) / 2
+    midway[0] = 0.0
+    return np.array(chain), midway
 
 
 def _rolled(points: np.ndarray, corner: np.ndarray, height: float) -> np.ndarray:

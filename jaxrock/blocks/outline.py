@@ -70,7 +70,7 @@ class Outline(NamedTuple):
             raise ValueError(
                 f"Argument `outline` must let the block rock about its corners up to its balance at {alpha:.4g} rad, "
                 f"but on side {1 if side > 0 else 2} another vertex reaches the ground at {contact:.4g} rad: it rolls "
-                "onto that face."
+                "onto that face. A rounded base: `from_corners`, with the model `jaxrock.models.Rolling`."
             )
 
 

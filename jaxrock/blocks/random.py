@@ -4,11 +4,14 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import not_negative, scalar
+from jaxrock._arguments import arguments, at_least, pair
+from jaxrock._checks import not_negative, positive, scalar
 from jaxrock._parameters import check_single
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.mesh import Rock
 from jaxrock.blocks.rigid import Block
 
 
@@ -51,3 +54,58 @@ def draw_blocks(
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
     ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
     return Block(alphas, ps, block.restitution + restitution * jax.random.truncated_normal(keys[2], *ends, (draws,)))
+
+
+def _tolerances(name: str, value) -> tuple[float, float]:
+    low, high = (float(scalar(name, positive(name, each))) for each in pair(name, value))
+    if low > high:
+        raise ValueError(f"Argument `{name}` must be a pair of which the second is not smaller, but is {value}.")
+    return low, high
+
+
+@arguments
+def draw_rocks(
+    rock: Rock,
+    azimuth: ArrayLike,
+    draws: Annotated[int, at_least(1, 10**6)],
+    *,
+    tolerance: Annotated[tuple[float, float], _tolerances],
+    resolution: Annotated[float, _deviation] = 0.0,
+    seed: Annotated[int, at_least(0, 2**32 - 1)] = 0,
+) -> AsymmetricBlock:
+    """The blocks that a rock may be in a vertical plane, as far as its mesh tells what it stands on.
+
+    **Arguments:**
+
+    - `rock`: a `Rock`.
+    - `azimuth`: as in `Rock.section`; the base is narrow.
+    - `draws`: how many.
+    - `tolerance`: least and largest of the height up to which vertices stand on the ground [m], positive: one is drawn
+      for each block, evenly in its logarithm.
+    - `resolution`: standard deviation of the heights of the vertices [m], 0 or more: noise of scan or photographs.
+    - `seed`: of the random numbers.
+
+    **Returns:** an `AsymmetricBlock` with parameters of shape (draws,). What would not stand is drawn again: the rock
+    does.
+
+    **Raises:** ValueError for arguments outside their ranges; where fewer than one in a hundred stands.
+    """
+    random, (low, high) = np.random.default_rng(seed), tolerance
+    section, heights = rock.section(azimuth), rock.vertices[:, 2]
+    near = heights <= heights.min() + high + 8 * resolution
+    width, heights = rock.widths(azimuth)[near], heights[near]
+    corners = []
+    for _ in range(100 * draws):
+        up = heights + resolution * random.normal(size=heights.size)
+        down = np.flatnonzero(up <= up.min() + np.exp(random.uniform(np.log(low), np.log(high))))
+        right, left = down[width[down].argmax()], down[width[down].argmin()]
+        if width[left] < 0 < width[right]:
+            corners.append([width[right], -width[left], section.centre[1] - up[right], section.centre[1] - up[left]])
+        if len(corners) == draws:
+            break
+    else:
+        raise ValueError("Argument `tolerance` must let the rock stand, but in fewer than 1 in 100 draws it does.")
+    width1, width2, height1, height2 = np.array(corners).T
+    radii = np.hypot(width1, height1), np.hypot(width2, height2)
+    alphas = np.arctan2(width1, height1), np.arctan2(width2, height2)
+    return AsymmetricBlock.from_radii(*alphas, *radii, section.gyration_radius)

@@ -30,7 +30,8 @@ def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
     if isinstance(block, Block):
         return model.moments(block), None
-    return tuple(model.moments(side).times((side.p / block.p1) ** 2) for side in block.sides)
+    both = zip(model.moments_of_sides(block), block.sides)
+    return tuple(moments.times((side.p / block.p1) ** 2) for moments, side in both)
 
 
 def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> Scalar:

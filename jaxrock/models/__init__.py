@@ -12,5 +12,6 @@ from jaxrock.models.rigid import (
     Housner as Housner,
     Linear as Linear,
 )
+from jaxrock.models.rolling import Rolling as Rolling
 from jaxrock.models.spring import Spring as Spring
 from jaxrock.models.user_equation import Equation as Equation

@@ -5,17 +5,22 @@ the restoring moment and s u times the overturning arm, both over m g R, and wha
 """
 
 import abc
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from jaxrock._parameters import Owner
+from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.numerics.elementary import sine_cosine
+from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 
 Scalar = Inexact[Array, ""]
+_GAUSS = gauss_legendre_of_unit(12)
 
 
 class Angle(NamedTuple):
@@ -29,6 +34,14 @@ class Angle(NamedTuple):
     def of(cls, value: Scalar | float) -> "Angle":
         """An angle from its value, between 0 and pi/2 or a little beyond."""
         return cls(value, *sine_cosine(jnp.asarray(value)))
+
+
+class Rolled(NamedTuple):
+    """Where the centre of mass is over the point at which a block touches the ground, all over R."""
+
+    height: Scalar
+    reach: Scalar  # horizontal distance; positive as long as the weight rights the block
+    radius: Scalar  # of curvature of what it rolls on
 
 
 class AbstractMoments(eqx.Module):
@@ -78,6 +91,16 @@ class AbstractMoments(eqx.Module):
         forcing at the angle, positive.
         """
 
+    def work(self, opening: Scalar) -> Scalar:
+        """Work of the weight up to an opening angle, over m g R: half the squared speed on the ground after a free fall
+        from there."""
+        nodes, weights = (jnp.asarray(values, opening.dtype) for values in _GAUSS)
+        return opening * jnp.sum(weights * jax.vmap(lambda x: self.restoring(Angle.of(x)))(opening * nodes))
+
+    def rolled(self, angle: Angle) -> Rolled | None:
+        """Where the centre of mass is at an opening angle; None for a block that turns about its corner."""
+        return None
+
     @property
     def threshold(self) -> Scalar:
         """Ground acceleration at which the block uplifts [g]: tan(alpha), or alpha in the linear model."""
@@ -110,6 +133,11 @@ class AbstractEquation(Owner):
         **Returns:** moments over m g R, in time p t.
         """
 
+    def moments_of_sides(self, block: AsymmetricBlock) -> tuple[AbstractMoments, AbstractMoments]:
+        """Those of side 1 and of side 2 of an asymmetric block; each in its own time."""
+        first, second = block.sides
+        return self.moments(first), self.moments(second)
+
     @property
     def falls_flat(self) -> bool:
         """Whether a rotation of pi/2 means that the block lies on its side."""
@@ -124,3 +152,22 @@ class AbstractEquation(Owner):
     def feels_weight(self) -> bool:
         """Whether a vertical acceleration changes the restoring moment; if not, vertical motions are refused."""
         return True
+
+
+def first_zero(moment: Callable, like: Scalar) -> Scalar:
+    """Where a moment that rights a block first vanishes, at most pi/2: a scan, bisection, and a Newton step that
+    carries the derivatives. `like`: a number of the same type."""
+    grid = jnp.linspace(0.0, jnp.pi / 2, 257, dtype=like.dtype)
+    falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
+    first = jnp.argmax(falls)
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = (low + high) / 2
+        above = jax.lax.stop_gradient(moment(middle)) > 0
+        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+    low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
+    low = jax.lax.stop_gradient(low)
+    root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
+    return jnp.where(jnp.any(falls), root, jnp.pi / 2)

@@ -10,7 +10,7 @@ from jaxrock._arguments import arguments
 from jaxrock._guard import guarded
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero
 
 
 class Equation(AbstractEquation):
@@ -118,7 +118,7 @@ class FunctionMoments(AbstractMoments):
         self.arm_at_rest = guarded(
             self.arm(zero), self.arm(zero) <= 0, "The overturning arm must be positive at rotation 0."
         )
-        self.saddle = self._first_zero()
+        self.saddle = first_zero(lambda x: self.restoring(Angle.of(x)), block.alpha)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
@@ -126,6 +126,8 @@ class FunctionMoments(AbstractMoments):
         return value if weight is None else value - (weight - 1) * self.restoring(angle)
 
     def _value(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
+        if self.factor is not None:  # the function's own unit of time is that of its side
+            velocity = velocity / jnp.sqrt(self.factor)
         value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
         return value if self.factor is None else self.factor * value
 
@@ -157,24 +159,3 @@ class FunctionMoments(AbstractMoments):
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; infinite, because nothing is known of the function beyond this angle."""
         return jnp.full_like(hold, jnp.inf)
-
-    def _first_zero(self) -> Scalar:
-        """Where the block balances: a scan, bisection, and a Newton step that carries the derivatives."""
-
-        def moment(x):
-            return self.restoring(Angle.of(x))
-
-        grid = jnp.linspace(0.0, jnp.pi / 2, 257, dtype=self.block.alpha.dtype)
-        falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
-        first = jnp.argmax(falls)
-
-        def halve(_, bracket):
-            low, high = bracket
-            middle = (low + high) / 2
-            above = jax.lax.stop_gradient(moment(middle)) > 0
-            return jnp.where(above, middle, low), jnp.where(above, high, middle)
-
-        low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
-        low = jax.lax.stop_gradient(low)
-        root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
-        return jnp.where(jnp.any(falls), root, jnp.pi / 2)

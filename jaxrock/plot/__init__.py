@@ -10,7 +10,7 @@ from jaxrock.plot.fits import found_record as found_record, history_fit as histo
 from jaxrock.plot.fragilities import fragility as fragility, fragility_surface as fragility_surface
 from jaxrock.plot.regions import feasible_region as feasible_region, search as search
 from jaxrock.plot.responses import history as history, phase as phase
-from jaxrock.plot.rocks import slenderness as slenderness
+from jaxrock.plot.rocks import righting as righting, slenderness as slenderness
 from jaxrock.plot.sensitivities import critical as critical, sensitivity_map as sensitivity_map, tornado as tornado
 from jaxrock.plot.style import log_ticks as log_ticks
 from jaxrock.plot.surfaces import borders as borders, overturning as overturning, spectrum as spectrum

@@ -40,3 +40,33 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
     for axis, title in zip(axes, ("slenderness [rad]", "p [rad/s]")):
         axis.set_title(title, fontsize=9)
     return axes
+
+
+def righting(rock: Rock, azimuth: float = 0.0, axis=None):
+    """Draw what rights a rock that opens towards an azimuth: the arm of its weight over the opening angle.
+
+    **Arguments:**
+
+    - `rock`: a `Rock`; `azimuth`: as in `Rock.section`, towards the right.
+    - `axis`: of matplotlib; None makes a figure.
+
+    **Returns:** the axis: the arm [m] of the rock itself, as it lies on its vertices in turn, that of the smooth edge
+    of `Rock.edges`, and those of the narrow and the wide base, which bound them.
+    """
+    import matplotlib.pyplot as plt
+
+    axis = plt.subplots(figsize=(4.6, 3.4), layout="constrained")[1] if axis is None else axis
+    narrow, wide = (rock.section(azimuth, base) for base in ("narrow", "wide"))
+    opening = np.linspace(0, min(1.05 * max(wide.slenderness[0], narrow.slenderness[0]), np.pi / 2), 200)
+    for section, label in ((narrow, "narrow base"), (wide, "wide base")):
+        across, up = section.right[0], section.centre[1] - section.right[1]
+        style = {"color": "grey", "linestyle": "--" if section is wide else ":", "linewidth": 1}
+        axis.plot(opening, across * np.cos(opening) - up * np.sin(opening), label=label, **style)
+    axis.plot(opening, rock.arms(azimuth, opening)[0], color=BLUE, label="the rock, rolling")
+    radius, start = np.hypot(narrow.right[0], narrow.centre[1] - narrow.right[1]), narrow.slenderness[0]
+    smooth = np.sin(start - opening) + np.asarray(rock.edges(azimuth)[0].run(opening))
+    axis.plot(opening, radius * smooth, color=RED, linewidth=1, label="smooth edge")
+    axis.axhline(0, color="black", linewidth=0.5)
+    axis.set(xlabel="opening angle [rad]", ylabel="arm of the weight [m]", xlim=(0, opening[-1]))
+    axis.legend(frameon=False, fontsize=8)
+    return axis

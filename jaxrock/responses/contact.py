@@ -12,7 +12,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
-from jaxrock.models.equation import Angle
+from jaxrock.models.equation import Angle, Rolled
 from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response
 
@@ -73,8 +73,8 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
 
     **Raises:** ValueError for a value outside its range.
 
-    **Source:** momentum of the centre of mass, on a circle about the corner (Shenton 1996 for the beginning of
-    rocking); at an impact, of the impulse that angular momentum about the new corner implies.
+    **Source:** momentum of the centre of mass, on a circle about the corner, or as it rolls (Shenton 1996 for the
+    beginning of rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
     ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
     check_single(block=block)
@@ -94,7 +94,8 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     needed = _at_impacts(response, 1.0, *corners), _at_impacts(response, -1.0, *corners[::-1])
     friction = _friction(horizontal, normal)
     # Between steps, and where the block rests for good and no step is taken.
-    below = jnp.abs(rotation) < jnp.where(rotation < 0, alphas[1], alphas[0])
+    saddles = [moments.saddle for moments in response.scene.both_moments]
+    below = jnp.abs(rotation) < jnp.where(rotation < 0, saddles[1], saddles[0])
     largest = jnp.maximum(largest, jnp.max(jnp.where(below, friction, 0.0)))
     least = jnp.minimum(least, jnp.min(jnp.where(below, normal, jnp.inf)))
     return Contact(time, horizontal, normal, friction, needed, largest, least)
@@ -131,9 +132,11 @@ def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity:
     speed = side * velocity / rate
     push, own = side * acceleration, (rate / scene.p) ** 2
     angular = scene.moments.acceleration(Angle.of(opening), side * velocity / scene.p, push, weight) / own
-    missing = alpha - opening
-    horizontal = acceleration + side * ratio * (jnp.cos(missing) * angular + jnp.sin(missing) * speed**2)
-    normal = weight + ratio * (jnp.sin(missing) * angular - jnp.cos(missing) * speed**2)
+    rolled = scene.moments.rolled(Angle.of(opening))
+    # On a circle about the corner, if it does not roll.
+    at = Rolled(jnp.cos(alpha - opening), jnp.sin(alpha - opening), jnp.zeros_like(alpha)) if rolled is None else rolled
+    horizontal = acceleration + side * ratio * (at.height * angular + at.reach * speed**2)
+    normal = weight + ratio * (at.reach * angular + (at.radius - at.height) * speed**2)
     still = (side == 0) | (opening >= jnp.pi / 2)
     return jnp.where(still, acceleration, horizontal), jnp.where(still, weight, normal)
 

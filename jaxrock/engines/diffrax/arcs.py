@@ -40,7 +40,6 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
-from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 from jaxrock.status import Status
 from jaxrock.transforms.branches import either
 from jaxrock.transforms.differentiation import differentiable
@@ -49,7 +48,6 @@ from jaxrock.transforms.held import Held
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 Pair = Inexact[Array, "2"]  # opening angle, velocity per p t
-_GAUSS = gauss_legendre_of_unit(12)
 
 _ADJOINTS: dict[type, Any] = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",
@@ -205,19 +203,13 @@ class ArcStepper(AbstractStepper):
         higher or closer to its balance there than before: its energy would not take it to some angle below all that.
         """
         scene = self.scene.on(state.side)
-        far = scene.both_moments[1]
-        nodes, weights = (jnp.asarray(values, state.opening.dtype) for values in _GAUSS)
-
-        def energy(moments, opening):
-            return opening * jnp.sum(weights * jax.vmap(lambda x: moments.restoring(Angle.of(x)))(opening * nodes))
-
-        whole = energy(scene.moments, state.opening)
+        far, whole = scene.both_moments[1], scene.moments.work(state.opening)
         left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
         outdone = jnp.zeros_like(state.done)
         for share in (0.999, 0.7, 0.4, 0.1):
             opening = share * jnp.minimum(state.peak, far.saddle)
             least = (far.restoring(Angle.of(opening)) / far.restoring_at_rest) ** 2
-            outdone = outdone | ((left < energy(far, opening)) & (least >= state.closeness))
+            outdone = outdone | ((left < far.work(opening)) & (least >= state.closeness))
         return outdone
 
     def finish(self, state: State) -> State:

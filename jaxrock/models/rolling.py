@@ -1,0 +1,173 @@
+"""The block whose edges are rounded: it rolls on them, and does not turn about a corner."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Inexact
+
+from jaxrock._arguments import arguments
+from jaxrock._described import described
+from jaxrock._parameters import parameter, set_parameters
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.edge import Edge
+from jaxrock.blocks.restitution import ratio_of_inertia
+from jaxrock.blocks.rigid import Block, Side
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero
+from jaxrock.numerics.elementary import sine_cosine
+
+Scalar = Inexact[Array, ""]
+
+
+class Rolling(AbstractEquation):
+    """A rigid block that rolls without slipping on rounded edges; the diffrax engine solves it.
+
+    At rest it stands on the ground between two corners, where the rounding begins; to these belong the `alpha` and `p`
+    of a block, and its restitution: the impact comes when the flat part meets the ground, and changes the angular
+    velocity as it does of a block with sharp corners there. With the height H of the centre of mass over the ground at
+    an opening angle x, over R, its horizontal distance H' from the point of contact, and the radius of curvature r
+    there, H'' = r - H and
+
+        [1 + k (H^2 + H'^2 - 1)] x'' + k r H' x'^2 = -[(1 + v) H' + s u H],
+
+    k the inertia ratio m R^2/I. On a circle of radius r over a rectangle H = r + (cos(alpha) - r) cos(x) +
+    sin(alpha) sin(x). It uplifts where a block with sharp corners does, and balances later: at
+    arctan(sin(alpha)/(cos(alpha) - r)).
+
+    **Arguments:**
+
+    - `edge`: radius over R [-], 0 or more, of the circle that is the edge; or an `Edge`, which may be rounded
+      otherwise.
+    - `other`: the same of side 2 of an `AsymmetricBlock`, over R2. None: as `edge`.
+    - `inertia_ratio`: of a symmetric `Block`: m R^2/I about a corner [-], in (0, 1]; 3/4 for a rectangle. An
+      `AsymmetricBlock` has its own.
+
+    Where the radius is so large that the block does not balance before pi/2, it overturns only by lying flat. A
+    facetted base, which loses energy at every facet, is not such an edge.
+
+    **Raises:** ValueError for values outside their ranges; for a symmetric block whose `other` edge was given.
+
+    **Source:** Lagrange's equation of rolling without slipping; Bachmann, Vassiliou & Stojadinović (2019) for columns
+    on round edges.
+    """
+
+    edge: Edge
+    other: Edge | None
+    inertia_ratio: Scalar = parameter("-", ratio_of_inertia)
+
+    __repr__ = described
+
+    @arguments
+    def __init__(
+        self, edge: Edge | ArrayLike, other: Edge | ArrayLike | None = None, *, inertia_ratio: ArrayLike = 0.75
+    ):
+        set_parameters(self, inertia_ratio=inertia_ratio)
+        edge = edge if isinstance(edge, Edge) else Edge(edge)
+        other = other if other is None or isinstance(other, Edge) else Edge(other)
+        self.edge, self.other = (edge, None) if other is None else _alike(edge, other)
+
+    def moments(self, block: Block | Side) -> "RollingMoments":
+        """What acts on a symmetric block."""
+        if self.other is not None:
+            raise ValueError("Argument `other` must be None for a symmetric block, whose edges are alike.")
+        return RollingMoments.of(block.alpha, self.inertia_ratio, self.edge)
+
+    def moments_of_sides(self, block: AsymmetricBlock) -> tuple["RollingMoments", "RollingMoments"]:
+        """What acts on both sides of an asymmetric one."""
+        first = RollingMoments.of(block.alpha1, block.inertia_ratio, self.edge)
+        return first, RollingMoments.of(block.alpha2, block.inertia_ratio2, self.other or self.edge)
+
+    @property
+    def is_series(self) -> bool:
+        """The moment of inertia about the point of contact changes."""
+        return False
+
+
+class RollingMoments(AbstractMoments):
+    """The moments that act on a block on one of its rounded edges."""
+
+    slenderness: Angle
+    ratio: Scalar
+    edge: Edge
+    factor: Scalar  # of all accelerations (see `times`)
+    saddle: Scalar
+
+    @classmethod
+    def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
+        """Of a block, or a side."""
+        made = cls(Angle.of(alpha), ratio, edge, jnp.ones_like(alpha), alpha)
+        return replace(made, saddle=first_zero(lambda x: made.rolled(Angle.of(x)).reach, alpha))
+
+    def times(self, factor: Scalar | float) -> "RollingMoments":
+        """As for any moments."""
+        return replace(self, factor=factor * self.factor)
+
+    def rolled(self, angle: Angle) -> Rolled:
+        """Where the centre of mass is over the point of contact."""
+        sine, cosine = self.slenderness.sine, self.slenderness.cosine
+        return Rolled(
+            cosine * angle.cosine + sine * angle.sine + self.edge.rise(angle.value),
+            sine * angle.cosine - cosine * angle.sine + self.edge.run(angle.value),
+            self.edge.at(angle.value),
+        )
+
+    def _inertia(self, at: Rolled) -> Scalar:
+        """About the point of contact, over that at rest."""
+        return 1 + self.ratio * (at.height**2 + at.reach**2 - 1)
+
+    def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
+        at = self.rolled(angle)
+        moment = self.factor * ((at.reach if weight is None else weight * at.reach) + push * at.height)
+        # The moment of inertia grows as it rolls on; that does not depend on the unit of time.
+        return -(moment + self.ratio * at.radius * at.reach * velocity**2) / self._inertia(at)
+
+    def restoring(self, angle: Angle) -> Scalar:
+        """Restoring moment over m g R at an opening angle, of a moment of inertia as at rest."""
+        at = self.rolled(angle)
+        return self.factor * at.reach / self._inertia(at)
+
+    def arm(self, angle: Angle) -> Scalar:
+        """Overturning moment over m R u g at an opening angle, of a moment of inertia as at rest."""
+        at = self.rolled(angle)
+        return self.factor * at.height / self._inertia(at)
+
+    def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """How fast nearby angles part, per angle, of a block that stands still."""
+        still = jnp.zeros_like(angle.value)
+        return jax.grad(lambda x: self.acceleration(Angle.of(x), still, push, weight))(angle.value)
+
+    def work(self, opening: Scalar) -> Scalar:
+        """By height: the moment of inertia there does not matter."""
+        return self.factor * (self.rolled(Angle.of(opening)).height - 1)
+
+    @property
+    def restoring_at_rest(self) -> Scalar:
+        """As of a sharp corner."""
+        return self.factor * self.slenderness.sine
+
+    @property
+    def arm_at_rest(self) -> Scalar:
+        """As of a sharp corner."""
+        return self.factor * self.slenderness.cosine
+
+    @property
+    def stiffness(self) -> Scalar:
+        """How fast the restoring moment falls where it balances; the factor where it does not before pi/2."""
+        at = self.rolled(Angle(self.saddle, *sine_cosine(self.saddle)))
+        falls = at.height - at.radius
+        return jnp.where(falls > 0, self.factor * falls / self._inertia(at), self.factor)
+
+    def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """As for any moments; infinite, because it may roll on to a firmer part."""
+        return jnp.full_like(hold, jnp.inf)
+
+
+def _alike(first: Edge, second: Edge) -> tuple[Edge, Edge]:
+    """Two edges of as many angles, so that one program serves both sides."""
+    if first.angle is None and second.angle is None:
+        return first, second
+    known = [jnp.zeros(1) if edge.angle is None else edge.angle for edge in (first, second)]
+    count = max(angle.size for angle in known)
+    longer = [jnp.concatenate([angle, angle[-1] + 1.0 + jnp.arange(count - angle.size)]) for angle in known]
+    return first.with_angles(longer[0]), second.with_angles(longer[1])

@@ -1,0 +1,348 @@
+"""Blocks on rounded edges: beside Newton's law for a body on a rolling circle, by energy, and on meshes.
+
+The judge knows no height of the centre of mass as a function of the angle: it solves for the forces of the ground, for
+a circle that rolls without slipping (`Wheel`).
+"""
+
+import warnings
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+
+import jaxrock as rk
+from jaxrock.models.equation import Angle
+
+GRAVITY = 9.81
+EXACT = {"engine": rk.Diffrax(rtol=1e-11)}
+
+
+class Wheel(NamedTuple):
+    """One side of a block: slenderness, frequency parameter, m R^2/I, radius of the edge over R, restitution."""
+
+    alpha: float
+    p: float
+    ratio: float
+    radius: float
+    restitution: float
+
+    def forces(self, opening, speed, push, lift):
+        """Angular acceleration [1/s^2], horizontal and normal force of the ground over m g, outward and up.
+
+        Newton's law for the centre of mass and about it; the centre of the circle moves on a level line by radius
+        times angle.
+        """
+        R = self.ratio * GRAVITY / self.p**2
+        inertia, edge = R**2 * (1 / self.ratio - 1), self.radius * R
+        away = np.array([-R * np.sin(self.alpha), R * np.cos(self.alpha) - edge])
+        sine, cosine = np.sin(opening), np.cos(opening)
+        x, y = cosine * away[0] + sine * away[1], -sine * away[0] + cosine * away[1]  # turned outward
+        matrix = [[edge + y, -1.0, 0.0], [-x, 0.0, -1.0], [inertia, edge + y, -x]]
+        right = [x * speed**2 - push * GRAVITY, y * speed**2 - (1 + lift) * GRAVITY, 0.0]
+        turning, horizontal, normal = np.linalg.solve(matrix, right)
+        return turning, horizontal / GRAVITY, normal / GRAVITY
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.3, 0.8])
+def test_the_equation_is_newtons(radius):
+    """At states below and beyond its balance, under horizontal and vertical shaking; what follows from it at rest."""
+    alpha, p, ratio = 0.3, 2.5, 0.7
+    moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
+    wheel = Wheel(alpha, p, ratio, radius, 0.9)
+    for opening, speed, push, lift in ((0.0, 0.4, 0.5, 0.0), (0.25, 1.0, -0.2, 0.3), (0.7, 2.0, 0.1, -0.4)):
+        told = p**2 * moments.acceleration(Angle.of(opening), speed / p, push, 1 + lift)
+        assert float(told) == pytest.approx(wheel.forces(opening, speed, push, lift)[0], rel=1e-12)
+    assert float(moments.threshold) == pytest.approx(np.tan(alpha), rel=1e-14)
+    balance = float(np.arctan2(np.sin(alpha), np.cos(alpha) - radius))
+    assert float(moments.saddle) == pytest.approx(balance, rel=1e-12)
+    slope = jax.grad(lambda r: rk.models.Rolling(r).moments(rk.Block(alpha, p)).saddle)(radius)
+    assert float(slope) == pytest.approx(np.sin(balance) ** 2 / np.sin(alpha), rel=1e-10)
+    height = np.hypot(np.sin(alpha), np.cos(alpha) - radius) + radius
+    assert float(moments.work(balance)) == pytest.approx(height - 1, rel=1e-12)
+
+
+def by_newton(wheels, horizontal, vertical, start, times, until):
+    """Rotation, angular velocity and forces [m g] at times under a smooth motion [g], and whether it fell."""
+    side, state, begin = 1 if start[0] > 0 or start[1] > 0 else -1, np.array(start, float), 0.0
+    found = np.full((4, len(times)), np.nan)
+    while begin < until:
+        wheel = wheels[0 if side > 0 else 1]
+
+        def flow(t, y, wheel=wheel, side=side):
+            return [y[1], side * wheel.forces(side * y[0], y[1], side * horizontal(t), vertical(t))[0]]
+
+        def ground(t, y, begin=begin, side=side):
+            return side * y[0] if t > begin + 1e-5 else 1.0
+
+        ground.terminal, ground.direction = True, -1
+        flat = lambda t, y: np.pi / 2 - abs(y[0])
+        flat.terminal = True
+        arc = solve_ivp(flow, (begin, until), state, "DOP853", events=(ground, flat), rtol=1e-12, atol=1e-14,
+                        dense_output=True, max_step=0.05)  # fmt: skip
+        inside = (times >= begin) & (times < arc.t[-1])
+        found[:2, inside] = arc.sol(times[inside])
+        for k in np.flatnonzero(inside):
+            t, (angle, speed) = times[k], found[:2, k]
+            _, outward, normal = wheel.forces(side * angle, speed, side * horizontal(t), vertical(t))
+            found[2:, k] = side * outward, normal
+        if arc.t_events[1].size:
+            return found, True
+        begin, state = arc.t[-1], np.array([0.0, wheel.restitution * arc.y[1, -1]])
+        side = -side
+    return found, False
+
+
+SINE = rk.SinePulse(0.35, 0.9)
+DIPS = {"level": lambda t: 0.0, "vertical": lambda t: 0.2 * np.sin(2 * np.pi * t / 0.4)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "alpha, radius, dip",
+    [(0.2, 0.3, "level"), (0.35, 0.8, "vertical"), (0.15, 0.05, "level")],
+    ids=["round", "rounder, and vertical motion", "nearly sharp"],
+)
+def test_beside_newton(alpha, radius, dip):
+    """Rotation, velocity and forces of the ground under a sine; at rest its own edge starts it."""
+    block, p = rk.Block(alpha, 2.5, 0.9), 2.5
+    motion = (
+        SINE if dip == "level" else SINE.with_vertical(rk.SinePulse(0.2, 0.4) + rk.SinePulse(0.2, 0.4).shifted(0.4))
+    )
+    until = 0.8
+    wheel = Wheel(alpha, p, 0.75, radius, 0.9)
+    response = rk.simulate(block, motion, rk.models.Rolling(radius), initial=(0.08, 0.1), duration=until, **EXACT)
+    contact = rk.contact_forces(response, block)
+    push = lambda t: 0.35 * np.sin(2 * np.pi * t / 0.9)
+    times = np.asarray(response.time)[:-1]
+    found, fell = by_newton([wheel, wheel], push, DIPS[dip], (0.08, 0.1), times, until)
+    assert not fell and np.isfinite(found).all() and response.impact_times.size >= 1
+    np.testing.assert_allclose(response.rotation[:-1], found[0], atol=2e-9)
+    np.testing.assert_allclose(response.velocity[:-1], found[1], atol=2e-8)
+    np.testing.assert_allclose(contact.horizontal[:-1], found[2], atol=1e-7)
+    np.testing.assert_allclose(contact.normal[:-1], found[3], atol=1e-7)
+
+
+@pytest.mark.slow
+def test_sides_of_their_own():
+    """Different edges, slenderness and size on either side."""
+    block = rk.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, restitution=(0.9, 0.85))
+    model = rk.models.Rolling(0.4, 0.1)
+    wheels = [
+        Wheel(0.2, 2.5, 0.7, 0.4, 0.9),
+        Wheel(0.3, float(block.p2), float(block.inertia_ratio2), 0.1, 0.85),
+    ]
+    response = rk.simulate(block, SINE, model, initial=(0.05, 0.2), duration=0.9, **EXACT)
+    times = np.linspace(0.0, 0.9, 60)[:-1]
+    found, _ = by_newton(wheels, lambda t: 0.35 * np.sin(2 * np.pi * t / 0.9), DIPS["level"], (0.05, 0.2), times, 0.9)
+    assert (found[0] < -0.01).any() and (found[0] > 0.01).any()
+    np.testing.assert_allclose(response(times), found[:2], atol=2e-8)
+
+
+@pytest.mark.slow
+def test_a_damper_on_two_sides():
+    """A moment that depends on the velocity is told in the unit of time of its own side."""
+    block = rk.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, 1.6, restitution=(0.9, 0.8))
+    model = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: 0.5 * v)
+    response = rk.simulate(block, rk.RectangularPulse(0.0, 0.1), model, initial=(-0.2, 0.0), duration=0.5, **EXACT)
+    p2 = float(block.p2)
+    arc = solve_ivp(lambda t, y: [y[1], -(p2**2) * np.sin(0.3 - y[0]) - 0.5 * p2 * y[1]], (0, 0.5), [0.2, 0.0],
+                    rtol=1e-11, atol=1e-13)  # fmt: skip
+    assert abs(p2 / 2.5 - 1) > 0.1 and arc.y[0, -1] > 0
+    np.testing.assert_allclose(-response.rotation[-1], arc.y[0, -1], rtol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("above", [False, True])
+@pytest.mark.parametrize("edge", [0.5, rk.blocks.Edge([0.6, 0.2, 0.0], [0.0, 0.15, 0.3])], ids=["circle", "profile"])
+def test_what_topples_it_by_energy(edge, above):
+    """Height gained up to its balance: a little less speed, and it comes back; a little more, and it does not."""
+    alpha, p, model = 0.2, 2.0, rk.models.Rolling(edge)
+    known = edge if isinstance(edge, rk.blocks.Edge) else rk.blocks.Edge(edge)
+    arm = lambda x: np.sin(alpha - x) + quad(lambda y: np.cos(x - y) * float(known.at(y)), 0, x, points=(0.15, 0.3))[0]
+    grid = np.linspace(0, 1.2, 241)
+    balance = grid[np.argmax([arm(x) <= 0 for x in grid])]
+    low, high = balance - 0.005, balance
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if arm(middle) > 0 else (low, middle)
+    rise = quad(arm, 0, low, points=(0.15, 0.3), limit=200, epsabs=1e-13)[0]
+    speed = p * np.sqrt(2 * rise) * (1 + (1e-7 if above else -1e-7))
+    found = rk.outcome(rk.Block(alpha, p), rk.RectangularPulse(0.0, 0.01), model, initial=(0.0, speed), **EXACT)
+    assert low > alpha + 0.02
+    assert bool(found.overturned) == above
+    assert abs(float(found.margin)) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [0.0, 0.5])
+def test_energy_on_the_way(radius):
+    """Of the body that rolls; a sharp edge is Housner's block."""
+    block, model = rk.Block(0.25, 2.0), rk.models.Rolling(radius)
+    response = rk.simulate(block, rk.RectangularPulse(0.0, 0.01), model, initial=(0.2, 0.0), duration=1.5, **EXACT)
+    x, v = np.abs(np.asarray(response.rotation)), np.asarray(response.velocity) / 2.0
+    centre = np.array([-np.sin(0.25), np.cos(0.25) - radius])
+    height = radius - centre[0] * np.sin(x) + centre[1] * np.cos(x)
+    reach = -centre[0] * np.cos(x) - centre[1] * np.sin(x)
+    energy = height + v**2 / 2 * (1 + 0.75 * (height**2 + reach**2 - 1))
+    parts = np.searchsorted(np.asarray(response.impact_times), np.asarray(response.time))
+    assert parts.max() >= 1
+    for part in range(parts.max()):
+        np.testing.assert_allclose(energy[parts == part], energy[parts == part][0], atol=1e-10)
+    if radius == 0:
+        plain = rk.simulate(block, rk.RectangularPulse(0.0, 0.01), initial=(0.2, 0.0), duration=1.5)
+        np.testing.assert_allclose(response.rotation, plain.rotation, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_rounder_edge_helps():
+    """Slopes by the radius, in an outcome and by differences; a rounder block balances later, and rocks less."""
+    peak = lambda radius: rk.outcome(rk.Block(0.25, 2.5), SINE, rk.models.Rolling(radius), **EXACT).max_rotation
+    value, slope = jax.jit(jax.value_and_grad(peak))(jnp.asarray(0.3))
+    ends = [float(jax.jit(peak)(jnp.asarray(0.3 + sign * 1e-4))) for sign in (1, -1)]
+    assert 0 < float(value) < 0.25
+    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-5)
+    assert float(slope) < 0
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.1, 0.25, 0.6])
+@pytest.mark.parametrize(
+    "edge, radius",
+    [
+        (rk.blocks.Edge(0.4), lambda y: 0.4),
+        (rk.blocks.Edge([0.5, 0.1, 0.3], [0.05, 0.2, 0.4]), lambda y: np.interp(y, [0.05, 0.2, 0.4], [0.5, 0.1, 0.3])),
+    ],
+    ids=["circle", "profile"],
+)
+def test_what_an_edge_adds(edge, radius, opening):
+    """The integrals that its docstring names."""
+    for told, weight in ((edge.rise, np.sin), (edge.run, np.cos)):
+        known = quad(lambda y, f=weight: f(opening - y) * radius(y), 0, opening, points=(0.05, 0.2, 0.4))[0]
+        assert float(told(opening)) == pytest.approx(known, abs=1e-12)
+    assert float(edge.at(opening)) == pytest.approx(radius(opening), abs=1e-14)
+
+
+trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
+
+
+def prism(outline, depth=0.6):
+    """A convex outline in the plane of the first and the third axis, drawn out along the second."""
+    ends = [np.column_stack([outline[:, 0], np.full(len(outline), y), outline[:, 1]]) for y in (0.0, depth)]
+    return trimesh.convex.convex_hull(np.concatenate(ends))
+
+
+def round_edged(radius=0.25, flat=0.2, height=1.5, sides=60):
+    """A rectangle whose lower edges are quarter circles."""
+    turns = np.linspace(0, np.pi / 2, sides)
+    right = np.stack([flat + radius * np.sin(turns), radius * (1 - np.cos(turns))], axis=1)
+    top = np.array([[flat + radius, height], [-flat - radius, height]])
+    return np.concatenate([right, top, (right * [-1, 1])[::-1]])
+
+
+def test_a_mesh_of_a_round_edge():
+    """Its edge is found again, with its radius, its balance and its arms."""
+    rock = rk.blocks.Rock.from_mesh(prism(round_edged()), tolerance=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        edges = rock.edges(0.0)
+    section = rock.section(0.0)
+    R = np.hypot(0.2, rock.centre[2])
+    angles = np.linspace(0, 0.25, 9)
+    for edge, rolls in zip(edges, section.rolls):
+        assert rolls
+        np.testing.assert_allclose(R * edge.run(angles), 0.25 * np.sin(angles), atol=0.002)
+    model = rk.models.Rolling(*edges)
+    with pytest.warns(UserWarning, match="The base is rounded"):
+        block = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+    balance = np.arctan2(0.2, rock.centre[2] - 0.25)
+    for moments in model.moments_of_sides(block):
+        assert float(moments.saddle) == pytest.approx(balance, rel=3e-3)
+    opening = np.linspace(0, 0.3, 7)
+    known = 0.2 * np.cos(opening) - (rock.centre[2] - 0.25) * np.sin(opening)
+    np.testing.assert_allclose(rock.arms(0.0, opening), [known, known], atol=0.25 * np.pi / 2 / 59)
+    axis = rk.plot.righting(rock, 0.0)
+    assert [line.get_label() for line in axis.lines[:4]] == [
+        "narrow base", "wide base", "the rock, rolling", "smooth edge"
+    ]  # fmt: skip
+    plt.close("all")
+
+
+@pytest.mark.slow
+def test_a_rock_that_rolls_topples_between_its_bounds():
+    """Least sine pulse that topples it, of the narrow block, of the rolling one, of the wide one."""
+    rock = rk.blocks.Rock.from_mesh(prism(round_edged()), tolerance=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        narrow, wide = (rk.AsymmetricBlock.from_mesh(rock, 0.0, base=base) for base in ("narrow", "wide"))
+    amplitudes = np.linspace(0.15, 1.2, 43)
+
+    def least(block, model):
+        fell = jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a, 1.0), model).overturned)(amplitudes)
+        return amplitudes[np.argmax(fell)]
+
+    rolls = least(narrow, rk.models.Rolling(*rock.edges(0.0)))
+    assert least(narrow, rk.Housner()) < rolls < least(wide, rk.Housner())
+
+
+def test_a_base_of_faces_warns():
+    outline = np.array([[-0.2, 0.0], [0.2, 0.0], [0.5, 0.03], [0.5, 1.6], [-0.5, 1.6], [-0.5, 0.03]])
+    rock = rk.blocks.Rock.from_mesh(prism(outline), tolerance=1e-6)
+    with pytest.warns(UserWarning, match="The base is made of faces"):
+        rock.edges(0.0)
+
+
+def test_rocks_that_a_mesh_allows():
+    """Known tolerance: the block itself. Open: between its ends. Noise: scatters, and always stands."""
+    rock = rk.blocks.Rock.from_mesh(prism(round_edged()), tolerance=0.005)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        same = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+    known = rk.blocks.draw_rocks(rock, 0.0, 3, tolerance=(0.005, 0.005))
+    np.testing.assert_allclose(known.alpha1, same.alpha1, rtol=1e-12)
+    np.testing.assert_allclose(known.p2, same.p2, rtol=1e-12)
+    ends = [rk.blocks.draw_rocks(rock, 0.0, 1, tolerance=(each, each)).alpha1[0] for each in (0.002, 0.02)]
+    drawn = rk.blocks.draw_rocks(rock, 0.0, 200, tolerance=(0.002, 0.02))
+    assert ends[0] <= drawn.alpha1.min() < drawn.alpha1.max() <= ends[1] and drawn.alpha1.std() > 0.01
+    noisy = rk.blocks.draw_rocks(rock, 0.0, 200, tolerance=(0.005, 0.005), resolution=0.002, seed=1)
+    assert float(noisy.alpha1.std()) > 1e-3 and (np.asarray(noisy.alpha1) > 0).all()
+    wild = rk.blocks.draw_rocks(rock, 0.0, 50, tolerance=(0.001, 0.001), resolution=0.03)  # many draws do not stand
+    assert wild.alpha1.shape == (50,) and (np.asarray(wild.alpha2) > 0).all()
+    with pytest.raises(ValueError, match="`tolerance` must be a pair of which the second is not smaller"):
+        rk.blocks.draw_rocks(rock, 0.0, 3, tolerance=(0.02, 0.005))
+
+
+def test_the_plane_that_rocks_share():
+    def turned(azimuth):
+        box = trimesh.creation.box((0.4, 0.8, 2.0))
+        box.apply_transform(trimesh.transformations.rotation_matrix(azimuth, [0, 0, 1]))
+        return rk.blocks.Rock.from_mesh(box)
+
+    shared = rk.blocks.shared_plane([turned(0.0), turned(0.06), turned(1.2)], planes=90)
+    assert shared.rocks.tolist() == [True, True, False]
+    assert 0 <= shared.azimuth <= 0.07
+    np.testing.assert_allclose(shared.weakest, [0.0, 0.06, 1.2], atol=np.pi / 90)
+    assert shared.slenderness.min() == pytest.approx(np.arctan2(0.4, 2.0), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: rk.models.Rolling(-0.1), "`radius` must be 0 or more"),
+        (lambda: rk.models.Rolling(0.1, inertia_ratio=1.5), r"`inertia_ratio` must be in \(0, 1\]"),
+        (lambda: rk.blocks.Edge([0.1, 0.2]), "`radius` must be one number without `angle`"),
+        (lambda: rk.blocks.Edge([0.1, 0.2], [0.0]), "`radius` and `angle` must be lists of one length"),
+        (lambda: rk.blocks.Edge([0.1, 0.2], [0.3, 0.1]), "`angle` must grow"),
+        (lambda: rk.outcome(rk.Block(0.2, 2.0), SINE, rk.models.Rolling(0.1, 0.2)), "`other` must be None"),
+        (
+            lambda: rk.outcome(rk.Block(0.2, 2.0), SINE, rk.models.Rolling(0.1), engine=rk.Series()),
+            r"must be a Diffrax\(...\)",
+        ),
+        (lambda: rk.blocks.shared_plane([]), "`rocks` must hold at least one"),
+    ],
+)
+def test_what_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
