@@ -21,7 +21,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, engine_of, start_of, steps_of_flexible
-from jaxrock.responses.current_model import current_model
+from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
@@ -205,7 +205,7 @@ def simulate(
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model)
-    start = start_of(initial, throw)
+    block, start = standing(block, model), start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     response = Response(time, *_evaluate(path, time), summary, path)
