@@ -65,12 +65,24 @@ def test_critical():
     }
 
 
+def test_broken_curves():
+    """What stands alone between gaps, or at an end, is a dot."""
+    _, axis = plt.subplots()
+    values = [1.0, np.inf, 2.0, 3.0, np.nan, 4.0, np.inf, 5.0]
+    line = rk.plot.broken_curve(axis, np.arange(8), values, color="red")
+    np.testing.assert_array_equal(line.get_ydata(), np.where(np.isfinite(values), values, np.nan))
+    assert axis.lines[1].get_xydata().tolist() == [[0.0, 1.0], [5.0, 4.0], [7.0, 5.0]]
+    assert axis.lines[1].get_color() == "red"
+
+
 def test_safety_regions():
     axis = rk.plot.safety_regions(0.5, longest=4.0, points=8)
     wall = axis.lines[0].get_xydata()
     np.testing.assert_allclose(wall[:, 0], np.linspace(0.5, 4.0, 8))
     np.testing.assert_allclose(wall[:, 1], single_lobe.safety_wall(wall[:, 0], 0.5))
     assert len(axis.collections) == 5
+    assert "$O_3$" in {text.get_text() for text in axis.texts} and axis.get_legend() is not None
+    assert rk.plot.safety_regions(0.5, points=8, legend=False).get_legend() is None
 
 
 def test_sine_regions():

@@ -7,6 +7,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
+from jaxrock.flexible.closeness import still_to_come
 from jaxrock.flexible.phases import Numbers, locked_phase, rocking_phase
 from references.flexible_column import PULSE, SHORT, TALL, beam, independent
 
@@ -221,6 +222,64 @@ def test_vibrations_do_not_hide_the_peak():
     found = rk.responses.outcome_flexible(block, rk.SinePulse(0.3, 0.8), duration=1.6)
     assert float(found.max_rotation) == pytest.approx(rigid_peak(block, 0.3, 0.8), rel=1e-7)
     assert found.status == rk.Status.successful
+
+
+# ---------------------------------------------------------------- the margin
+
+
+@pytest.fixture(scope="module")
+def by_amplitude():
+    """Outcomes of nine columns of three masses by modulus [Pa], damping and amplitude of a pulse [g]; slope of the
+    margin by the amplitude."""
+
+    def margin(modulus, damping, amplitude):
+        block = rk.FlexibleBlock(5.0, 50.0, modulus, 2500.0, damping, 3)
+        found = rk.outcome(block, rk.SinePulse(amplitude, 1.6), duration=20.0)
+        return found.margin, found
+
+    def one(modulus, damping, amplitude):
+        return jax.jvp(lambda a: margin(modulus, damping, a), (amplitude,), (1.0,), has_aux=True)
+
+    compiled = jax.jit(jax.vmap(one, (None, None, 0)))
+    return lambda amplitude, modulus=30e9, damping=0.01: compiled(modulus, damping, amplitude)
+
+
+@pytest.mark.parametrize("amplitudes", [(-0.3, -0.01), (-0.01, -0.3), (0.01, -0.3), (0.3, -0.01), (0.0, -0.1)])
+def test_the_nearest_of_a_free_swing(amplitudes):
+    """From amplitudes of the growing and the decaying mode on, against a table of the distance."""
+    grows, decays, time = 0.8, 0.9, np.linspace(0, 12, 200_001)
+    outward, inward = amplitudes[0] * np.exp(grows * time), amplitudes[1] * np.exp(-decays * time)
+    found = still_to_come(*(jnp.asarray(x) for x in (*amplitudes, grows, decays)))
+    np.testing.assert_allclose(found, np.min(2 * (outward**2 + inward**2)), rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_the_margin_of_a_rigid_column(by_amplitude):
+    """(1 - peak/balance)^2, where nothing vibrates; 1 where nothing turns, negative where it overturns."""
+    margin, _, found = by_amplitude(np.array([0.08, 0.3, 0.4, 0.5, 0.6, 0.65, 0.8, 0.9, 1.0]), 30e12, 0.0)
+    peak, lost = found.max_rotation / np.arctan(0.1), np.asarray(found.overturned)
+    assert peak[0] == 0 and margin[0] == 1
+    np.testing.assert_array_equal(lost, np.arange(9) > 5)
+    np.testing.assert_allclose(margin[~lost], (1 - peak[~lost]) ** 2, rtol=1e-3)
+    assert (margin[lost] < 0).all() and (found.energy[~lost] < 1).all()
+
+
+@pytest.mark.slow
+def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
+    """It passes through zero with a slope, which is its derivative; on either side of every verdict that changes."""
+    low, high = 0.7, 0.8
+    for _ in range(10):
+        tried = np.linspace(low, high, 9)
+        lost = np.asarray(by_amplitude(tried)[2].overturned)
+        assert lost[-1] and not lost[0]
+        first = int(np.argmax(lost))
+        low, high = tried[first - 1], tried[first]
+    away = np.array([-1e-3, -1e-4, -1e-5, -1e-6, 1e-6, 1e-5, 1e-4, 1e-3, 0.02])
+    margin, slope, found = by_amplitude(low * (1 + away))
+    np.testing.assert_array_equal(margin < 0, found.overturned)
+    near = np.abs(away) < 2e-4
+    np.testing.assert_allclose((margin / (low * away))[near], slope[near], rtol=2e-3)
+    np.testing.assert_allclose(slope[near], slope[3], rtol=5e-3)
 
 
 # ------------------------------------------------------- many, and derivatives

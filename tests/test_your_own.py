@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.responses.current_model import current_model
+from jaxrock.responses.outcome import _outcome
 from jaxrock.studies.parameters import declarations, named
 
 BLOCK = rk.Block(0.2, 2.0)
@@ -263,3 +265,36 @@ def test_the_orbit_of_functions_is_drawn():
     axis = rk.plot.phase(rk.simulate(BLOCK, rk.SinePulse(0.3, 0.6), model))
     assert axis.get_legend() is None and len(axis.lines) == 4
     plt.close(axis.figure)
+
+
+def falling(x, block):
+    return jnp.sin(x - block.alpha)
+
+
+def standing(x, block):
+    return jnp.sin(block.alpha - x)
+
+
+@pytest.mark.parametrize(
+    ("parts", "what"), [((falling,), "restoring moment"), ((standing, lambda x, block: x - 1.0), "overturning arm")]
+)
+@pytest.mark.parametrize("call", [rk.outcome, rk.simulate], ids=lambda call: call.__name__)
+def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
+    """At the door, alone and under `jax.vmap`: what is compiled calls back to nothing, and JAX can keep it."""
+    model = rk.Equation(*parts)
+
+    def scene(a):
+        return call(BLOCK, rk.SinePulse(a, 1.0), model)
+
+    for scenes, amplitude in ((scene, 0.5), (jax.vmap(scene), jnp.ones(2))):
+        with pytest.raises(ValueError, match=f"The {what} must be positive at rotation 0"):
+            scenes(amplitude)
+
+
+@pytest.mark.slow  # compiles an arc of diffrax
+def test_programs_of_ones_own_equation_call_back_to_nothing():
+    """Else JAX would not keep them."""
+    model = rk.Equation(standing)
+    scene = BLOCK, rk.SinePulse(0.3, 1.0), current_model(model, BLOCK)
+    text = _outcome.lower(*scene, (jnp.zeros(()), jnp.zeros(())), rk.Diffrax()).as_text()
+    assert "callback" not in text

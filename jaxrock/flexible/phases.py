@@ -234,13 +234,14 @@ class Arc(eqx.Module):
 
     def state(self, x: Scalar) -> Inexact[Array, " states"]:
         """(q, q', theta) at x."""
-        return self.center + (self.phase.modes @ self._at(x)).real
+        return self.center + (self.phase.modes @ self.mode_amplitudes(x)).real
 
     def outputs(self, x: Scalar) -> Inexact[Array, " outputs"]:
         """Rotation, top displacement over L, its bending part, base moment over m L^2, at x."""
-        return self.offsets + (self.phase.outputs @ self._at(x)).real
+        return self.offsets + (self.phase.outputs @ self.mode_amplitudes(x)).real
 
-    def _at(self, x):
+    def mode_amplitudes(self, x: Scalar) -> Complex[Array, " modes"]:
+        """Of the modes at x."""
         return self.amplitudes * jnp.exp(self.exponents * x) + powers(x, len(self.coefficients)) @ self.coefficients
 
     def curves(self) -> Curve:

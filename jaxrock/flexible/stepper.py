@@ -7,11 +7,12 @@ polynomial that answers the motion's Taylor series. Steps end where the series d
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Complex, Inexact, Int
 
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Reset
+from jaxrock.flexible.closeness import approached, mirrored, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
@@ -34,6 +35,8 @@ class FlexibleState(eqx.Module):
     stay: Scalar  # how long the base has rocked on this side [s]
     braked_stay: Scalar  # the stay that the last impact ended [s]
     maxima: Inexact[Array, " six"]  # of rotation, top displacement over L, its bending part; of their negatives
+    closeness: Scalar  # smallest squared distance from standing still in balance (`margin`)
+    closeness_beyond: Scalar  # the same since the balance was last crossed outward
     impacts: Int[Array, ""]
     impacted: Bool[Array, ""]  # just now
     fallen: Bool[Array, ""]
@@ -50,6 +53,9 @@ class FlexibleOutcome(AbstractTable):
     - `max_bending`: largest part of it that is bending [m]; infinite if the block overturned.
     - `impact_count`: impacts within the duration.
     - `overturned`: the verdict, which looks beyond the duration.
+    - `margin`: signed distance to overturning [-], by the rocking part of the motion (its unstable mode and the one
+      that mirrors it, without vibrations): 1 if the base has not turned, positive if the block survives, zero where
+      it comes to balance, negative if it overturns. Of rigid and undamped rocking it is (1 - peak/balance)^2.
     - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself.
     - `status`: a `Status`; `undecided` if, at the end, the energy suffices to overturn but the block is not lost.
     """
@@ -59,13 +65,14 @@ class FlexibleOutcome(AbstractTable):
     max_bending: Scalar
     impact_count: Int[Array, "..."]
     overturned: Bool[Array, "..."]
+    margin: Scalar
     energy: Scalar
     status: Status
 
     @property
     def _columns(self):
         units = {"max_rotation": "rad", "max_displacement": "m", "max_bending": "m"}
-        names = (*units, "impact_count", "overturned", "energy", "status")
+        names = (*units, "impact_count", "overturned", "margin", "energy", "status")
         axes = scenes(self.max_rotation.ndim)
         return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in names}
 
@@ -106,6 +113,8 @@ class FlexibleScene(eqx.Module):
             stay=zero,
             braked_stay=zero,
             maxima=jnp.zeros(6),
+            closeness=zero + 1,
+            closeness_beyond=zero + jnp.inf,
             impacts=count,
             impacted=no,
             fallen=no,
@@ -173,7 +182,9 @@ class FlexibleScene(eqx.Module):
         motion = path.state(x)
         maxima, certain = _maxima(rows, state.maxima, x)
         status = Status.where(certain, state.status, Status.solver_failed)
-        state = eqx.tree_at(lambda s: (s.maxima, s.status), state, (maxima, status))
+        near = approached(path, state.side, self.numbers.balance, x, (state.closeness, state.closeness_beyond))
+        state = eqx.tree_at(lambda s: (s.maxima, s.closeness, s.closeness_beyond, s.status), state,
+                            (maxima, *near, status))  # fmt: skip
         return self._land(state, motion, x * length, slope / length, below, above, at_end & whole, ~certain)
 
     def _land(self, state, motion, elapsed, speed, below, above, piece_over, failed) -> FlexibleState:
@@ -210,6 +221,8 @@ class FlexibleScene(eqx.Module):
             stay=jnp.where(returned, 0.0, stay),
             braked_stay=jnp.where(counts, stay, state.braked_stay),
             maxima=state.maxima,
+            closeness=state.closeness,
+            closeness_beyond=state.closeness_beyond,
             impacts=state.impacts + counts,
             impacted=counts,
             fallen=state.fallen | fallen,
@@ -239,19 +252,35 @@ class FlexibleScene(eqx.Module):
         largest = jnp.maximum(*jnp.split(state.maxima, 2)) * jnp.stack([jnp.ones_like(length), length, length])
         largest = jnp.where(lost, jnp.inf, largest)
         rotation, displacement, bending = largest
-        return FlexibleOutcome(rotation, displacement, bending, state.impacts, lost, total, status)
+        margin = self._margin(state, lost, quiet)
+        return FlexibleOutcome(rotation, displacement, bending, state.impacts, lost, margin, total, status)
+
+    def _amplitudes(self, state: FlexibleState) -> Complex[Array, " modes"]:
+        """Of the modes of the rocking base [rad], about its balance."""
+        n = self.numbers.rotation.size
+        shape = jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
+        return self.rocking.project @ (state.motion - self.numbers.balance * state.side * shape)
 
     def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
         """Whether, without further shaking, the unstable mode outgrows all others from here on."""
-        side, phase = state.side, self.rocking
-        n = self.numbers.rotation.size
-        center = self.numbers.balance * side * jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
-        amplitudes = phase.project @ (state.motion - center)
-        growing = phase.rates.real == jnp.max(phase.rates.real)
+        side, rates = state.side, self.rocking.rates.real
+        amplitudes = self._amplitudes(state)
+        growing = rates == jnp.max(rates)
         outward = side * jnp.sum(jnp.where(growing, amplitudes.real, 0.0))
         others = jnp.sum(jnp.where(growing, 0.0, jnp.abs(amplitudes)))
         quiet = self.time(state) >= self.knots[-1]
         return quiet & (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
+
+    def _margin(self, state: FlexibleState, lost: Bool[Array, ""], quiet: Bool[Array, ""]) -> Scalar:
+        """The closeness that was, and, where the ground rests, that of the swing in which the base is."""
+        grows, decays = mirrored(self.rocking)
+        outward, inward = (state.side * self._amplitudes(state).real[k] for k in (grows, decays))
+        rates = (self.rocking.rates[grows].real, -self.rocking.rates[decays].real)
+        ahead = jnp.where(quiet & (state.side != 0), still_to_come(outward, inward, *rates), jnp.inf)
+        ahead /= self.numbers.balance**2
+        beyond = jnp.where(outward + inward > 0, jnp.minimum(state.closeness_beyond, ahead), ahead)
+        fallen = jnp.where(state.fallen, state.closeness_beyond, beyond)
+        return jnp.where(lost, -fallen, jnp.minimum(state.closeness, ahead))
 
 
 def _maxima(rows, maxima, x):

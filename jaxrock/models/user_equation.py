@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxrock._arguments import arguments
-from jaxrock._guard import guarded
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero
@@ -61,6 +60,12 @@ class Equation(AbstractEquation):
         """What the engine asks of the equation, for one block."""
         return FunctionMoments(self._acceleration, block)
 
+    def at_rest(self, block: Block | Side) -> tuple[Scalar, Scalar]:
+        """Restoring moment and overturning arm just after uplift, which must be positive."""
+        zero = jnp.zeros_like(block.alpha)
+        alone, pushed = (self._acceleration(zero, zero, push, as_functions_see(block)) for push in (zero, zero + 1))
+        return -alone, alone - pushed
+
     @property
     def falls_flat(self) -> bool:
         """As it was given."""
@@ -112,11 +117,9 @@ class FunctionMoments(AbstractMoments):
     def __init__(self, function: Callable, block: Block | Side, factor: Scalar | float | None = None):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
         zero = Angle.of(jnp.zeros_like(block.alpha))
-        self.restoring_at_rest = guarded(
-            self.restoring(zero), self.restoring(zero) <= 0, "The restoring moment must be positive at rotation 0."
-        )
-        self.arm_at_rest = guarded(
-            self.arm(zero), self.arm(zero) <= 0, "The overturning arm must be positive at rotation 0."
+        # What does not stand has no threshold (`standing` raises before).
+        self.restoring_at_rest, self.arm_at_rest = (
+            jnp.where(moment > 0, moment, jnp.nan) for moment in (self.restoring(zero), self.arm(zero))
         )
         self.saddle = first_zero(lambda x: self.restoring(Angle.of(x)), block.alpha)
 

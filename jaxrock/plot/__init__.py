@@ -12,5 +12,5 @@ from jaxrock.plot.regions import feasible_region as feasible_region, search as s
 from jaxrock.plot.responses import history as history, phase as phase
 from jaxrock.plot.rocks import righting as righting, slenderness as slenderness
 from jaxrock.plot.sensitivities import critical as critical, sensitivity_map as sensitivity_map, tornado as tornado
-from jaxrock.plot.style import log_ticks as log_ticks
+from jaxrock.plot.style import broken_curve as broken_curve, log_ticks as log_ticks
 from jaxrock.plot.surfaces import borders as borders, overturning as overturning, spectrum as spectrum

@@ -13,14 +13,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def safety_regions(shape: float, axis: "Axes | None" = None, *, longest: float = 8.0, points: int = 400) -> "Axes":
+def safety_regions(
+    shape: float, axis: "Axes | None" = None, *, longest: float = 8.0, points: int = 400, legend: bool = True
+) -> "Axes":
     """Draw what becomes of a slender block under a single-lobe pulse of one shape, from closed forms.
 
     **Arguments:**
 
     - `shape`: of the pulse, from -inf (rectangle) to +inf (spike).
     - `axis`: matplotlib axis; None makes a figure.
-    - `longest`: largest pulse duration p t_d. `points`: along each curve.
+    - `longest`: largest pulse duration p t_d. `points`: along each curve. `legend`: below the axis, what letters mean.
 
     **Returns:** the axis.
 
@@ -42,9 +44,15 @@ def safety_regions(shape: float, axis: "Axes | None" = None, *, longest: float =
              "$S_2$: safe, peak after the pulse", "$S_1$: safe, peak while it falls")  # fmt: skip
     for lower, upper, color, name in zip(edges, edges[1:], colors, names):
         axis.fill_between(duration, lower, upper, color=color, linewidth=0, label=name)
+        if (room := upper - lower).max() > 0.08:
+            widest = np.argmax(np.where((duration > 0.06 * longest) & (duration < 0.94 * longest), room, -1))
+            middle = (lower[widest] + upper[widest]) / 2
+            letters = {"ha": "center", "va": "center", "color": "white" if name.startswith("$O") else "black"}
+            axis.text(duration[widest], middle, name[:5], **letters)
     axis.plot(duration, curves[2], color="black", linewidth=1.2)
     axis.set(xlim=(0, longest), ylim=(0, 1), xlabel="pulse duration $p\\,t_d$", ylabel="uplift strength $g\\alpha/A_g$")
-    axis.legend(loc="lower right", fontsize=7)
+    if legend:
+        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7, frameon=False)
     return axis
 
 

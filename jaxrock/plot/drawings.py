@@ -123,10 +123,12 @@ def draw(axis: "Axes", body: Body, shapes: Shapes) -> "tuple[Polygon, Line2D, Li
     return outline, column, masses
 
 
-def _between(axis: "Axes", start: np.ndarray, end: np.ndarray, label: str, offset: Any = (0.0, 0.0)) -> None:
+def _between(
+    axis: "Axes", start: np.ndarray, end: np.ndarray, label: str, offset: Any = (0.0, 0.0), ha: str = "center"
+) -> None:
     """A measure: an arrow with two heads and its symbol."""
     axis.annotate("", start, end, arrowprops={"arrowstyle": "<->", "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0})
-    axis.text(*((np.add(start, end)) / 2 + offset), label, ha="center", va="center", fontsize=11)
+    axis.text(*((np.add(start, end)) / 2 + offset), label, ha=ha, va="center", fontsize=11)
 
 
 def _arc(axis: "Axes", centre: np.ndarray, radius: float, first: float, last: float, label: str) -> None:
@@ -158,24 +160,33 @@ def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
     _between(axis, at(-side * (b + gap), 0), at(-side * (b + gap), top), "$2h$", at(-side * 0.8 * gap, 0) - at(0, 0))
     for corner, name in ((body.right, "$O$"), (body.left, "$O'$")):
         axis.text(corner[0] + np.sign(corner[0]) * 0.9 * gap, -0.9 * gap, name, ha="center", va="top", fontsize=11)
-    upright = np.pi / 2 - rotation
+    if modelled:
+        _column_symbols(axis, body, rotation, side)
+        return
+    upright, centre = np.pi / 2 - rotation, at(*body.centre)
     if abs(rotation) > 1e-9:
         axis.plot([pivot[0]] * 2, [0, 0.95 * top], color=GREY, linewidth=0.7, linestyle=":")
         _arc(axis, pivot, 0.8 * top, np.pi / 2, upright, r"$\theta$")
-    if modelled:
-        length, names = body.heights[-1], {True: "$2R$", False: "$R$"}
-        longer = length > 1.5 * np.hypot(*body.centre)
-        name = names[longer] if length > body.centre[1] * (1 + 1e-9) else r"$R\cos\alpha$"
-        foot, head = (turned(np.array([side * 0.5 * gap, y]), np.zeros(2), rotation) for y in (0, length))
-        _between(axis, foot, head, name, (side * (0.7 if len(name) < 5 else 1.7) * gap, 0))
-        return
-    centre = at(*body.centre)
     axis.plot(*np.transpose([pivot, centre]), **_INK)
     axis.plot(*centre, "o", color="black", markersize=4)
     axis.text(*(pivot + 0.62 * (centre - pivot) - [side * 0.5 * gap, 0]), "$R$", ha="center", va="center", fontsize=11)
     axis.text(*(centre + [0, 0.6 * gap]), "$m$", ha="center", va="center", fontsize=11)
     alpha = float(np.arctan2(body.right[0], body.centre[1]))
     _arc(axis, pivot, 0.45 * np.hypot(*body.centre), upright, upright + side * alpha, r"$\alpha$")
+
+
+def _column_symbols(axis: "Axes", body: Body, rotation: float, side: int) -> None:
+    """Length of the column, on the side to which it leans, and its rotation, on the other."""
+    length, gap = body.heights[-1], 0.08 * body.size
+    full = r"$R\cos\alpha$" if length < body.centre[1] * (1 + 1e-9) else "$R$"
+    name = "$2R$" if length > 1.5 * np.hypot(*body.centre) else full
+    foot, head = (turned(np.array([side * 0.5 * gap, y]), np.zeros(2), rotation) for y in (0, length))
+    _between(axis, foot, head, name, (side * 0.35 * gap, 0), "left" if side > 0 else "right")
+    if abs(rotation) > 1e-9:
+        axis.plot([0, 0], [0, length], color=GREY, linewidth=0.7, linestyle=":")
+        _arc(axis, np.zeros(2), 0.8 * length, np.pi / 2, np.pi / 2 - rotation, "")
+        axis.text(-side * 0.3 * gap, 0.8 * length, r"$\theta$", color=RED, ha="right" if side > 0 else "left",
+                  va="center", fontsize=11)  # fmt: skip
 
 
 def _sides(axis: "Axes", body: Body, rotation: float) -> None:

@@ -70,8 +70,8 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
     axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     axes[2].set_ylabel("ground\nacceleration [g]")
     axes[2].set_xlabel("time [s]")
-    for axis in (axes[0], axes[2]):
-        axis.legend(loc="upper right", fontsize=8, frameon=False)
+    axes[0].legend(loc="upper right", fontsize=8, frameon=False)
+    axes[2].legend(loc="upper right", fontsize=8, framealpha=0.9, edgecolor="none")  # the lines go through it
     return axes
 
 

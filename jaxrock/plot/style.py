@@ -1,6 +1,8 @@
-"""Colours that all figures share, and ticks of logarithmic axes."""
+"""Colours that all figures share, curves with gaps, and ticks of logarithmic axes."""
 
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,3 +27,23 @@ def log_ticks(axis: "Axes") -> "Axes":
             ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
             ticks.set_minor_formatter(NullFormatter())
     return axis
+
+
+def broken_curve(axis, abscissa, values, **line):
+    """Draw a curve that has gaps, such as a spectrum where blocks overturn: what stands alone in a gap is a dot.
+
+    **Arguments:**
+
+    - `axis`: matplotlib axis.
+    - `abscissa`, `values`: (n,) each; values that are not finite are gaps.
+    - `line`: colour, style, width and label, as matplotlib names them.
+
+    **Returns:** the line.
+    """
+    abscissa, values = np.asarray(abscissa), np.asarray(values, float)
+    values = np.where(np.isfinite(values), values, np.nan)
+    (drawn,) = axis.plot(abscissa, values, **line)
+    there = np.pad(np.isfinite(values), 1)
+    alone = there[1:-1] & ~there[:-2] & ~there[2:]  # survivors between overturned blocks, of which no line is drawn
+    axis.plot(abscissa[alone], values[alone], ".", color=drawn.get_color(), markersize=4)
+    return drawn

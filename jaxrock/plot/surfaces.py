@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED
+from jaxrock.plot.style import BLUE, GREY, RED, broken_curve
 from jaxrock.responses.arguments import engine_of
 from jaxrock.studies.borders import Region, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
@@ -44,12 +44,11 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     labels = result.uplift_strength if by_duration else result.intensity
     rows = np.atleast_2d(np.asarray(result.overturned))
     for axis, values in zip(axes, (result.max_rotation, result.max_velocity)):
-        values = np.atleast_2d(np.where(np.isfinite(values), values, np.nan))
+        values = np.atleast_2d(np.asarray(values))
         colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(values))) if len(values) > 1 else [BLUE]
         for i, (curve, color) in enumerate(zip(values, colors)):
             label = None if labels is None else f"{float(labels[i]):g}"
-            axis.plot(abscissa, curve, color=color, linewidth=1, label=label)
-            axis.plot(abscissa[alone := _alone(curve)], curve[alone], ".", color=color, markersize=4)
+            broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
         axis.set_ylim(bottom=0)
         lost = rows.any(axis=0)
         if lost.any():
@@ -127,7 +126,7 @@ def overturning(
     colors = dict(zip((-1, 1, 2, 0), (*_STATES, _SAFE[0])))
     shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
     handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
-    axis.legend(handles=handles, loc="upper left", fontsize=8)
+    axis.legend(handles=handles, loc="lower right" if by_duration else "upper left", fontsize=8)
     axis.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()))
     axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
     axis.set_ylabel(
@@ -203,12 +202,6 @@ def _beyond(peaks: np.ndarray) -> np.ndarray:
     moved = [around[i : i + n, j : j + m] for i in range(3) for j in range(3)]
     nearest = np.fmax.reduce(moved)
     return np.where(np.isnan(peaks), nearest, peaks)
-
-
-def _alone(curve: np.ndarray) -> np.ndarray:
-    """Survivors between overturned blocks, of which no line is drawn."""
-    there = np.pad(np.isfinite(curve), 1)
-    return there[1:-1] & ~there[:-2] & ~there[2:]
 
 
 def _without_more(result: Spectrum | OverturningMap) -> None:

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxrock._checks import put_down
+from jaxrock._guard import guarded
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation
-from jaxrock.models.user_equation import Functions
+from jaxrock.models.user_equation import Equation, Functions
 from jaxrock.transforms.user_function import UserFunction
 
 
@@ -39,6 +40,19 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
         return UserFunction.of(node, number, number, number, example) if _is_functions(node) else node
 
     return jax.tree.map(current, model, is_leaf=_is_functions)
+
+
+def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block | AsymmetricBlock:
+    """The block, with a check that it stands by an equation of the user's own (of `current_model`).
+
+    Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
+    """
+    if not isinstance(model, Equation):
+        return block
+    for side in (block,) if isinstance(block, Block) else block.sides:
+        for name, moment in zip(("restoring moment", "overturning arm"), model.at_rest(side)):
+            block = guarded(block, jnp.any(moment <= 0), f"The {name} must be positive at rotation 0.")
+    return block
 
 
 def _is_functions(node) -> bool:

@@ -22,7 +22,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
-from jaxrock.responses.current_model import current_model
+from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
@@ -234,7 +234,7 @@ def simulate(
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model)
-    start = start_of(initial, throw)
+    block, start = standing(block, model), start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     rotation, velocity = _evaluate(path, time)

@@ -23,7 +23,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
-from jaxrock.responses.current_model import current_model
+from jaxrock.responses.current_model import current_model, standing
 from jaxrock.status import Status, marked_result
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.recipe import Passes
@@ -144,7 +144,7 @@ def outcome(
         )
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model)
-    start = start_of(initial, throw)
+    block, start = standing(block, model), start_of(initial, throw)
     result = _outcome(block, padded(motion), model, start, engine)
     return result if throw else marked_result(result, (block, motion, model, start))
 

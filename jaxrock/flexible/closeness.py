@@ -1,0 +1,65 @@
+"""How near a rocking base comes to standing still in balance: of what the margin of a flexible block is made.
+
+About the balance the base moves by an unstable mode, which grows, and the one that mirrors it, which decays; what is
+left are vibrations. Where the ground rests the sign of what grows is the verdict. With amplitudes g and d [rad] the
+distance is sqrt(2 (g^2 + d^2)); a rigid base that turns back at theta has come as near as balance - theta.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact, Int
+
+from jaxrock.flexible.phases import Arc, Phase
+
+Scalar = Inexact[Array, ""]
+_HALVINGS = 40  # of a step, in which the distance is least
+
+
+def mirrored(rocking: Phase) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Which of the modes grows, and which decays as it grows (a little faster, with damping)."""
+    grows = jnp.argmax(rocking.rates.real)
+    return grows, jnp.argmin(jnp.abs(rocking.rates + rocking.rates[grows]))
+
+
+def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tuple[Scalar, Scalar]) -> tuple:
+    """Closeness, and closeness since the balance was last crossed outward, after the step `path` up to x = `end`."""
+    closeness, beyond = before
+    modes = mirrored(path.phase)
+
+    def parts(x):
+        amplitudes = side * path.mode_amplitudes(x).real
+        return tuple(amplitudes[k] for k in modes)
+
+    def distance(x):
+        outward, inward = parts(x)
+        return 2 * (outward**2 + inward**2) / balance**2
+
+    def slope(x):
+        return jax.jvp(distance, (x,), (jnp.ones_like(x),))[1]
+
+    still = jax.lax.stop_gradient(end)
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = (low + high) / 2
+        falls = slope(middle) < 0
+        return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
+
+    # Least where it ceases to fall; the derivative of the least value needs no derivative of its place.
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (0 * still, still))
+    place = jax.lax.stop_gradient((low + high) / 2)
+    rocking = side != 0
+    least = jnp.where(rocking, jnp.minimum(distance(place), distance(end)), jnp.inf)
+    was, now = (sum(parts(x)) > 0 for x in (0 * still, end))
+    beyond = jnp.where(rocking & now, jnp.where(was, jnp.minimum(beyond, least), least), jnp.inf)
+    return jnp.minimum(closeness, least), beyond
+
+
+def still_to_come(outward: Scalar, inward: Scalar, grows: Scalar, decays: Scalar) -> Scalar:
+    """The least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive."""
+    safe = jnp.where(outward == 0, 1.0, outward)
+    time = jnp.log(jnp.maximum(decays * inward**2 / (grows * safe**2), 1.0)) / (2 * (grows + decays))
+    time = jax.lax.stop_gradient(jnp.where(outward == 0, jnp.inf, time))
+    return 2 * (
+        jnp.where(outward == 0, 0.0, outward * jnp.exp(grows * time)) ** 2 + (inward * jnp.exp(-decays * time)) ** 2
+    )
