@@ -57,6 +57,7 @@ def test_units(name, unit):
     [
         ("SA", "`measure` must be one of 'PGA', 'PGV', 'PGD', 'IA', 'CAV', 'SA.period.', 'SV.period.', or a function"),
         ("SA(0)", "`period` must be from 0.001"),
+        (lambda motion: 1 + rk.intensity.arias(motion), "`measure` must grow as a power of a motion's scale"),
         (lambda motion: 3.0, "`measure` must grow as a power of a motion's scale, but is 3, 3 and 3 of a motion"),
         (rk.intensity.significant_duration, "`measure` must grow as a power of a motion's scale"),
         (lambda motion: "x", "`measure` must give one number of a motion"),
