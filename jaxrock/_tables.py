@@ -58,6 +58,19 @@ class AbstractTable(eqx.Module):
         return frame
 
 
+def scenes(ndim: int) -> tuple[str, ...]:
+    """Names of the axes that `jax.vmap` puts in front."""
+    return ("scene",)[:ndim] if ndim < 2 else tuple(f"scene_{i}" for i in range(ndim))
+
+
+def along_time(time, histories: dict[str, tuple[Any, str]]) -> dict[str, Column]:
+    """Columns of histories, each with its unit: over the time of one scene, or sample by sample of many."""
+    many = scenes(np.ndim(time) - 1)
+    axes = (*many, "sample" if many else "time")
+    told = {name: Column(axes, values, unit) for name, (values, unit) in histories.items()}
+    return {"time": Column(axes, time, "s")} | told
+
+
 def is_status(values: Any) -> bool:
     """Whether it is a status, or an array of them."""
     return hasattr(values, "_enumeration")

@@ -114,10 +114,10 @@ def test_certified_least_squares():
     x = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0])
     y = np.array([10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78])
 
-    def at(points, samples):
-        decay = np.exp(-points[:, 1:] * x)
+    def at(point, samples):
+        decay = np.exp(-point[1] * x)
         inside = np.arange(x.size) < samples
-        return (points[:, :1] * (1 - decay) - y) * inside, np.stack([1 - decay, points[:, :1] * x * decay], 2)
+        return (point[0] * (1 - decay) - y) * inside, np.stack([1 - decay, point[0] * x * decay], axis=1)
 
     scale = np.array([500.0, 1e-4])
     problem = Problem(at, scale, np.zeros(2), np.full(2, np.inf))
@@ -132,10 +132,7 @@ def test_certified_least_squares():
 
 def test_a_parameter_that_does_not_show_stays_and_has_no_interval():
     slopes = np.stack([np.ones(20), np.zeros(20)], axis=1)
-    at = lambda points, samples: (
-        points[:, :1] - np.ones(20) + 0.1 * noise(1, 20),
-        np.tile(slopes, (len(points), 1, 1)),
-    )
+    at = lambda point, samples: (point[0] - np.ones(20) + 0.1 * noise(1, 20), slopes)
     scale = np.ones(2)
     found = least_squares(
         Problem(at, scale, -9 * scale, 9 * scale), np.array([3.0, 2.0]), Progression((20,), 0.1, 0.1), 1, 0
@@ -162,11 +159,10 @@ def test_what_a_history_does_not_show_has_no_interval(rotation, untold):
 
 
 def test_a_start_without_a_result_is_given_up():
-    def at(points, samples):
+    def at(point, samples):
         """A line through the origin, that cannot be drawn with a slope below 1.9 (one of the starts)."""
         slope = np.arange(1.0, 10.0)
-        residuals = np.where(points < 1.9, np.inf, (points - 3) * slope)
-        return residuals, np.tile(slope[:, None], (len(points), 1, 1))
+        return np.where(point < 1.9, np.inf, (point - 3) * slope), slope[:, None]
 
     def found(first, starts):
         problem = Problem(at, np.ones(1), -9 * np.ones(1), 9 * np.ones(1))

@@ -7,6 +7,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock._tables import AbstractTable, items_of
+from jaxrock.studies.sensitivities import Slopes
 
 pytest.importorskip("xarray")
 pytest.importorskip("pandas")
@@ -23,6 +24,13 @@ def made(kind, **fields):
         object.__setattr__(result, name, value)
     return result
 
+
+_SLOPES = made(Slopes, value=ONE, derivative=jnp.ones(2), elasticity=jnp.ones(2))
+SENSITIVITY = made(
+    rk.studies.Sensitivity, names=("alpha", "p"), values=jnp.array([0.2, 2.5]), max_rotation=_SLOPES,
+    max_velocity=_SLOPES, margin=_SLOPES, valid=ONE, condition=ONE, graze_distance=ONE, boundary_distance=ONE,
+    outcome=made(rk.responses.Outcome, status=rk.Status.successful),
+)  # fmt: skip
 
 TABLES = {
     "spectrum": made(
@@ -68,6 +76,51 @@ TABLES = {
         rk.inverse.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE,
         status=rk.inverse.RecordStatus.useless_slopes,
     ),
+    "outcomes": made(
+        rk.responses.Outcome, max_rotation=jnp.ones(3), max_velocity=jnp.ones(3), time_of_max=jnp.ones(3),
+        impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3),
+        differentiable=jnp.ones(3, bool), clearance=jnp.ones(3), error=jnp.ones(3), status=STATUS,
+    ),
+    "outcome of a column": made(
+        rk.responses.FlexibleOutcome, max_rotation=ONE, max_displacement=ONE, max_bending=ONE, impact_count=ONE,
+        overturned=ONE, energy=ONE, status=rk.Status.successful,
+    ),
+    "history": made(
+        rk.responses.Response, time=jnp.arange(4.0), rotation=jnp.zeros(4), velocity=jnp.ones(4)
+    ),
+    "history of a column": made(
+        rk.responses.FlexibleResponse, time=jnp.ones((2, 4)), rotation=jnp.zeros((2, 4)),
+        displacement=jnp.ones((2, 4)), bending=jnp.ones((2, 4)),
+    ),
+    "contact": made(
+        rk.responses.Contact, time=jnp.arange(4.0), horizontal=jnp.ones(4), normal=jnp.ones(4), friction=jnp.ones(4)
+    ),
+    "sensitivity": SENSITIVITY,
+    "sensitivities": made(
+        rk.studies.SensitivityMap, uplift_strength=jnp.ones(2), pulse_duration=jnp.ones(3),
+        sensitivity=jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *jnp.shape(x))), SENSITIVITY),
+    ),
+    "suite": made(
+        rk.hazard.SuiteOutcomes, suite=rk.motions.Suite([RECORD, 2 * RECORD], ["one", "two"]), facing=(1, -1),
+        scale=np.array([1.0, 2.0, 3.0]), verdict=np.zeros((2, 3, 2, 4), np.int8), rotation=np.ones((2, 3, 2, 4)),
+        margin=np.ones((2, 3, 2, 4)),
+    ),
+    "simulated fragility": made(
+        rk.hazard.SimulatedFragility, levels=jnp.array([0.1, 0.2]), verdict=np.ones((3, 2, 5), np.int8),
+        peak_acceleration=jnp.ones(3), peak_velocity=jnp.ones(3), names=("a", "b", "c"), measure="PGA",
+    ),
+    "fragility": made(
+        rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=jnp.eye(2),
+        log_likelihood=ONE, highest_survived=ONE, lowest_toppled=ONE, status=rk.hazard.FitStatus.separable,
+    ),
+    "probit": made(
+        rk.hazard.ProbitFit, names=("PGA", "PGV"), intercept=ONE, slopes=jnp.ones(2), covariance=jnp.eye(3),
+        log_likelihood=ONE, status=rk.hazard.FitStatus.successful,
+    ),
+    "calibration": made(
+        rk.inverse.BlockCalibration, values={"alpha": ONE, "alpha_sd": ONE}, covariance=jnp.eye(2), log_likelihood=ONE,
+        status=rk.inverse.CalibrationStatus.at_an_end,
+    ),
     "history fit": made(
         rk.inverse.HistoryFit, names=("p",), values=np.ones(1), covariance=np.eye(1), robust_covariance=np.eye(1),
         scatter=0.1, residuals=np.ones(9), misfit=1.0, correlated=False, status=rk.inverse.HistoryStatus.not_identified,
@@ -112,6 +165,23 @@ def test_values_are_where_they_belong():
     assert TABLES["estimate"].to_pandas().loc["period", "value"] == 0.8
     assert TABLES["posterior"].to_xarray()["amplitude"].attrs["units"] == "g"
     np.testing.assert_array_equal(TABLES["found record"].to_xarray()["time"], [0.0, 0.5, 1.0])
+
+
+def test_slopes_are_told_by_parameter():
+    data = TABLES["sensitivities"].to_xarray()
+    assert data["margin"].dims == ("uplift_strength", "pulse_duration")
+    assert data["max_rotation_derivative"].dims == ("uplift_strength", "pulse_duration", "parameter")
+    assert TABLES["sensitivity"].to_pandas().loc["p", "at"] == 2.5
+
+
+def test_many_scenes_have_a_row_each():
+    """Those of `jax.vmap` are numbered; each history has its own time."""
+    alphas = jnp.array([0.1, 0.2, 0.3])
+    found = jax.vmap(lambda alpha: rk.outcome(rk.Block(alpha, 2.5), rk.SinePulse(0.3, 0.8)))(alphas)
+    frame = found.to_pandas()
+    np.testing.assert_array_equal(frame["max_rotation"], found.max_rotation)
+    assert frame.index.name == "scene" and frame["status"].tolist() == ["successful"] * 3
+    assert TABLES["history of a column"].to_xarray()["time"].dims == ("scene", "sample")
 
 
 def test_a_grid_in_pandas():

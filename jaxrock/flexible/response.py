@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import Values, marked, scalar, span
-from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
+from jaxrock._tables import AbstractTable, along_time
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
@@ -24,7 +24,7 @@ from jaxrock.transforms.differentiation import differentiable
 Scalar = Inexact[ArrayLike, "..."]
 
 
-class FlexibleResponse(eqx.Module):
+class FlexibleResponse(AbstractTable):
     """The history of a flexible block; call it with times to evaluate it anywhere.
 
     - `time`, `rotation`, `displacement`, `bending`: (samples,) [s], base rotation [rad], displacement of the top
@@ -40,7 +40,10 @@ class FlexibleResponse(eqx.Module):
     outcome: FlexibleOutcome
     trajectory: Trajectory = eqx.field(repr=False)
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        units = {"rotation": "rad", "displacement": "m", "bending": "m"}
+        return along_time(self.time, {name: (getattr(self, name), unit) for name, unit in units.items()})
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Base rotation [rad], displacement of the top [m], and its bending part [m].

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact, Int
 
-from jaxrock._described import described
+from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
@@ -45,7 +45,7 @@ class FlexibleState(eqx.Module):
     steps: Int[Array, ""]
 
 
-class FlexibleOutcome(eqx.Module):
+class FlexibleOutcome(AbstractTable):
     """What came of a flexible block within a duration.
 
     - `max_rotation`: largest |rotation| of the base [rad]; infinite if the block overturned.
@@ -69,7 +69,12 @@ class FlexibleOutcome(eqx.Module):
     energy: Scalar
     status: Status
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        units = {"max_rotation": "rad", "max_displacement": "m", "max_bending": "m"}
+        names = (*units, "impact_count", "overturned", "energy", "status")
+        axes = scenes(self.max_rotation.ndim)
+        return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in names}
 
 
 class FlexibleScene(eqx.Module):

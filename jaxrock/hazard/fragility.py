@@ -22,6 +22,7 @@ from jaxrock._checks import (
     together,
 )
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock._tables import AbstractTable, Column, scenes
 
 Real = Inexact[Array, "..."]
 
@@ -157,7 +158,7 @@ class FitStatus(eqx.Enumeration):
     not_converged = "The maximum of the likelihood was not found."
 
 
-class FragilityFit(eqx.Module):
+class FragilityFit(AbstractTable):
     """What `fit_fragility` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     - `fragility`: the `LogNormalFragility` of largest likelihood.
@@ -175,6 +176,17 @@ class FragilityFit(eqx.Module):
     highest_survived: Inexact[Array, ""]
     lowest_toppled: Inexact[Array, ""]
     status: FitStatus
+
+    @property
+    def _columns(self):
+        own = "that of the levels"
+        units = {"median": own, "highest_survived": own, "lowest_toppled": own}
+        errors = jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+        told = {"median": self.fragility.median, "dispersion": self.fragility.dispersion}
+        told |= {f"standard_error_of_ln_{name}": errors[..., i] for i, name in enumerate(("median", "dispersion"))}
+        told |= {n: getattr(self, n) for n in ("log_likelihood", "highest_survived", "lowest_toppled", "status")}
+        axes = scenes(self.log_likelihood.ndim)
+        return {name: Column(axes, values, units.get(name, "-")) for name, values in told.items()}
 
 
 def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> FragilityFit:

@@ -13,10 +13,11 @@ from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, not_negative, positive, shown
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line
 
 
-class ProbitFit(eqx.Module):
+class ProbitFit(AbstractTable):
     """What `fit_probit` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     P = Phi(intercept + sum of slopes times ln measure).
@@ -33,6 +34,17 @@ class ProbitFit(eqx.Module):
     covariance: Float[Array, "terms terms"]
     log_likelihood: Float[Array, ""]
     status: FitStatus
+
+    @property
+    def _columns(self):
+        terms = np.array(["intercept", *self.names])
+        return {
+            "term": Column(("term",), terms),
+            "value": Column(("term",), jnp.concatenate([self.intercept[None], self.slopes])),
+            "standard_error": Column(("term",), self.standard_errors),
+            "log_likelihood": Column((), self.log_likelihood),
+            "status": Column((), self.status),
+        }
 
     @property
     def standard_errors(self) -> Float[Array, " terms"]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int8
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, one_of
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import FitStatus, FragilityFit, TabulatedFragility, fit_fragility, probit, rising_list
@@ -37,7 +38,7 @@ def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
     return np.sum(verdict != STOOD if upper else verdict == TOPPLED, axis=-1).astype(float)
 
 
-class SimulatedFragility(eqx.Module):
+class SimulatedFragility(AbstractTable):
     """What became of blocks under scaled motions.
 
     - `levels`: (levels,) of the measure; `measure`: "PGA" [g] or "PGV" [m/s].
@@ -52,6 +53,14 @@ class SimulatedFragility(eqx.Module):
     peak_velocity: Float[Array, " motions"]
     names: tuple[str, ...] = eqx.field(static=True)
     measure: str = eqx.field(static=True)
+
+    @property
+    def _columns(self):
+        axes, unit = ("motion", "level"), {"PGA": "g", "PGV": "m/s"}[self.measure]
+        rows = {name: values.reshape(self.verdict.shape[:2]) for name, values in self.table().items()}
+        told = {"motion": Column(("motion",), np.array(self.names)), "level": Column(("level",), self.levels, unit)}
+        units = {"peak_acceleration": "g", "peak_velocity": "m/s"}
+        return told | {name: Column(axes, rows[name], units.get(name, "-")) for name in rows if name not in axes}
 
     @property
     def undecided(self) -> int:

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int8
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import Values, checked, positive, shown, size
 from jaxrock._parameters import leaves_of
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -27,7 +28,7 @@ from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stac
 _FACINGS = {"one": (1,), "both": (1, -1)}
 
 
-class SuiteOutcomes(eqx.Module):
+class SuiteOutcomes(AbstractTable):
     """What became of blocks under the motions of a suite.
 
     - `suite`, `blocks` (with parameters of shape (blocks,)), `scale`: (scales,); `facing`: (facings,) 1 as recorded, -1
@@ -45,6 +46,14 @@ class SuiteOutcomes(eqx.Module):
     verdict: Int8[np.ndarray, "motions scales facings blocks"]
     rotation: Float[np.ndarray, "motions scales facings blocks"]
     margin: Float[np.ndarray, "motions scales facings blocks"]
+
+    @property
+    def _columns(self):
+        axes = {"motion": self.suite.names, "scale": self.scale, "facing": self.facing,
+                "block": np.arange(self.verdict.shape[3])}  # fmt: skip
+        results = {"verdict": self.verdict, "rotation_over_alpha": self.rotation, "margin": self.margin}
+        told = {name: Column((name,), np.asarray(values)) for name, values in axes.items()}
+        return told | {name: Column((*axes,), values) for name, values in results.items()}
 
     @property
     def undecided(self) -> int:

@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, known, list_of
 from jaxrock._checks import Values, as_real, below_one, share, shown, whole
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
 from jaxrock.inverse.unknowns import Unknown
@@ -37,7 +38,7 @@ class CalibrationStatus(eqx.Enumeration):
     not_converged = "The maximum of the likelihood was not found, or is flat: some parameter is not told by the tests."
 
 
-class BlockCalibration(eqx.Module):
+class BlockCalibration(AbstractTable):
     """What `calibrate_block` finds.
 
     - `values`: the most probable ones by name; of a parameter with scatter its median, and `name_sd`.
@@ -58,6 +59,16 @@ class BlockCalibration(eqx.Module):
     toppled: Float[Array, " tests"]
     status: CalibrationStatus
     problem: "_Problem"
+
+    @property
+    def _columns(self):
+        return {
+            "parameter": Column(("parameter",), np.array([*self.values])),
+            "value": Column(("parameter",), np.array([*self.values.values()]), "that of the parameter"),
+            "standard_error": Column(("parameter",), jnp.sqrt(jnp.diag(self.covariance)), "that of its place"),
+            "log_likelihood": Column((), self.log_likelihood),
+            "status": Column((), self.status),
+        }
 
     @property
     def standard_errors(self) -> dict[str, Float[Array, ""]]:

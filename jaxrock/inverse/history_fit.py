@@ -1,6 +1,6 @@
 """Fits to measured histories: the block and the motion that make a simulated rotation follow a measured one.
 
-Least squares by Levenberg and Marquardt, from many starts at once, with exact derivatives of whole histories. A wrong
+Least squares of SciPy from many starts, with exact derivatives of whole histories by all parameters. A wrong
 period puts a simulated history out of phase, and sums of squares have a minimum at every slip by a cycle: so the fit
 begins with a short window of the data and goes on with longer ones, each from where the one before has ended.
 """
@@ -20,7 +20,7 @@ from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.history_scene import FittedScene, histories
+from jaxrock.inverse.history_scene import FittedScene, history
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
@@ -160,7 +160,7 @@ def fit_history(
 
     **Raises:** ValueError for arguments outside their ranges, or names that the scene does not have.
 
-    **Source:** Marquardt (1963); Nielsen (1999), the damping; Brockwell & Davis (1991), 8.1, correlated residuals.
+    **Source:** Branch, Coleman & Li (1999), by SciPy; Brockwell & Davis (1991), 8.1, correlated residuals.
     """
     if np.size(rotation) == 0:
         raise ValueError("Argument `rotation` must hold measurements, but is empty.")
@@ -169,12 +169,12 @@ def fit_history(
     time, rotation, weight = _data(time, rotation, scatter, 2 * len(scene.names))
     places = np.arange(time.size)
 
-    def at(points: np.ndarray, samples: int):
+    def at(point: np.ndarray, samples: int):
         """Weighted residuals and their derivatives in a window of the data."""
-        fitted, slopes, known = map(np.asarray, histories(jnp.asarray(points), time, time[samples - 1], scene))
+        fitted, slopes, known = map(np.asarray, history(jnp.asarray(point), time, time[samples - 1], scene))
         inside = np.where(places < samples, weight, 0.0)
         residuals = np.where(inside > 0, (rotation - fitted) * inside, 0.0)
-        return np.where(known[:, None], residuals, np.inf), -slopes * inside[:, None]
+        return np.where(known, residuals, np.inf), -slopes * inside[:, None]
 
     first, scale, lower, upper = scene.coordinates()
     if not ((lower < first) & (first < upper)).all():

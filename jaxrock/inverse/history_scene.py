@@ -152,16 +152,12 @@ def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | Asym
 
 
 @jax.jit
-def histories(points, time, until, scene: FittedScene):
-    """Of every start: rotations, their derivatives by the coordinates, and whether there is a history."""
+def history(point, time, until, scene: FittedScene):
+    """Of one point: rotations, their derivatives by the coordinates, and whether there is a history."""
 
-    def one(point):
-        def value_twice(point):
-            rotation, known = scene.rotation(point, time, until)
-            return rotation, (rotation, known)
+    def value_twice(point):
+        rotation, known = scene.rotation(point, time, until)
+        return rotation, (rotation, known)
 
-        slopes, (rotation, known) = jax.jacfwd(value_twice, has_aux=True)(point)
-        good = known & jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(slopes))
-        return rotation, slopes, good
-
-    return jax.vmap(one)(points)
+    slopes, (rotation, known) = jax.jacfwd(value_twice, has_aux=True)(point)
+    return rotation, slopes, known & jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(slopes))

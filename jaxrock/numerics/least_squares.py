@@ -1,22 +1,26 @@
-"""Nonlinear least squares from many starts at once, and the covariance of what it finds.
+"""Nonlinear least squares from scattered starts, window after window, and the covariance of what they find.
 
-Residuals and their derivatives come from one compiled function of all starts; the small algebra is done here.
+The steps are those of SciPy (a region of trust that bounds reflect); the windows, the holding and the covariance are
+done here.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Float
 
-_MOST_STEPS, _FEW_STEPS = 60, 8  # of the last window, and of one on the way
+_MOST_STEPS, _FEW_STEPS = 100, 12  # of the last window, and of one on the way; one that is refused counts
 _TIGHT, _LOOSE = 1e-10, 1e-2  # relative gain in a step, below which it is the last one there
+_STILL = 1e-9  # of the size of all parameters: a step that is none
 _UNDETERMINED = 1e10  # variance of what the data do not tell, in squares of its natural size
-_TO_THE_BOUND = 0.9  # share of the way to a bound that one step may go
+_TO_THE_BOUND = 0.9  # share of the way to a bound that a start is scattered
 
 
 class Problem(NamedTuple):
-    """What is to be made small: `at(points, samples)` gives residuals (starts, n) and their derivatives.
+    """What is to be made small: `at(point, samples)` gives residuals (n,) and their derivatives.
 
     Residuals past the first `samples` are zero; of a point that has no result they are infinite. `scale`, `lower` and
     `upper` are (parameters,): their natural size, and the open interval that they stay in.
@@ -37,6 +41,20 @@ class Progression(NamedTuple):
     windows: tuple[int, ...]
     spread: float
     noise: float
+
+
+class End(NamedTuple):
+    """Where a start has come to: its point, residuals and derivatives there, and whether that is a minimum."""
+
+    point: Float[np.ndarray, " parameters"]
+    residuals: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n parameters"]
+    converged: bool
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(np.sum(self.residuals**2))
 
 
 class Minimum(NamedTuple):
@@ -66,22 +84,25 @@ def least_squares(problem: Problem, first: np.ndarray, progression: Progression,
     - `first`: (parameters,) the first start; the others lie around it by the spread of the progression.
     - `starts`: how many. `seed`: of their random numbers.
 
-    **Source:** Marquardt (1963); the damping by Nielsen (1999).
+    **Source:** Branch, Coleman & Li (1999), by SciPy.
     """
     noise = np.random.default_rng(seed).normal(size=(starts, first.size)) * (np.arange(starts) > 0)[:, None]
     points = _inside(problem, np.tile(first, (starts, 1)), noise * progression.spread * problem.scale)
+    ends = [_through_windows(problem, point, progression) for point in points]
+    costs = np.array([end.cost for end in ends])
+    best = ends[int(np.argmin(costs))]
+    # What is so near is the same minimum, to a thirtieth of the standard errors.
+    near = costs <= best.cost * (1 + 1e-6) + 1e-3 * progression.noise**2
+    share = float(np.mean(near)) if np.isfinite(best.cost) else 0.0
+    return Minimum(*best, share)
+
+
+def _through_windows(problem: Problem, point: np.ndarray, progression: Progression) -> End:
+    """Where a start comes to, from the first window to the last."""
     *early, last = progression.windows
     for samples in early:
-        points = _descend(problem, points, samples, (progression.noise / progression.spread) ** 2, _FEW_STEPS, _LOOSE)[
-            0
-        ]
-    points, residuals, jacobian, converged = _descend(problem, points, last, 0.0, _MOST_STEPS, _TIGHT)
-    costs = np.sum(residuals**2, axis=1)
-    best = int(np.argmin(costs))
-    # What is so near is the same minimum, to a thirtieth of the standard errors.
-    near = costs <= costs[best] * (1 + 1e-6) + 1e-3 * progression.noise**2
-    share = float(np.mean(near)) if np.isfinite(costs[best]) else 0.0
-    return Minimum(points[best], residuals[best], jacobian[best], bool(converged[best]), share)
+        point = _descend(problem, point, samples, progression.noise / progression.spread, _FEW_STEPS, _LOOSE).point
+    return _descend(problem, point, last, 0.0, _MOST_STEPS, _TIGHT)
 
 
 def _inside(problem: Problem, points: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -90,57 +111,31 @@ def _inside(problem: Problem, points: np.ndarray, steps: np.ndarray) -> np.ndarr
     return points + np.where(np.abs(steps) < _TO_THE_BOUND * np.abs(room), steps, _TO_THE_BOUND * room)
 
 
-def _descend(problem: Problem, points: np.ndarray, samples: int, hold: float, most: int, enough: float):
-    """Steps of Levenberg and Marquardt of all starts together: points, residuals, derivatives, and which converged.
+def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, most: int, enough: float) -> End:
+    """The minimum that SciPy finds from one start in a window. `hold`: by how much it is held where it began."""
 
-    `hold`: weight of the squared relative distance from where a start began.
-    """
-    begun = points
-    residuals, jacobian = problem.at(points, samples)
+    @functools.lru_cache(maxsize=2)  # residuals and derivatives come together and are asked for apart
+    def at(place: tuple[float, ...]):
+        residuals, jacobian = problem.at(np.array(place), samples)
+        return residuals, np.nan_to_num(jacobian)
 
-    def cost(points, residuals):
-        return np.sum(residuals**2, axis=1) + hold * np.sum(((points - begun) / problem.scale) ** 2, axis=1)
+    held = hold * np.diag(1 / problem.scale)
 
-    costs = cost(points, residuals)
-    damping, growth = np.full(len(points), 1e-3), np.full(len(points), 2.0)
-    done = ~np.isfinite(costs)
-    for _ in range(most):
-        if done.all():
-            break
-        steps, gains = _damped_steps(problem, points, residuals, jacobian, begun, hold, damping)
-        trial = _inside(problem, points, np.where(done[:, None], 0.0, steps))
-        new_residuals, new_jacobian = problem.at(trial, samples)
-        new_costs = cost(trial, new_residuals)
-        better = ~done & (new_costs < costs)
-        fall = np.subtract(costs, new_costs, out=np.zeros_like(costs), where=better)
-        ratio = fall / np.maximum(gains, 1e-300)
-        small = np.max(np.abs(trial - points) / problem.scale, axis=1) < 1e-9
-        # The sum of squares can fall no more, or does so no more.
-        ended = (gains <= enough * costs) | (better & (fall <= enough * costs)) | small
-        points = np.where(better[:, None], trial, points)
-        residuals = np.where(better[:, None], new_residuals, residuals)
-        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
-        costs = np.where(better, new_costs, costs)
-        damping = np.where(better, damping * np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), damping * growth)
-        damping, growth = np.minimum(damping, 1e15), np.minimum(np.where(better, 2.0, 2 * growth), 1e15)
-        done |= ended
-    return points, residuals, jacobian, done & np.isfinite(costs)
+    def residuals(point):
+        return np.concatenate([at(tuple(point))[0], held @ (point - begun)])
 
+    def slopes(point):
+        return np.concatenate([at(tuple(point))[1], held])
 
-def _damped_steps(problem: Problem, points, residuals, jacobian, begun, hold: float, damping):
-    """Damped Gauss-Newton steps, and the gains in the sum of squares that they promise."""
-    slopes = np.nan_to_num(jacobian) * problem.scale
-    errors = np.where(np.isfinite(residuals), residuals, 0.0)
-    normal = np.einsum("sni,snj->sij", slopes, slopes) + hold * np.eye(problem.scale.size)
-    gradient = np.einsum("sni,sn->si", slopes, errors) + hold * (points - begun) / problem.scale
-    diagonal = np.einsum("sii->si", normal)
-    # A parameter that the data do not show stays where it is.
-    floor = 1e-12 * np.maximum(diagonal.max(axis=1, keepdims=True), 1e-280)
-    ridge = damping[:, None] * diagonal + floor
-    damped = normal + ridge[:, :, None] * np.eye(problem.scale.size)
-    steps = -np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-    gains = np.sum(steps * (ridge * steps - gradient), axis=1)
-    return steps * problem.scale, gains
+    first, first_slopes = at(tuple(begun))
+    has_result = bool(np.isfinite(first).all())
+    if not has_result or not np.any(first @ first_slopes):
+        return End(begun, first, first_slopes, has_result)  # given up, or there is nowhere to go
+    bounds = problem.lower, problem.upper
+    found = scipy.optimize.least_squares(
+        residuals, begun, slopes, bounds, x_scale=problem.scale, ftol=enough, xtol=_STILL, gtol=None, max_nfev=most
+    )
+    return End(found.x, *at(tuple(found.x)), found.status > 0)
 
 
 def covariance(minimum: Minimum, scale: np.ndarray, scatter_is_known: bool) -> Covariance:

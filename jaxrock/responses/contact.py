@@ -1,14 +1,13 @@
 """Whether pure rocking is a fair model: the friction that it needs, and whether the block stays on the ground."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
-from jaxrock._described import described
 from jaxrock._parameters import check_single
+from jaxrock._tables import AbstractTable, along_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block
@@ -21,7 +20,7 @@ Scalar = Inexact[ArrayLike, ""]
 _WITHIN = 8  # parts of each step at whose ends the extremes are looked for
 
 
-class Contact(eqx.Module):
+class Contact(AbstractTable):
     """Forces of the ground on a block, over its weight, and what they need.
 
     - `time`: (samples,) those of the response [s].
@@ -43,7 +42,10 @@ class Contact(eqx.Module):
     largest_friction: Scalar
     least_normal: Scalar
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        names = ("horizontal", "normal", "friction")
+        return along_time(self.time, {name: (getattr(self, name), "-") for name in names})
 
     @property
     def keeps_contact(self):

@@ -11,6 +11,7 @@ from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
+from jaxrock._tables import AbstractTable, along_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state, surpasses
@@ -43,7 +44,7 @@ class Summary(eqx.Module):
     __repr__ = described
 
 
-class Response(eqx.Module):
+class Response(AbstractTable):
     """The history of a scene; call it with times to evaluate it anywhere: `rotation, velocity = response(t)`.
 
     - `time`, `rotation`, `velocity`: (samples,) equally spaced history [s], [rad], [rad/s].
@@ -62,7 +63,9 @@ class Response(eqx.Module):
     summary: Summary
     trajectory: Trajectory = eqx.field(repr=False)
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        return along_time(self.time, {"rotation": (self.rotation, "rad"), "velocity": (self.velocity, "rad/s")})
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Rotation and angular velocity.

@@ -2,15 +2,14 @@
 
 from typing import Annotated
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
+from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state
@@ -32,7 +31,7 @@ from jaxrock.transforms.recipe import Passes
 Scalar = Inexact[ArrayLike, "..."]
 
 
-class Outcome(eqx.Module):
+class Outcome(AbstractTable):
     """What came of a scene: the motion, and the free stage after it to its end.
 
     - `max_rotation`: largest |rotation| [rad]; infinite if the block overturned.
@@ -75,7 +74,11 @@ class Outcome(eqx.Module):
     error: Scalar
     status: Status
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        units = {"max_rotation": "rad", "max_velocity": "rad/s", "time_of_max": "s", "clearance": "rad", "error": "rad"}
+        axes = scenes(self.max_rotation.ndim)
+        return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in self.__dataclass_fields__}
 
 
 @arguments

@@ -7,8 +7,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan, scalar
-from jaxrock._described import described
 from jaxrock._parameters import check_single
+from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import uplift_threshold
@@ -40,7 +40,7 @@ class Slopes(eqx.Module):
     elasticity: Inexact[Array, "... parameters"]
 
 
-class Sensitivity(eqx.Module):
+class Sensitivity(AbstractTable):
     """What `sensitivity` finds.
 
     - `names`, `values`: the parameters; the last, where the motion is a pulse or a record, is `uplift_strength`.
@@ -66,9 +66,26 @@ class Sensitivity(eqx.Module):
     graze_distance: Scalar
     boundary_distance: Scalar
 
-    __repr__ = described
+    @property
+    def _columns(self):
+        return _table(self, scenes(self.condition.ndim))
 
 
+def _table(found: Sensitivity, axes: tuple[str, ...]) -> dict[str, Column]:
+    """Results over the axes of scenes, their slopes over those and the parameters."""
+    over = (*axes, "parameter")
+    told = {"parameter": Column(("parameter",), found.names), "at": Column(over, found.values, _OWN)}
+    for name, unit in {"max_rotation": "rad", "max_velocity": "rad/s", "margin": "-"}.items():
+        slopes = getattr(found, name)
+        told[name] = Column(axes, slopes.value, unit)
+        told[f"{name}_derivative"] = Column(over, slopes.derivative, f"{unit} over {_OWN}")
+        told[f"{name}_elasticity"] = Column(over, slopes.elasticity)
+    names = ("valid", "condition", "graze_distance", "boundary_distance")
+    told |= {name: Column(axes, getattr(found, name)) for name in names}
+    return told | {"status": Column(axes, found.outcome.status)}
+
+
+_OWN = "that of the parameter"
 _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 
 
@@ -138,7 +155,7 @@ def sensitivity(
     )
 
 
-class SensitivityMap(eqx.Module):
+class SensitivityMap(AbstractTable):
     """Sensitivities of a block under the exponential pulse; results have the shape (strengths, durations).
 
     - `uplift_strength`, `pulse_duration`: the axes, threshold/amplitude and p t_d [-]; `shape` of the pulse.
@@ -149,6 +166,11 @@ class SensitivityMap(eqx.Module):
     pulse_duration: Float[Array, " columns"]
     shape: Float[Array, ""]
     sensitivity: Sensitivity
+
+    @property
+    def _columns(self):
+        axes = ("uplift_strength", "pulse_duration")
+        return {name: Column((name,), getattr(self, name)) for name in axes} | _table(self.sensitivity, axes)
 
 
 @arguments
