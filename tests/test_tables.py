@@ -83,7 +83,7 @@ TABLES = {
     ),
     "outcome of a column": made(
         rk.responses.FlexibleOutcome, max_rotation=ONE, max_displacement=ONE, max_bending=ONE, impact_count=ONE,
-        overturned=ONE, energy=ONE, status=rk.Status.successful,
+        overturned=ONE, margin=ONE, energy=ONE, status=rk.Status.successful,
     ),
     "history": made(
         rk.responses.Response, time=jnp.arange(4.0), rotation=jnp.zeros(4), velocity=jnp.ones(4)

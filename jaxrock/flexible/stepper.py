@@ -72,7 +72,7 @@ class FlexibleOutcome(AbstractTable):
     @property
     def _columns(self):
         units = {"max_rotation": "rad", "max_displacement": "m", "max_bending": "m"}
-        names = (*units, "impact_count", "overturned", "energy", "status")
+        names = (*units, "impact_count", "overturned", "margin", "energy", "status")
         axes = scenes(self.max_rotation.ndim)
         return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in names}
 
