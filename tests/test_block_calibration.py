@@ -102,6 +102,23 @@ def test_rotations_say_more_than_verdicts(found):
         assert abs(np.log(float(more.values[name]) / truth)) < 3 * float(more.standard_errors[name])
 
 
+def test_names_in_any_order():
+    """Two parameters and a scatter: where the likelihood is largest does not hang on the order of their names."""
+    unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}
+    given = {"cells": {"alpha": 32, "p": 8}, "progress": False}
+    found = [
+        rk.inverse.calibrate_block(
+            rk.Block, SUITE, FELL, {name: unknowns[name] for name in order}, {"alpha": SPREAD}, **given
+        )
+        for order in (("alpha", "p"), ("p", "alpha"))
+    ]
+    for name in ("alpha", "p", "alpha_sd"):
+        assert float(found[0].values[name]) == pytest.approx(float(found[1].values[name]), rel=1e-6)
+    truth = found[0].log_density({"alpha": ALPHA, "alpha_sd": SCATTER, "p": P})
+    assert float(found[0].log_likelihood) > float(truth) - 0.1
+    assert abs(np.log(float(found[0].values["p"]) / P)) < 3 * float(found[0].standard_errors["p"]) < 1
+
+
 @pytest.mark.slow
 def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
     make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)

@@ -226,13 +226,14 @@ def calibrate_block(
     suite = motions if isinstance(motions, Suite) else Suite(motions)
     axes = _axes(unknowns, scatter, cells)
     places = {**unknowns, **{f"{name}_sd": each for name, each in scatter.items() if isinstance(each, Unknown)}}
+    places = {name: places[name] for name in sorted(places)}  # as JAX orders what a program is given
     seen, ways, told = _tests(len(suite), toppled, facing, rotation)
     lanes, dealt = _blocks(block, axes), _dealt(groups, len(suite), folds)
     found = scenes(
         lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
     )
     table = Table.of(found, seen, ways, told, rotation_sd, tuple(axis.count for axis in axes.values()))
-    problem = _Problem(dict(places), axes, table, lapse)
+    problem = _Problem(places, axes, table, lapse)
     return _fitted(problem, dealt)
 
 
@@ -250,7 +251,9 @@ def _axes(unknowns, scatter, cells) -> dict[str, Axis]:
         raise ValueError(f"Argument `cells` must have some of the names {sorted(unknowns)}, but has {sorted(cells)}.")
     counts = cells if isinstance(cells, Mapping) else dict.fromkeys(unknowns, cells)
     counts = {name: whole("cells", count, 8, 4096) for name, count in counts.items()}
-    return {name: Axis.of(name, each, scatter.get(name), counts.get(name, 64)) for name, each in unknowns.items()}
+    return {
+        name: Axis.of(name, each, scatter.get(name), counts.get(name, 64)) for name, each in sorted(unknowns.items())
+    }
 
 
 def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
