@@ -211,6 +211,14 @@ def test_figure_of_a_fragility():
 RECORD = rk.Record([0.0, 0.3, 0.0], 0.4)
 
 
+def test_motions_of_one_name_are_numbered():
+    """They would be taken for one, where outcomes are grouped by motions."""
+    named = rk.Record([0.1, -0.2, 0.0], 0.5, "station")
+    found = rk.motions.Suite([RECORD, 2 * RECORD, rk.SinePulse(0.3, 0.8), named, 0.5 * named])
+    assert found.names == ("Record", "Scaled", "SinePulse", "station 1", "station 2")
+    assert rk.motions.Suite([RECORD, RECORD]).names == ("Record 1", "Record 2")
+
+
 @pytest.mark.parametrize(
     "call, message",
     [

@@ -1,5 +1,6 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated
 
@@ -66,7 +67,7 @@ class Suite(eqx.Module):
             self.turns = len(motions) // records
         self.groups = tuple(map(_ensemble, motions))
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
-        self.names = tuple(own if names is None else names)
+        self.names = tuple(_numbered(own) if names is None else names)
         if len(self.names) != len(own):
             raise ValueError(f"Argument `names` must name {len(own)} motions, but has {len(self.names)} names.")
         self.sources = self.names if sources is None else sources
@@ -121,8 +122,20 @@ def size_of(group: AbstractMotion) -> int:
 
 
 def _names(motion: AbstractMotion, size: int) -> list[str]:
-    name = getattr(motion, "name", "") or type(motion).__name__
+    inner = motion
+    while not getattr(inner, "name", "") and hasattr(inner, "motion"):
+        inner = inner.motion  # of one that is scaled, say
+    name = getattr(inner, "name", "") or type(motion).__name__
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
+
+
+def _numbered(names: list[str]) -> list[str]:
+    """The same, with a number where several are alike: names tell which outcomes go together."""
+    alike, seen, found = Counter(names), Counter[str](), []
+    for name in names:
+        seen[name] += 1
+        found.append(f"{name} {seen[name]}" if alike[name] > 1 else name)
+    return found
 
 
 def _each(measure: Callable, group: AbstractMotion):
