@@ -54,7 +54,8 @@ def test_the_equation_is_newtons(radius):
     moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
     wheel = Wheel(alpha, p, ratio, radius, 0.9)
     for opening, speed, push, lift in ((0.0, 0.4, 0.5, 0.0), (0.25, 1.0, -0.2, 0.3), (0.7, 2.0, 0.1, -0.4)):
-        told = p**2 * moments.acceleration(Angle.of(opening), speed / p, push, 1 + lift)
+        given = (jnp.asarray(x) for x in (speed / p, push, 1 + lift))
+        told = p**2 * moments.acceleration(Angle.of(opening), *given)
         assert float(told) == pytest.approx(wheel.forces(opening, speed, push, lift)[0], rel=1e-12)
     assert float(moments.threshold) == pytest.approx(np.tan(alpha), rel=1e-14)
     balance = float(np.arctan2(np.sin(alpha), np.cos(alpha) - radius))
@@ -62,7 +63,7 @@ def test_the_equation_is_newtons(radius):
     slope = jax.grad(lambda r: rk.models.Rolling(r).moments(rk.Block(alpha, p)).saddle)(radius)
     assert float(slope) == pytest.approx(np.sin(balance) ** 2 / np.sin(alpha), rel=1e-10)
     height = np.hypot(np.sin(alpha), np.cos(alpha) - radius) + radius
-    assert float(moments.work(balance)) == pytest.approx(height - 1, rel=1e-12)
+    assert float(moments.work(jnp.asarray(balance))) == pytest.approx(height - 1, rel=1e-12)
 
 
 def by_newton(wheels, horizontal, vertical, start, times, until):
