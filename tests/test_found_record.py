@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 import jaxrock as rk
+from jaxrock.inverse.kept_spectrum import KeptSpectrum
 from jaxrock.inverse.nearest_change import allowed_changes, least_change
 
 ALPHA, P, DT, COUNT = 0.2, 3.0, 0.02, 40
@@ -91,6 +92,35 @@ def test_the_band_is_kept():
     spectrum, frequency = abs(np.fft.rfft(change)), np.fft.rfftfreq(COUNT, DT)
     outside = (frequency < 0.5) | (frequency > 8.0)
     assert outside.sum() > 3 and spectrum[outside].max() < 1e-13 < 1e-3 < spectrum.max()
+
+
+PERIODS = (0.25, 0.4, 0.7)
+
+
+def test_oscillators_are_those_of_the_intensities():
+    """At the samples, and by rows as by recursion."""
+    samples = np.random.default_rng(3).normal(size=60)
+    for period in PERIODS:
+        kept = KeptSpectrum.of(np.array([period]), samples, 0.01)
+        there = kept.displacement(period, samples)
+        peak = rk.intensity.spectral_acceleration(rk.Record(samples, 0.01), period)
+        assert 0.98 * peak < np.abs(there).max() < peak * (1 + 1e-9)
+        for instant in (1, 30, 59, 75):
+            row = kept.row(period, instant)
+            other = np.random.default_rng(instant).normal(size=60)
+            both = there[instant] * (row @ other), kept.displacement(period, other)[instant] * (row @ samples)
+            np.testing.assert_allclose(*both, rtol=1e-10)
+
+
+def test_the_spectrum_is_kept():
+    """Its peaks, judged by oscillators that are followed between samples; without, it changes."""
+    free, kept = found(starts=3, baseline=False), found(starts=3, baseline=False, spectrum=PERIODS)
+    spectrum = functools.partial(rk.intensity.spectral_acceleration, period=PERIODS)
+    before, after, changed = map(spectrum, (START, kept.record, free.record))
+    np.testing.assert_allclose(after, before, rtol=0.06)
+    assert np.abs(changed / before - 1).max() > 0.1 and np.isnan(free.spectrum)
+    assert kept.spectrum <= 0.05 and bool(kept.status == rk.inverse.RecordStatus.successful)
+    assert rk.outcome(BLOCK, kept.record, **LINEAR).overturned and kept.change > free.change
 
 
 @pytest.mark.parametrize("band", [None, (2.0, 9.0)])
@@ -178,6 +208,8 @@ BAD = {
     "a word": ({"target": "fall"}, "`target` must be one of 'topple', 'spare'"),
     "two targets": ({"target": [0.1, 0.2]}, "`target` must be one for each of 1 blocks"),
     "a band that falls": ({"band": (5.0, 1.0)}, "`band` must rise"),
+    "periods that the record does not show": ({"spectrum": [0.1, 1.0]}, "each of 0.2 s .ten steps of the record. or"),
+    "one period": ({"spectrum": 1.0}, "`spectrum` must be a list of periods"),
     "no optimiser": ({"optimizer": 0.1}, "`optimizer` must be an optax.GradientTransformation"),
     "blocks in a square": ({"block": rk.Block(np.full((2, 2), 0.2), P)}, "`block` must be one block or a list"),
 }

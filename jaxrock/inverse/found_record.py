@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, gradient_transformation, known, pair
-from jaxrock._checks import finite, not_negative, one_of, scalar, shown
+from jaxrock._checks import Values, finite, not_negative, one_of, positive, scalar, shown
 from jaxrock._parameters import broadcast, leaves_of
 from jaxrock._precision import say_if_single
 from jaxrock._progress import Progress
@@ -22,6 +22,7 @@ from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.kept_spectrum import TOLERANCE, KeptSpectrum
 from jaxrock.inverse.nearest_change import Found, Search, Site, allowed_changes, least_change, rms
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -31,6 +32,7 @@ from jaxrock.status import Enumeration, item
 
 Real = Float[Array, "..."]
 Target = str | ArrayLike | Sequence[str | float]
+_ROUNDS = 6  # of the search, each of which keeps the peaks of the spectrum that have grown in the one before
 _APPROACH = 40  # steps of the optimiser
 _NEARBY = 0.15  # root mean square of what is added to a record to start nearby, over the record's
 _SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that, or above
@@ -45,6 +47,10 @@ class RecordStatus(Enumeration):
     useless_slopes = item(
         "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
         "long that slopes lead nowhere, and digits of the record decide that nobody measures. There are nearer ones."
+    )
+    spectrum_changed = item(
+        "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "
+        "5 %: see `spectrum`."
     )
     not_reached = item(
         "No change was found that makes margins as wanted: none on straight lines from the start, nor on the way of "
@@ -66,6 +72,8 @@ class FoundRecord(AbstractTable):
     - `changes`: (starts,) root mean squares of the changes to which each start came [g]; infinite where it did not
       come to anything. Those that differ are local minima.
     - `path`: (steps,) root mean squares on the way from the start that came farthest [g].
+    - `spectrum`: by which share the response spectrum changes at most at the periods that are kept; not a number where
+      none is.
     - `status`: a `RecordStatus`.
     """
 
@@ -77,6 +85,7 @@ class FoundRecord(AbstractTable):
     slope: Real
     changes: Real
     path: Real
+    spectrum: Real
     status: RecordStatus
 
     @property
@@ -110,6 +119,7 @@ def find_record(
     penalty: Annotated[float, known(not_negative)] = 1.0,
     band: Annotated[tuple[float, float] | None, pair] = None,
     baseline: bool = True,
+    spectrum: Values | None = None,
     starts: Annotated[int, at_least(1, 10**4)] = 6,
     steps: Annotated[int, at_least(1, 10**6)] = 60,
     seed: Annotated[int, at_least(0)] = 0,
@@ -130,6 +140,8 @@ def find_record(
       beside the margins there, 0 or more.
     - `band`: frequencies between which the record may change [Hz]; None: at all.
     - `baseline`: whether velocity and displacement of the ground at the end of the record stay as they are.
+    - `spectrum`: (periods,) of oscillators of 5 % damping whose peaks the change leaves as they are, within 5 % [s],
+      10 steps of the record or more; None: whatever becomes of them.
     - `starts`: directions from which the nearest record is looked for, at least 1: three, and others from records
       nearby by `seed`. `steps`: for each, at most.
     - `model`, `engine`, `progress`: as in `estimate_motion`.
@@ -149,19 +161,42 @@ def find_record(
     if not size > 0:
         raise ValueError("Argument `start` must shake, but all its samples are zero.")
     site = _site(block, start, target, model, engine)
-    search = Search(site, size, allowed_changes(samples.size, float(start.dt), _checked_band(band), baseline))
+    space, kept = (samples.size, float(start.dt), _checked_band(band), baseline), _kept(spectrum, start)
+    search = Search(site, size, allowed_changes(*space, None if kept is None else kept.rows))
     if search.reached(np.zeros((1, samples.size)))[0]:
-        return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0)
-    bar = Progress(starts * steps, "record", progress)
-    scaled = [search.along(direction) for direction in (samples, -samples)]
-    directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
+        return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0, kept)
+    scaling = min(_length(search.along(direction)) for direction in (samples, -samples))
+    for _ in range(_ROUNDS):
+        bar = Progress(starts * steps, "record", progress)
+        directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
+        lengths, best = _nearest(search, directions, starts, steps, bar)
+        more = None if kept is None or best is None else kept.kept_at(samples + best.change)
+        if more is None:
+            break
+        kept, search = more, search._replace(allowed=allowed_changes(*space, more.rows))
+    return _result(search, start, best, lengths, scaling, kept)
+
+
+def _nearest(search: Search, directions: "_Directions", starts: int, steps: int, bar: Progress):
+    """The lengths to which all starts come, and what the shortest is of."""
     found = []
     for number in range(starts):
         reached = search.along(directions(number))
         found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
         bar.add((number + 1) * steps - bar.done)
-    lengths = [each.length if each else np.inf for each in found]
-    return _result(search, start, found[int(np.argmin(lengths))], lengths, min(_length(each) for each in scaled))
+    lengths = [_length(each) for each in found]
+    return lengths, found[int(np.argmin(lengths))]
+
+
+def _kept(spectrum: Values | None, start: Record) -> KeptSpectrum | None:
+    if spectrum is None:
+        return None
+    dt = float(start.dt)
+    period = np.asarray(positive("spectrum", spectrum), float)
+    if period.ndim != 1 or period.size == 0 or not (period >= 10 * dt).all() or not np.isfinite(period).all():
+        wanted = f"be a list of periods, each of {10 * dt:g} s (ten steps of the record) or more"
+        raise ValueError(f"Argument `spectrum` must {wanted}, but is {shown(spectrum)}.")
+    return KeptSpectrum.of(period, np.asarray(start.samples, float), dt)
 
 
 def _length(found: Found | None) -> float:
@@ -247,10 +282,13 @@ class _Directions(NamedTuple):
         return np.asarray(place)
 
 
-def _result(search: Search, start: Record, found: Found | None, lengths: list[float], scaling: float) -> FoundRecord:
+def _result(
+    search: Search, start: Record, found: Found | None, lengths: list[float], scaling: float, kept: KeptSpectrum | None
+) -> FoundRecord:
     change = np.zeros_like(start.samples) if found is None else found.change
     margin, _ = search.site.margins(jnp.asarray(change))
     slope = np.nan if found is None else found.slope
+    spectrum = np.nan if kept is None else kept.change(np.asarray(start.samples) + change)
     status = RecordStatus.successful
     if found is None:
         status = RecordStatus.not_reached
@@ -258,6 +296,8 @@ def _result(search: Search, start: Record, found: Found | None, lengths: list[fl
         status = RecordStatus.unchanged
     elif slope > _USELESS:
         status = RecordStatus.useless_slopes
+    elif spectrum > TOLERANCE:
+        status = RecordStatus.spectrum_changed
     name = f"{start.name}, changed".removeprefix(", ")
     return FoundRecord(
         record=start if found is None else Record(start.samples + change, start.dt, name),
@@ -268,5 +308,6 @@ def _result(search: Search, start: Record, found: Found | None, lengths: list[fl
         slope=jnp.asarray(slope),
         changes=jnp.asarray(lengths),
         path=jnp.asarray(found.lengths if found else ()),
+        spectrum=jnp.asarray(spectrum),
         status=status,
     )

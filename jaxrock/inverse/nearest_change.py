@@ -190,9 +190,12 @@ def least_change(slopes: np.ndarray, bound: np.ndarray) -> np.ndarray | None:
     return None if left[-1] > -1e-12 else -left[:-1] / left[-1] * size
 
 
-def allowed_changes(count: int, dt: float, band: tuple[float, float] | None, baseline: bool) -> Callable:
+def allowed_changes(
+    count: int, dt: float, band: tuple[float, float] | None, baseline: bool, kept: np.ndarray | None = None
+) -> Callable:
     """The orthogonal projection of changes, (..., n), onto those within a band of frequencies [Hz] that leave velocity
-    and displacement at the end of the record as they are, if `baseline`."""
+    and displacement at the end of the record as they are, if `baseline`; and whose products with `kept`, (rows, n),
+    vanish."""
     inside = np.ones(count // 2 + 1, bool)
     if band is not None:
         frequency = np.fft.rfftfreq(count, dt)
@@ -201,15 +204,12 @@ def allowed_changes(count: int, dt: float, band: tuple[float, float] | None, bas
     def in_band(changes: np.ndarray) -> np.ndarray:
         return changes if inside.all() else np.fft.irfft(np.fft.rfft(changes, axis=-1) * inside, count, axis=-1)
 
-    if not baseline or count < 4:
+    fixed = [] if kept is None else [kept]
+    if baseline and count >= 4:
+        fixed.append(_baseline(count, dt))
+    if not fixed:
         return in_band
-    time = dt * np.arange(count)
-    velocity, displacement = np.ones(count), time[-1] - time
-    # Of straight lines between samples, exactly.
-    velocity[[0, -1]] = 0.5
-    displacement[[0, -1]] = time[-1] / 2 - dt / 6, dt / 6
-    both = in_band(np.stack([velocity, displacement / time[-1]]))
-    left, sizes, rows = np.linalg.svd(both, full_matrices=False)
+    _, sizes, rows = np.linalg.svd(in_band(np.concatenate(fixed)), full_matrices=False)
     rows = rows[sizes > 1e-12 * np.sqrt(count)]
 
     def projected(changes: np.ndarray) -> np.ndarray:
@@ -217,3 +217,13 @@ def allowed_changes(count: int, dt: float, band: tuple[float, float] | None, bas
         return changes - (changes @ rows.T) @ rows
 
     return projected
+
+
+def _baseline(count: int, dt: float) -> np.ndarray:
+    """Velocity and displacement at the end by all samples, (2, n), in units of their own."""
+    time = dt * np.arange(count)
+    velocity, displacement = np.ones(count), time[-1] - time
+    # Of straight lines between samples, exactly.
+    velocity[[0, -1]] = 0.5
+    displacement[[0, -1]] = time[-1] / 2 - dt / 6, dt / 6
+    return np.stack([velocity, displacement / time[-1]])
