@@ -113,7 +113,7 @@ def test_motions():
     estimate = rk.inverse.estimate_motion(ROCKS, rk.SinePulse, UNKNOWNS, 0.2, starts=4, **QUICK)
     own, other = (
         rk.inverse.sample_motion(
-            ROCKS, rk.SinePulse, UNKNOWNS, 0.2, estimate=estimate, effective_size=400, steps=2000, sampler=each, **QUICK
+            ROCKS, rk.SinePulse, UNKNOWNS, 0.2, estimate=estimate, effective_size=400, steps=8000, sampler=each, **QUICK
         )
         for each in (None, lambda density: blackjax.rmh(density, moved))
     )

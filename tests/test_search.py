@@ -21,7 +21,7 @@ OPTIMIZERS = {
     "optimistix.BFGS": lambda: optimistix.BFGS(rtol=1e-6, atol=1e-6),
     "optimistix.LBFGS": lambda: optimistix.LBFGS(rtol=1e-6, atol=1e-6),
     "optax.adam": lambda: optax.adam(0.1),
-    "optax.sgd without extra arguments": lambda: optax.GradientTransformation(*optax.sgd(0.1, momentum=0.8)),
+    "optax.sgd without extra arguments": lambda: optax.GradientTransformation(*optax.sgd(0.02, momentum=0.8)),
     "optax.lbfgs": lambda: optax.lbfgs(),
 }
 QUICKLY = ("own", "optimistix.BFGS")
