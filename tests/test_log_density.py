@@ -11,8 +11,9 @@ import pytest
 import jaxrock as rk
 
 BLOCKS = re.findall(r"```python\n(.*?)```", (Path(__file__).parents[1] / "docs" / "inverse.md").read_text(), re.S)
-OPTIMISERS = {"optax.adam": 1, "optax.lbfgs": 2, "optimistix.BFGS": 3, "SciPy": 4}
-SAMPLERS = {"NumPyro": 5, "AutoLaplace": 6, "BlackJAX": 7, "tempered": 8}
+OPTIMISERS = {"optax.adam": 1, "optax.lbfgs": 2, "optimistix.BFGS": 3, "SciPy": 5}
+OF_RESIDUALS = 4
+SAMPLERS = {"NumPyro": 6, "AutoLaplace": 7, "BlackJAX": 8, "tempered": 9}
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,12 @@ def run(recipe, names):
 
 
 @pytest.mark.slow
+def test_residuals(names):
+    """Levenberg and Marquardt come back to the block that was measured."""
+    np.testing.assert_allclose(run(OF_RESIDUALS, names)["best"], [0.2, 2.5, 0.9], rtol=1e-8)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", OPTIMISERS)
 def test_optimisers(recipe, names, density, grid):
     """They find a maximum that is as high as the highest of a fine grid."""
@@ -128,6 +135,6 @@ def test_samplers(recipe, names, grid):
 
 
 def test_recipes_are_short():
-    assert len(BLOCKS) == 1 + len(OPTIMISERS) + len(SAMPLERS)
+    assert len(BLOCKS) == 2 + len(OPTIMISERS) + len(SAMPLERS)
     for block in BLOCKS[1:]:
         assert sum(bool(line.strip()) for line in block.splitlines()) <= 15
