@@ -98,7 +98,7 @@ def test_found_record():
     after = rk.Record(start.samples + change, 0.5)
     status = rk.inverse.RecordStatus.successful
     found = rk.inverse.FoundRecord(
-        after, start, number, number, number[None], number, number[None], number[None], status
+        after, start, number, number, number[None], number, number[None], number[None], jnp.array(jnp.nan), status
     )
     records, between, spectra = rk.plot.found_record(found)
     assert records.get_title() == "a start" and records.get_xlim() == between.get_xlim() == (0.0, 1.5)
