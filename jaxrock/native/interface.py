@@ -6,6 +6,7 @@
 import ctypes
 import os
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,9 +14,11 @@ import jaxlib
 from llvmlite import ir
 
 HAS_THREADS = os.name == "posix"
+ON_LINUX = sys.platform == "linux"
 _KNOWN = 0  # the major version of the interface; minor ones only add to its ends
 _WANTED, _THREADS = 1, 2  # what the first input of a program tells
 _SHARE = 64  # lanes that are worth a thread
+_CORES = 1024  # that a set of cores has room for
 _EXECUTE, _METADATA = 3, 1  # the stage that computes; the kind of extension that asks for the version
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
@@ -130,10 +133,16 @@ def _in_threads(b: ir.IRBuilder, program: ir.Function, outputs, inputs) -> None:
     join = _outside(module, "pthread_join", _I64, _POINTER.as_pointer())
     nothing = ir.Constant(_POINTER, None)
 
+    elsewhere = _other_cores(b) if ON_LINUX else None
+
     def begin(number):
         # If there is no thread to be had, the others do its work.
         failed = b.call(create, [b.gep(handles, [number]), nothing, worker, message])
-        return b.icmp_signed("==", failed, _I32(0))
+        begun = b.icmp_signed("==", failed, _I32(0))
+        if elsewhere is not None:
+            with b.if_then(begun):
+                elsewhere(b.load(b.gep(handles, [number])))
+        return begun
 
     def end(number):
         b.call(join, [b.load(b.gep(handles, [number])), ir.Constant(_POINTER.as_pointer(), None)])
@@ -142,6 +151,31 @@ def _in_threads(b: ir.IRBuilder, program: ir.Function, outputs, inputs) -> None:
     begun = _count_up(b, helpers, begin)
     b.call(worker, [message])
     _count_up(b, begun, end)
+
+
+def _other_cores(b: ir.IRBuilder) -> Callable:
+    """A function that sends a thread away from the core that this one runs on, if there is another.
+
+    Or else Linux may leave it where it was made, to wait there for its turn: for 2.5 of 3 ms that it is needed, on 2
+    cores.
+    """
+    module, size = b.module, _CORES // 8
+    bits = b.bitcast(b.alloca(_I64, _CORES // 64), _POINTER)
+    ask = _outside(module, "sched_getaffinity", _I32, _I64, _POINTER)
+    send = _outside(module, "pthread_setaffinity_np", _I64, _I64, _POINTER)
+    known = b.icmp_signed("==", b.call(ask, [_I32(0), _I64(size), bits]), _I32(0))
+    here = b.zext(b.call(_outside(module, "sched_getcpu"), []), _I64)  # -1 where it is not known
+    known = b.and_(known, b.icmp_unsigned("<", here, _I64(_CORES)))
+    with b.if_then(known):
+        byte = b.gep(bits, [b.lshr(here, _I64(3))])
+        own = b.shl(ir.IntType(8)(1), b.trunc(b.and_(here, _I64(7)), ir.IntType(8)))
+        b.store(b.and_(b.load(byte), b.not_(own)), byte)
+
+    def elsewhere(thread):
+        with b.if_then(known):
+            b.call(send, [thread, _I64(size), bits])  # refused where no core is left
+
+    return elsewhere
 
 
 def _outside(module: ir.Module, name: str, *kinds) -> ir.Function:

@@ -10,7 +10,7 @@ from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
-_ROWS = 4  # vmapped functions of up to 16,384 lanes (65,536 on a GPU) in one compiled call
+_LANES = 2**14  # of a compiled call on a device, at most; of a GPU four times as many
 _SMALLEST_BLOCK = 65536
 _LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
 _BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
@@ -65,30 +65,29 @@ class Plan(NamedTuple):
         return [x.ravel() for x in np.meshgrid(*parts, indexing="ij")]
 
 
-def layout(points: int, devices: int, platform: str) -> tuple[int, int, int]:
-    """Shape of a batch: rows, devices, lanes. As many lanes at once as there are points, in few different numbers,
-    each of which is compiled.
+def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
+    """Shape of a batch: devices, lanes. As many lanes at once as there are points, in few different numbers, each of
+    which is compiled.
 
     Few scenes go without a quick pass (`transforms.batching`), which leaves other last digits: whether these are few
     is told by the points, not by how many devices share them.
     """
-    share = -(-points // devices)
-    least, most = (_CHUNK if points <= _CHUNK else 2 * _CHUNK, 16384) if platform == "cpu" else (1024, 65536)
-    lanes = 2 ** (min(max(share, least), most) - 1).bit_length()
-    rows = min(_ROWS, 2 ** (max(-(-share // lanes), 1) - 1).bit_length())
-    return rows, devices, lanes
+    least, most = (_CHUNK if points <= _CHUNK else 2 * _CHUNK, _LANES) if platform == "cpu" else (1024, 4 * _LANES)
+    return devices, 2 ** (min(max(-(-points // devices), least), most) - 1).bit_length()
 
 
-def deal(points: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Flat points in the shape of a batch. Chunks are dealt in turn: neighbours cost alike, so shares do, too."""
-    rows, devices, lanes = shape
-    return points.reshape(rows, lanes // _CHUNK, devices, _CHUNK).swapaxes(1, 2).reshape(shape)
+def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Flat points, device by device. Chunks are dealt in turn: neighbours cost alike, so shares do, too."""
+    devices, lanes = shape
+    if devices == 1:
+        return points
+    return points.reshape(lanes // _CHUNK, devices, _CHUNK).swapaxes(0, 1).ravel()
 
 
 @functools.lru_cache(maxsize=16)
-def dealt_to(shape: tuple[int, int, int]) -> list[np.ndarray]:
+def dealt_to(shape: tuple[int, int]) -> list[np.ndarray]:
     """Which of a batch's points every device has, in its order."""
-    return [own.ravel() for own in np.moveaxis(deal(np.arange(math.prod(shape)), shape), 1, 0)]
+    return list(deal(np.arange(math.prod(shape)), shape).reshape(shape))
 
 
 @functools.lru_cache(maxsize=16)

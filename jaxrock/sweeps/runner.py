@@ -4,11 +4,10 @@ import collections
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -17,6 +16,8 @@ from jaxrock.sweeps.devices import compiler_options, local_devices
 from jaxrock.sweeps.plan import deal, dealt_to, layout
 from jaxrock.transforms.fingerprint import Program
 
+_EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
+
 
 class Runner:
     """One compiled function of a batch of points; call it with any number of flat points."""
@@ -24,15 +25,13 @@ class Runner:
     def __init__(self, function: Callable, axes: tuple[np.ndarray, ...], scene, points: int):
         devices = local_devices()
         self._layout = layout(points, len(devices), devices[0].platform)
-        mesh = Mesh(np.array(devices), ("devices",))
-        self._dealt = NamedSharding(mesh, PartitionSpec(None, "devices"))
-        self._scene = jax.device_put(scene, NamedSharding(mesh, PartitionSpec()))
-        self._call = _compiled(function, mesh)
-        like = [jax.ShapeDtypeStruct(self._layout, values.dtype, sharding=self._dealt) for values in axes]
-        checked = self._call.eval_shape(like, np.int32(0), self._scene)
-        self._messages = checked.messages
-        results, self.tree = jax.tree.flatten(checked.results)
-        self.shapes = [jax.ShapeDtypeStruct(x.shape[3:], x.dtype) for x in results]
+        self._mesh = Mesh(np.array(devices), ("devices",))
+        leaves, structure = jax.tree.flatten(self._at_hand(scene))
+        self._scene = structure.unflatten(leaves)
+        kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
+        self._call, self._messages, self.tree, self.shapes = _compiled(
+            function, self._mesh, self._layout, kinds, structure, like
+        )
 
     def __call__(
         self,
@@ -46,10 +45,12 @@ class Runner:
         results = [np.empty((order.size, *x.shape), x.dtype) for x in self.shapes]
         for numbers, leaves in self._batches(points, order):
             for device, dealt in enumerate(dealt_to(self._layout)):
-                there = dealt < numbers.size
-                targets = numbers[dealt] if there.all() else numbers[dealt[there]]
                 own = [self._of_device(part, device) for part in leaves]
-                own = own if there.all() else [x[there] for x in own]
+                if dealt[-1] < numbers.size:  # its share of a batch that is full
+                    targets = numbers[dealt]
+                else:
+                    there = dealt < numbers.size
+                    targets, own = numbers[dealt[there]], [x[there] for x in own]
                 for message, failed in zip(self._messages, own[len(results) :]):
                     if failed.any():
                         place = ", ".join(f"{x[targets[failed.argmax()]]:g}" for x in points)
@@ -59,21 +60,34 @@ class Runner:
             report(numbers.size)
         return results
 
-    @staticmethod
-    def _of_device(dealt: jax.Array, device: int) -> np.ndarray:
+    def _at_hand(self, tree):
+        """Arrays where the function is computed; what is on its only device already goes as it is."""
+        devices = self._mesh.devices.ravel()
+        if devices.size > 1:
+            return jax.device_put(tree, NamedSharding(self._mesh, _EVERYWHERE))
+
+        def put(x):
+            return x if isinstance(x, jax.Array) and x.device == devices[0] else jax.device_put(x, devices[0])
+
+        return jax.tree.map(put, tree)
+
+    def _of_device(self, dealt: jax.Array, device: int) -> np.ndarray:
         """One device's part of results: its own memory, where that can be read."""
-        (shard,) = (x for x in dealt.addressable_shards if (x.index[1].start or 0) == device)
-        part = np.asarray(shard.data)
-        return part.reshape(-1, *part.shape[3:])
+        if self._mesh.size == 1:
+            return np.asarray(dealt)
+        begin = device * self._layout[1]
+        (shard,) = (x for x in dealt.addressable_shards if (x.index[0].start or 0) == begin)
+        return np.asarray(shard.data)
 
     def _batches(self, points: list[np.ndarray], order: np.ndarray) -> Iterator[tuple[np.ndarray, list[jax.Array]]]:
         """Numbers of points, and their results. One batch is under way while the one before it is taken."""
         waiting, batch = collections.deque(), math.prod(self._layout)
         for begin in range(0, order.size, batch):
             numbers = order[begin : begin + batch]
-            rows = np.int32(-(-numbers.size // math.prod(self._layout[1:])))
-            parts = [np.pad(x[numbers], (0, batch - numbers.size), mode="edge") for x in points]
-            results = self._call(jax.device_put([deal(x, self._layout) for x in parts], self._dealt), rows, self._scene)
+            parts = [x[numbers] for x in points]
+            if numbers.size < batch:
+                parts = [np.pad(x, (0, batch - numbers.size), mode="edge") for x in parts]
+            results = self._call([deal(x, self._layout) for x in parts], self._scene)
             waiting.append((numbers, jax.tree.leaves(results)))
             if len(waiting) > 1:
                 yield waiting.popleft()
@@ -88,15 +102,34 @@ class _Checked(eqx.Module):
     messages: tuple[str, ...] = eqx.field(static=True)
 
 
+class _Compiled(NamedTuple):
+    """A function of points and a scene, its messages, and the structure, shapes and types of its results at a point."""
+
+    call: Callable
+    messages: tuple[str, ...]
+    tree: Any
+    shapes: list[jax.ShapeDtypeStruct]
+
+
 # A function is a `Program`, known by its text, or one of the package, of which there is one: what a user gives lies in
 # the scene, a pytree, by whose structure `jax.jit` tells programs apart.
+@functools.lru_cache(maxsize=64)
+def _compiled(
+    function: Callable, mesh: Mesh, shape: tuple[int, int], kinds: tuple, structure, scene: tuple
+) -> _Compiled:
+    """`function(*point, scene)` at a batch of points of these kinds of numbers, and what is known of it beforehand."""
+    call = _call_of(function, mesh)
+    like = [jax.ShapeDtypeStruct((math.prod(shape),), kind) for kind in kinds]
+    told = jax.eval_shape(call, like, structure.unflatten(scene))
+    results, tree = jax.tree.flatten(told.results)
+    return _Compiled(call, told.messages, tree, [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in results])
+
+
 @functools.lru_cache(maxsize=32)
-def _compiled(function: Callable, mesh: Mesh) -> Any:
-    """`function(*point, scene)` over the first so many rows of points of shape (rows, devices, lanes), `_Checked`."""
+def _call_of(function: Callable, mesh: Mesh) -> Callable:
+    """`function(*point, scene)` over points that are dealt to devices, `_Checked`."""
 
-    def on_one(points, rows, scene):
-        own = [x[:, 0] for x in points]  # this device's
-
+    def on_one(points, scene):
         def one(*point):
             if isinstance(function, Program):
                 return _Checked(*function(*point, scene), function.messages)
@@ -104,18 +137,11 @@ def _compiled(function: Callable, mesh: Mesh) -> Any:
                 results = function(*point, scene)
             return _Checked(results, tuple(failed for _, failed in checks), tuple(message for message, _ in checks))
 
-        def row(number):
-            return jax.vmap(one)(*(x[number] for x in own))
+        return jax.vmap(one)(*points)
 
-        def put(number, whole):
-            return jax.tree.map(lambda whole, part: whole.at[number, 0].set(part), whole, row(number))
-
-        # The number of rows is an argument, so that grids of any number of rows take the same compiled program.
-        empty = jax.tree.map(lambda x: jnp.zeros((own[0].shape[0], 1, *x.shape), x.dtype), jax.eval_shape(row, 0))
-        return jax.lax.fori_loop(0, rows, put, empty)
-
-    dealt = PartitionSpec(None, "devices")
-    spread = jax.shard_map(
-        on_one, mesh=mesh, in_specs=(dealt, PartitionSpec(), PartitionSpec()), out_specs=dealt, check_vma=False
-    )
-    return jax.jit(spread, compiler_options=compiler_options(mesh.devices.flat[0].platform))
+    options = compiler_options(mesh.devices.flat[0].platform)
+    if mesh.size == 1:
+        return jax.jit(on_one, compiler_options=options)
+    spread = jax.shard_map(on_one, mesh=mesh, in_specs=(_DEALT, _EVERYWHERE), out_specs=_DEALT, check_vma=False)
+    dealt, everywhere = (NamedSharding(mesh, spec) for spec in (_DEALT, _EVERYWHERE))
+    return jax.jit(spread, in_shardings=(dealt, everywhere), compiler_options=options)
