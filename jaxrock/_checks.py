@@ -25,6 +25,8 @@ def is_traced(tree: Any) -> bool:
 
 def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as a floating-point array, or say what it is instead; what is known stays so within `jax.jit`."""
+    if isinstance(value, jax.Array) and value.dtype == jnp.result_type(float) and not value.weak_type:
+        return value
     if is_traced(value):
         return _as_real(name, value)
     with jax.ensure_compile_time_eval():
@@ -35,7 +37,8 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     if _holds_no_number(value):
         raise _no_number(name, value)
     try:
-        array = jnp.asarray(value)
+        # A number of Python leaves a weak type behind, which would recompile every function it meets; NumPy's do not.
+        array = jnp.asarray(np.asarray(value) if isinstance(value, (float, int)) else value)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
@@ -45,8 +48,7 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     usual = jnp.result_type(float)
     if not jnp.issubdtype(array.dtype, jnp.floating) or array.dtype.itemsize < usual.itemsize // 2:
         array = array.astype(usual)  # of integers, and of half precision
-    # A Python float leaves a weak type behind, which would recompile every function it meets.
-    return jax.lax.convert_element_type(array, array.dtype)
+    return jax.lax.convert_element_type(array, array.dtype) if array.weak_type else array
 
 
 def _no_number(name: str, value: Any) -> ValueError:
