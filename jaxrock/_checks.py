@@ -133,7 +133,8 @@ _put_down: contextvars.ContextVar[tuple[Any, Any]] = contextvars.ContextVar("put
 def put_down() -> Iterator[list[tuple[str, Bool[Array, ""]]]]:
     """Checks of traced values are not made, but put down: pairs of a message, and whether the check has failed.
 
-    A program that may raise is not kept by JAX's cache of compiled programs; one that returns what was put down is.
+    One that returns what was put down is kept by JAX's cache of compiled programs on every platform; one that raises on
+    CPUs only.
     Checks within transformations of the function that is traced here are still made.
     """
     checks: list[tuple[str, Bool[Array, ""]]] = []

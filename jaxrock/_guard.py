@@ -1,9 +1,12 @@
 """Checks of values that are known when a program runs, as a primitive of JAX.
 
-Where JAX compiles for this process the check raises by calling back to Python, as `equinox.error_if` does. A program
-that is exported cannot call back: there a value that fails becomes what is not a number, and the status of a result
-says so. Outside of `jax.jit` (under `jax.vmap`, say) it raises at once.
+Where JAX compiles for a CPU of this process the check raises by a function that XLA calls (`_foreign`), which leaves
+programs that JAX can keep; elsewhere by calling back to Python, as `equinox.error_if` does. A program that is exported
+finds neither: there a value that fails becomes what is not a number, and the status of a result says so. Outside of
+`jax.jit` (under `jax.vmap`, say) it raises at once.
 """
+
+import functools
 
 import equinox as eqx
 import jax
@@ -14,6 +17,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, PyTree
 
 from jaxrock._abstract import typed_like, without_mesh
+from jaxrock._foreign import CHECK, has_check
 
 _guard_p = Primitive("guard")
 _guard_p.multiple_results = True
@@ -56,8 +60,20 @@ def _transposed(cotangents, failed, *values, message):
     return [None, *cotangents]
 
 
-def _raising(failed, *values, message):
+def _calling_back(failed, *values, message):
     return list(eqx.error_if(values, failed, message))
+
+
+def _raising(failed, *values, message, alone):
+    """`alone`: whether no other device takes part, as far as XLA sees. Then the check stays where it is; what XLA deals
+    to many devices by itself must be without effects, and may come out of a loop that takes no turn."""
+    like = jax.ShapeDtypeStruct((), jnp.bool_)
+
+    def check(failed):
+        return jax.ffi.ffi_call(CHECK, like, has_side_effect=alone)(failed, message=message)
+
+    failed = jnp.any(failed)
+    return _marked(jax.lax.cond(failed, check, lambda failed: failed, failed), *values, message=message)
 
 
 def _marked(failed, *values, message):
@@ -71,13 +87,26 @@ def _marked(failed, *values, message):
     return [of(x) for x in values]
 
 
-def _lowered(context, *operands, message):
+def _is_alone(axes) -> bool:
+    mesh = getattr(axes, "mesh", None)
+    if mesh is None:
+        return getattr(axes, "num_devices", 1) == 1
+    return mesh.size == 1 or set(mesh.axis_names) == set(axes.manual_axes)
+
+
+def _lowered(context, *operands, message, on_cpu):
     settings = getattr(context.module_context, "lowering_parameters", None)
-    rule = _marked if getattr(settings, "for_export", False) else _raising
+    if getattr(settings, "for_export", False):
+        rule = _marked
+    else:
+        rule = _calling_back
+        if on_cpu and has_check():
+            rule = functools.partial(_raising, alone=_is_alone(context.module_context.axis_context))
     return mlir.lower_fun(rule)(without_mesh(context), *operands, message=message)
 
 
 batching.primitive_batchers[_guard_p] = _batched
 ad.primitive_jvps[_guard_p] = _pushed
 ad.primitive_transposes[_guard_p] = _transposed
-mlir.register_lowering(_guard_p, _lowered)
+mlir.register_lowering(_guard_p, functools.partial(_lowered, on_cpu=False))
+mlir.register_lowering(_guard_p, functools.partial(_lowered, on_cpu=True), platform="cpu")

@@ -11,8 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
+from jaxrock import _guard
+from jaxrock._foreign import CHECK
 
 NAN, INF, HALF_PI = np.nan, np.inf, np.pi / 2
 BLOCK = rk.Block(0.2, 1.0)
@@ -381,6 +384,79 @@ def test_bad_input_under_jit(function, bad, good, argument, allowed):
     assert not np.isnan(compiled(good)).any()
     with pytest.raises(Exception, match=f"Argument `{argument}` must {re.escape(allowed)}"):
         compiled(bad).block_until_ready()
+
+
+def area(alpha):
+    return rk.Block(alpha, 1.0, 0.5).alpha ** 3
+
+
+def mesh():
+    return Mesh(np.array(jax.devices()[:2]), ("devices",))
+
+
+def dealt(function):
+    devices = PartitionSpec("devices")
+    return jax.shard_map(function, mesh=mesh(), in_specs=devices, out_specs=devices)
+
+
+def sharded(x):
+    return jax.device_put(x, NamedSharding(mesh(), PartitionSpec("devices")))
+
+
+RAISING = {
+    "vmap": lambda x: jax.vmap(jax.jit(area))(x),
+    "vmap, inside": lambda x: jax.jit(jax.vmap(area))(x),
+    "grad": lambda x: jax.vmap(jax.jit(jax.grad(area)))(x),
+    "hessian": lambda x: jax.jit(jax.vmap(jax.hessian(area)))(x),
+    "checkpoint": lambda x: jax.jit(jax.vmap(jax.grad(jax.checkpoint(area))))(x),
+    "scan": lambda x: jax.jit(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0])(x),
+    "grad of a scan": lambda x: jax.jit(jax.grad(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0]))(
+        x
+    ),
+    "while": lambda x: jax.jit(
+        lambda x: jax.lax.while_loop(lambda c: c[0] < 2, lambda c: (c[0] + 1, c[1] + area(x[c[0]])), (0, 0.0))
+    )(x),
+    "cond": lambda x: jax.jit(lambda a: jax.lax.cond(a < 1, area, lambda a: a, a))(x[-1]),
+    "shard_map": lambda x: jax.jit(dealt(jax.vmap(area)))(x),
+    "sharded": lambda x: jax.jit(jax.vmap(area))(sharded(x)),
+}
+
+
+@pytest.mark.parametrize("way", RAISING.values(), ids=RAISING)
+def test_bad_input_in_every_way(way):
+    """The message as it is, and nothing where all is well."""
+    assert np.all(np.isfinite(jax.tree.leaves(way(TWO))[-1]))
+    with pytest.raises(Exception, match=r"^(INVALID_ARGUMENT: )?Argument `alpha` must be in \(0, pi/2\).*"):
+        jax.block_until_ready(way(-TWO))
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_what_is_not_computed_does_not_raise(turns):
+    def added(a, turns):
+        return jax.lax.fori_loop(0, turns, lambda i, c: c + area(a), 0.0)
+
+    assert jax.jit(lambda a: jax.lax.cond(a > 0, area, lambda a: a, a))(-1.0) == -1.0
+    if turns:
+        with pytest.raises(Exception, match="Argument `alpha` must"):
+            jax.block_until_ready(jax.jit(added)(-1.0, turns))
+    else:
+        assert jax.jit(added)(-1.0, turns) == 0.0
+
+
+def test_results_of_checked_values_stay_where_they_are():
+    assert jax.jit(jax.vmap(area))(sharded(TWO)).sharding.spec == PartitionSpec("devices")
+
+
+def test_checks_where_xla_has_no_function_for_them(monkeypatch):
+    """They call back."""
+    text = jax.jit(area).lower(0.2).as_text()
+    assert CHECK in text and "callback" not in text
+    monkeypatch.setattr(_guard, "has_check", lambda: False)
+    compiled = jax.jit(lambda a: area(a) + 0.0)
+    assert "callback" in compiled.lower(0.2).as_text()
+    assert compiled(0.2) == area(0.2)
+    with pytest.raises(Exception, match="Argument `alpha` must be in"):
+        jax.block_until_ready(compiled(-0.2))
 
 
 @pytest.mark.parametrize("time", [-0.1, 4.1, NAN])

@@ -168,6 +168,37 @@ def test_processes_share_a_folder(tmp_path):
     assert time.time() - start < 200
 
 
+_CHECKED = """
+import jax, jax.monitoring
+jax.config.update("jax_enable_x64", True)
+import jaxrock as rk
+rk.keep_compiled()
+events = []
+jax.monitoring.register_event_listener(lambda event, **more: events.append(event))
+function = jax.jit(jax.grad(lambda a: rk.Block(a, 2.0).alpha ** 2))
+print(float(function(0.3)), sum(event.endswith("cache_misses") for event in events), end=" ")
+try:
+    print(float(function(-0.3)))
+except Exception as error:
+    print(error)
+"""
+
+
+def test_checks_are_kept_with_the_users_own_programs(tmp_path):
+    """By JAX's cache, and they raise when another process finds them there."""
+    environment = os.environ | {"JAXROCK_CACHE": str(tmp_path)}
+    told = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", _CHECKED], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        told.append(done.stdout.split(maxsplit=2))
+    assert told[0][0] == told[1][0] == "0.6"
+    assert int(told[0][1]) > 0 and int(told[1][1]) == 0
+    assert "Argument `alpha` must be in (0, pi/2)" in told[0][2] and told[0][2] == told[1][2]
+
+
 def test_another_version_of_the_package_asks_anew(place, monkeypatch):
     def ask():
         jax.clear_caches()

@@ -1,71 +1,31 @@
-"""The function that XLA calls, by the structures of its C interface for foreign functions. Needs llvmlite.
-
-`ctypes` lays the structures out as the compiler of XLA does; their fields stand as in the header that jaxlib ships.
-"""
+"""The function that XLA calls, by the structures of its C interface for foreign functions. Needs llvmlite."""
 
 import ctypes
 import os
-import re
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
-import jaxlib
 from llvmlite import ir
+
+from jaxrock._foreign import (
+    EXECUTE,
+    METADATA,
+    Buffer,
+    Buffers,
+    Extension,
+    Frame,
+    Interface,
+    Metadata,
+    MetadataExtension,
+    Version,
+)
 
 HAS_THREADS = os.name == "posix"
 ON_LINUX = sys.platform == "linux"
-_KNOWN = 0  # the major version of the interface; minor ones only add to its ends
 _WANTED, _THREADS = 1, 2  # what the first input of a program tells
 _SHARE = 64  # lanes that are worth a thread
 _CORES = 1024  # that a set of cores has room for
-_EXECUTE, _METADATA = 3, 1  # the stage that computes; the kind of extension that asks for the version
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
-
-
-class _Extension(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("type", ctypes.c_int), ("next", ctypes.c_void_p)]
-
-
-class _Version(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p),
-                ("major_version", ctypes.c_int), ("minor_version", ctypes.c_int)]  # fmt: skip
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("api_version", _Version), ("traits", ctypes.c_uint32)]
-
-
-class _MetadataExtension(ctypes.Structure):
-    _fields_ = [("base", _Extension), ("metadata", ctypes.c_void_p)]
-
-
-class _Interface(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api_version", _Version)]
-
-
-class _Buffer(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("dtype", ctypes.c_int),
-                ("data", ctypes.c_void_p)]  # fmt: skip
-
-
-class _Buffers(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("size", ctypes.c_int64),
-                ("types", ctypes.c_void_p), ("buffers", ctypes.c_void_p)]  # fmt: skip
-
-
-class _Frame(ctypes.Structure):
-    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api", ctypes.c_void_p),
-                ("ctx", ctypes.c_void_p), ("stage", ctypes.c_int), ("args", _Buffers), ("rets", _Buffers)]  # fmt: skip
-
-
-def is_known() -> bool:
-    """Whether XLA's interface is the one that is written down here, by the header of the jaxlib that is installed."""
-    header = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
-    if not header.exists():
-        return True  # nothing says otherwise, and XLA asks for the version itself
-    found = re.search(r"define XLA_FFI_API_MAJOR (\d+)", header.read_text())
-    return found is not None and int(found[1]) == _KNOWN
 
 
 def add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
@@ -83,22 +43,22 @@ def add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
     def at(pointer, offset, kind=_POINTER):
         return b.load(b.bitcast(b.gep(pointer, [_I64(offset)]), kind.as_pointer()))
 
-    version = _Metadata.api_version.offset + _Version.major_version.offset
-    extension = at(frame, _Frame.extension_start.offset)
+    version = Metadata.api_version.offset + Version.major_version.offset
+    extension = at(frame, Frame.extension_start.offset)
     with b.if_then(b.icmp_unsigned("!=", extension, done)):
-        with b.if_then(b.icmp_signed("==", at(extension, _Extension.type.offset, _I32), _I32(_METADATA))):
-            interface = at(frame, _Frame.api.offset)
-            known = at(interface, _Interface.api_version.offset + _Version.major_version.offset, _I64)  # both numbers
-            about = at(extension, _MetadataExtension.metadata.offset)
+        with b.if_then(b.icmp_signed("==", at(extension, Extension.type.offset, _I32), _I32(METADATA))):
+            interface = at(frame, Frame.api.offset)
+            known = at(interface, Interface.api_version.offset + Version.major_version.offset, _I64)  # both numbers
+            about = at(extension, MetadataExtension.metadata.offset)
             b.store(known, b.bitcast(b.gep(about, [_I64(version)]), _I64.as_pointer()))
             b.ret(done)
-    with b.if_then(b.icmp_signed("==", at(frame, _Frame.stage.offset, _I32), _I32(_EXECUTE))):
+    with b.if_then(b.icmp_signed("==", at(frame, Frame.stage.offset, _I32), _I32(EXECUTE))):
         tables = []
-        for where, count in ((_Frame.rets, outputs), (_Frame.args, inputs)):
-            table, buffers = b.alloca(_POINTER, count), at(frame, where.offset + _Buffers.buffers.offset)
+        for where, count in ((Frame.rets, outputs), (Frame.args, inputs)):
+            table, buffers = b.alloca(_POINTER, count), at(frame, where.offset + Buffers.buffers.offset)
             for i in range(count):
                 buffer = at(buffers, ctypes.sizeof(ctypes.c_void_p) * i)
-                b.store(at(buffer, _Buffer.data.offset), b.gep(table, [_I32(i)]))
+                b.store(at(buffer, Buffer.data.offset), b.gep(table, [_I32(i)]))
             tables.append(table)
         _in_threads(b, program, *tables)
     b.ret(done)

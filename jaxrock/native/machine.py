@@ -3,17 +3,16 @@
 Needs llvmlite.
 """
 
-import ctypes
 import functools
 import hashlib
 import threading
 from collections.abc import Callable
 
-import jax
 from llvmlite import binding
 
+from jaxrock._foreign import is_known, register
 from jaxrock.keeping import folder
-from jaxrock.native.interface import add_handler, is_known
+from jaxrock.native.interface import add_handler
 from jaxrock.native.kernels import emit
 from jaxrock.native.operations import Unsupported
 
@@ -106,8 +105,5 @@ def _register(name: str, code: bytes) -> None:
     with _one_at_a_time:
         if name in _registered:
             return
-        new = ctypes.pythonapi.PyCapsule_New
-        new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-        capsule = new(_machine().address(code, name), b"xla._CUSTOM_CALL_TARGET", None)
-        jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+        register(name, _machine().address(code, name))
         _registered.add(name)

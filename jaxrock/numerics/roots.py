@@ -26,8 +26,9 @@ def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Re
 def _bracketed_root_jvp(function, primals, tangents):
     (lower, upper, *parameters), (_, _, *changes) = primals, tangents
     root = bracketed_root(function, lower, upper, *parameters)
-    _, slope = jax.jvp(lambda x: function(x, *parameters), (root,), (jnp.ones_like(root),))
-    _, change = jax.jvp(lambda *p: function(root, *p), tuple(parameters), tuple(changes))
+    _, along = jax.linearize(function, root, *parameters)  # once: it may hold a search, too
+    slope = along(jnp.ones_like(root), *map(jnp.zeros_like, parameters))
+    change = along(jnp.zeros_like(root), *changes)
     flat = slope == 0  # no root, or a double one
     return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
 
@@ -49,25 +50,29 @@ def search_root(function: Callable, a: Real, b: Real) -> Real:
 
     **Source:** Chandrupatla (1997), inverse quadratic interpolation where it is safe, else bisection.
     """
-    fa, fb = function(a), function(b)
-    tight = 4 * jnp.finfo(a.dtype).eps
+    ends, tight = (a, b), 4 * jnp.finfo(a.dtype).eps
 
     def unfinished(carry):
         a, b, _, fa, fb, _, _, count = carry
-        return jnp.any(_open(a, b, fa, fb, tight)) & (count < _MOST_STEPS)
+        return (count < 2) | (jnp.any(_open(a, b, fa, fb, tight)) & (count < 2 + _MOST_STEPS))
 
     def step(carry):
         a, b, c, fa, fb, fc, share, count = carry
-        x = a + share * (b - a)
+        # The ends first, in the same loop: a function is large, and here it is compiled once.
+        first, begins = count == 0, count < 2
+        x = jnp.where(begins, jnp.where(first, *ends), a + share * (b - a))
         fx = function(x)
-        going = _open(a, b, fa, fb, tight)
-        same = (fx > 0) == (fa > 0)
+        fa, fb = (jnp.where(first, fx, f) for f in (fa, fb))
+        going = begins | _open(a, b, fa, fb, tight)
+        same = ((fx > 0) == (fa > 0)) & ~begins
         # c: the point before; a: the newest; b: on the other side.
         new = (x, jnp.where(same, b, a), jnp.where(same, a, b), fx, jnp.where(same, fb, fa), jnp.where(same, fa, fb))
         a, b, c, fa, fb, fc = (jnp.where(going, n, o) for n, o in zip(new, (a, b, c, fa, fb, fc)))
-        return a, b, c, fa, fb, fc, _next_share(a, b, c, fa, fb, fc, tight), count + 1
+        share = jnp.where(begins, 0.5, _next_share(a, b, c, fa, fb, fc, tight))
+        return a, b, c, fa, fb, fc, share, count + 1
 
-    start = (b, a, a, fb, fa, fa, jnp.full_like(a, 0.5), 0)
+    nothing = jnp.zeros_like(a)
+    start = (a, a, a, nothing, nothing, nothing, nothing, 0)
     a, b, _, fa, fb, _, _, _ = jax.lax.while_loop(unfinished, step, start)
     return jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
 

@@ -3,10 +3,12 @@
 import functools
 import inspect
 from collections.abc import Callable
+from typing import Any, get_args, get_origin
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Float
 
 from jaxrock._checks import together
 from jaxrock.transforms.differentiation import differentiable
@@ -37,7 +39,11 @@ def elementwise(**checks: Callable) -> Callable:
 
 def _with_kept_derivatives(function: Callable) -> Callable:
     compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
-    one = differentiable(lambda values: function(*values), name=f"{function.__module__}.{function.__qualname__}")
+    one = differentiable(
+        lambda values: function(*values),
+        name=f"{function.__module__}.{function.__qualname__}",
+        results=_told_by(inspect.signature(function).return_annotation),
+    )
 
     def at_elements(*values):
         values = jnp.broadcast_arrays(*values)
@@ -65,3 +71,15 @@ def _with_kept_derivatives(function: Callable) -> Callable:
         return pushed(values, [change for change, moved in zip(changes, moves) if moved], moves)
 
     return run
+
+
+def _told_by(annotation: Any) -> Callable | None:
+    """Of the values of one element what a function returns, by its annotation: numbers of their kind, or tuples of
+    these; None: it does not tell."""
+    if get_origin(annotation) is tuple:
+        parts = [_told_by(part) for part in get_args(annotation)]
+        known = [part for part in parts if part is not None]
+        return (lambda values: tuple(part(values) for part in known)) if len(known) == len(parts) else None
+    if getattr(annotation, "dtype", None) is Float:
+        return lambda values: jax.ShapeDtypeStruct((), values[0].dtype)
+    return None

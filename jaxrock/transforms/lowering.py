@@ -6,9 +6,11 @@ What is known by its facts is exported, and kept: in another session it need not
 import contextvars
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
+from jax.extend.mlir import deserialize_portable_artifact, ir
+from jax.extend.mlir.dialects import func
 from jax.interpreters import mlir
 
 from jaxrock._abstract import without_mesh
@@ -31,13 +33,25 @@ def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int |
     exported = getattr(context.module_context.lowering_parameters, "for_export", False)
     portable = exported and _called.get() is None  # by the user, for machines that may not have our machine code
     lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1, portable)
-    function, codes = _kept(lanes, context.avals_in) or (lanes, lanes.codes())
+    program, codes = _kept(lanes, context.avals_in) or (None, lanes.codes())
     if (called := _called.get()) is not None:
         called.extend(codes)
-    return mlir.lower_fun(function)(without_mesh(context), *leaves)
+    if program is None or b"lapack_" in program.mlir_module_serialized:
+        return mlir.lower_fun(lanes if program is None else program.call)(without_mesh(context), *leaves)
+    return _inlined(program, context, leaves)
 
 
-def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
+def _inlined(program: jax.export.Exported, context, leaves) -> Sequence:
+    """What `program.call` is lowered to; but that gets LAPACK ready first, which takes longer than all the rest."""
+    with context.module_context.module.context:
+        module = deserialize_portable_artifact(program.mlir_module_serialized)
+    results = ir.SymbolTable(module.operation)["main"].type.results
+    name = mlir.merge_mlir_modules(context.module_context.module, "jaxrock_kept", module)
+    used = [leaves[i] for i in program.module_kept_var_idx]
+    return func.CallOp(results, ir.FlatSymbolRefAttr.get(name), used).results
+
+
+def _kept(lanes: Lanes, leaves) -> tuple[jax.export.Exported, list[str]] | None:
     """The same as it was exported, in this session or another, and the machine code that it calls; None where that
     cannot be."""
     if lanes.recipe.facts is None or not lanes.on_cpu or lanes.portable or folder.folder() is None:
@@ -52,7 +66,7 @@ def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
         told, _, program = content.partition(b"\n")
         codes = json.loads(told)
         if all(map(lanes.found, codes)):
-            return jax.export.deserialize(bytearray(program)).call, codes
+            return jax.export.deserialize(bytearray(program)), codes
     _LOG.info("compiling, once for this machine")
     try:
         exported, codes = _exported(lanes, shapes)
@@ -60,7 +74,7 @@ def _kept(lanes: Lanes, leaves) -> tuple[Callable, list[str]] | None:
     except Exception as error:  # such as a callback in it, which no other process has
         _LOG.debug("%s is not kept: %.300s", lanes.recipe, error)
         return None
-    return exported.call, codes
+    return exported, codes
 
 
 def _exported(lanes: Lanes, shapes: list) -> tuple[jax.export.Exported, list[str]]:
