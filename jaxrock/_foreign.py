@@ -43,9 +43,15 @@ class _Complaint(ctypes.Structure):
 _Complain = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Complaint))
 
 
+class Task(ctypes.Structure):
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("context", ctypes.c_void_p),
+                ("task", ctypes.c_void_p), ("data", ctypes.c_void_p)]  # fmt: skip
+
+
 class Interface(ctypes.Structure):
     _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api_version", Version),
-                ("internal", ctypes.c_void_p), ("create_error", _Complain)]  # fmt: skip
+                ("internal", ctypes.c_void_p), ("create_error", _Complain), ("others", ctypes.c_void_p * 10),
+                ("schedule", ctypes.c_void_p)]  # fmt: skip
 
 
 class Buffer(ctypes.Structure):

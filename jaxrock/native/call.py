@@ -15,10 +15,10 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxrock.native.emitter import SMALL, is_known
 from jaxrock.native.hoisting import hoisted
-from jaxrock.native.interface import HAS_THREADS
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
 from jaxrock.native.partition import Part, ahead, around_loop, computed
+from jaxrock.native.pool import HAS_THREADS
 
 
 class _Piece(NamedTuple):

@@ -1,0 +1,150 @@
+"""A program in the threads of XLA's pool and in the one that calls it, which share its lanes. Needs llvmlite.
+
+Those threads are there already: a new one costs more, and Linux may leave it to wait on the core that made it. XLA
+promises nothing about when a task is done, if ever: whoever calls does what nobody else has begun, and waits only for
+those who have.
+"""
+
+import ctypes
+import os
+from collections.abc import Callable
+
+from llvmlite import ir
+
+from jaxrock._foreign import Interface, Task
+
+HAS_THREADS = os.name == "posix"
+_WANTED, _THREADS = 1, 2  # what the first input of a program tells
+_SHARE = 64  # lanes that are worth a thread
+_NEXT, _BEGUN, _ENDED, _HELD = 2, 3, 4, 5  # numbers of what is shared, after the tables of outputs and inputs
+_CLOSED = 1 << 32  # no more may begin; more than there are threads
+_POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
+
+
+def together(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
+    """Call a program in this thread and, where there are many lanes, at the same time in others.
+
+    `tables`: of outputs and of inputs; `interface`, `context`: what XLA has passed for calls of its own functions.
+    """
+    sizes = b.bitcast(b.load(tables[1]), _I32.as_pointer())
+    wanted, threads = (b.sext(b.load(b.gep(sizes, [_I32(i)])), _I64) for i in (_WANTED, _THREADS))
+    most, others = b.sdiv(b.sub(wanted, _I64(1)), _I64(_SHARE)), b.sub(threads, _I64(1))
+    others = b.select(b.icmp_signed("<", most, others), most, others)
+    if not HAS_THREADS:
+        others = _I64(0)
+    with b.if_else(b.icmp_signed("<=", others, _I64(0))) as (alone, shared):
+        with alone:
+            following = b.alloca(_I64)
+            b.store(_I64(0), following)
+            b.call(program, [*tables, following])
+        with shared:
+            _Shared(b, program).run(tables, others, interface, context)
+
+
+class _Shared:
+    """What threads share while they run a program: in memory of its own, for a task may come when all is over."""
+
+    def __init__(self, b: ir.IRBuilder, program: ir.Function):
+        self.b, self.program = b, program
+        give = ir.Function(b.module, ir.FunctionType(_POINTER, [_I64]), "malloc")
+        self._take_back = ir.Function(b.module, ir.FunctionType(ir.VoidType(), [_POINTER]), "free")
+        self._let_others = ir.Function(b.module, ir.FunctionType(_I32, []), "sched_yield")
+        self._memory = lambda: b.call(give, [_I64(8 * (_HELD + 1))])
+
+    def run(self, tables: list, others, interface, context) -> None:
+        """Ask for tasks, run the program here, too, and wait for those that have begun."""
+        b = self.b
+        memory = self._memory()
+        for number, table in enumerate(tables):
+            b.store(b.ptrtoint(table, _I64), self._number(b, memory, number))
+        for number, value in ((_NEXT, _I64(0)), (_BEGUN, _I64(0)), (_ENDED, _I64(0)), (_HELD, b.add(others, _I64(1)))):
+            b.store(value, self._number(b, memory, number))
+        asked = _count_up(b, others, self._asking(memory, interface, context))
+        b.atomic_rmw("sub", self._number(b, memory, _HELD), b.sub(others, asked), "acq_rel")
+        self._run(b, memory)
+        begun = b.atomic_rmw("add", self._number(b, memory, _BEGUN), _I64(_CLOSED), "acq_rel")
+        wait, look, done = (b.append_basic_block(name) for name in ("wait", "look", "done"))
+        b.branch(look)
+        b.position_at_end(wait)
+        b.call(self._let_others, [])
+        b.branch(look)
+        b.position_at_end(look)
+        ended = b.load_atomic(self._number(b, memory, _ENDED), "acquire", 8)
+        b.cbranch(b.icmp_signed("<", ended, begun), wait, done)
+        b.position_at_end(done)
+        self._let_go(b, memory)
+
+    def _asking(self, memory, interface, context) -> Callable:
+        """`ask(number)` for a task: whether XLA takes it."""
+        b, asked = self.b, _room_for(self.b, Task)
+        known = {"struct_size": ir.Constant(_I64, ctypes.sizeof(Task)), "extension_start": ir.Constant(_POINTER, None)}
+        parts = known | {"context": context, "task": b.bitcast(self._task(), _POINTER), "data": memory}
+        for name, value in parts.items():
+            place = b.gep(asked, [_I64(getattr(Task, name).offset)])
+            b.store(value, b.bitcast(place, value.type.as_pointer()))
+
+        def function(name):
+            kind = ir.FunctionType(_POINTER, [_POINTER]).as_pointer()
+            place = b.gep(interface, [_I64(getattr(Interface, name).offset)])
+            return b.load(b.bitcast(place, kind.as_pointer()))
+
+        schedule = function("schedule")
+
+        def ask(number):
+            return b.icmp_unsigned("==", b.call(schedule, [asked]), ir.Constant(_POINTER, None))
+
+        return ask
+
+    def _task(self) -> ir.Function:
+        """What another thread does: the program, unless it comes too late."""
+        task = ir.Function(self.b.module, ir.FunctionType(ir.VoidType(), [_POINTER]), "task")
+        task.linkage = "internal"
+        b, memory = ir.IRBuilder(task.append_basic_block("entry")), task.args[0]
+        before = b.atomic_rmw("add", self._number(b, memory, _BEGUN), _I64(1), "acq_rel")
+        with b.if_then(b.icmp_signed("<", before, _I64(_CLOSED))):
+            self._run(b, memory)
+            b.atomic_rmw("add", self._number(b, memory, _ENDED), _I64(1), "acq_rel")
+        self._let_go(b, memory)
+        b.ret_void()
+        return task
+
+    def _run(self, b: ir.IRBuilder, memory) -> None:
+        kinds = self.program.ftype.args
+        tables = [b.inttoptr(b.load(self._number(b, memory, i)), kinds[i]) for i in (0, 1)]
+        b.call(self.program, [*tables, self._number(b, memory, _NEXT)])
+
+    def _let_go(self, b: ir.IRBuilder, memory) -> None:
+        """The last frees the memory."""
+        held = b.atomic_rmw("sub", self._number(b, memory, _HELD), _I64(1), "acq_rel")
+        with b.if_then(b.icmp_signed("==", held, _I64(1))):
+            b.call(self._take_back, [memory])
+
+    @staticmethod
+    def _number(b: ir.IRBuilder, memory, number: int):
+        return b.bitcast(b.gep(memory, [_I64(8 * number)]), _I64.as_pointer())
+
+
+def _room_for(b: ir.IRBuilder, kind: type[ctypes.Structure]):
+    """Room for a structure."""
+    return b.bitcast(b.alloca(_I64, -(-ctypes.sizeof(kind) // 8)), _POINTER)
+
+
+def _count_up(b: ir.IRBuilder, size, act: Callable):
+    """`act(number)` from 0 to `size`, or until it is false; the number where it ends."""
+    before, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("next", "act", "done"))
+    b.branch(head)
+    b.position_at_end(head)
+    number = b.phi(_I64)
+    b.cbranch(b.icmp_signed("<", number, size), inside, after)
+    b.position_at_end(inside)
+    goes_on = act(number)
+    following = b.add(number, _I64(1))
+    number.add_incoming(_I64(0), before)
+    number.add_incoming(following, b.block)
+    last = b.block
+    b.cbranch(goes_on, head, after)
+    b.position_at_end(after)
+    end = b.phi(_I64)
+    end.add_incoming(number, head)
+    end.add_incoming(number, last)
+    return end
