@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import jaxrock as rk
+from jaxrock.engines.taylor.policy import POLICY
 from references.hard_cases import LANES, SAMPLES, engines, outcomes
 
 RTOL = 1e-8
@@ -259,3 +260,39 @@ def test_nonsense_is_found():
         assert nonsense(good | {name: np.array([np.nan])}).all()
         assert nonsense(good | {name: np.array([np.inf])}).all()
     assert nonsense(good | {"overturned": np.array([True])}).all()
+
+
+@pytest.mark.parametrize(
+    "motion, tolerance, most",
+    [
+        ("record", 1e-6, 1e-3),
+        ("sine", 1e-8, 1e-5),
+        pytest.param("record", 1e-8, 1e-5, marks=pytest.mark.slow),
+        pytest.param("record", 1e-11, 1e-8, marks=pytest.mark.slow),
+        pytest.param("sine", 1e-6, 1e-3, marks=pytest.mark.slow),
+        pytest.param("sine", 1e-11, 1e-8, marks=pytest.mark.slow),
+    ],
+)
+def test_what_a_tolerance_leaves_undone_is_told(motion, tolerance, most):
+    """Verdicts are those of the exact series, or there is none; peaks are within the error that is told, and that is
+    not too large to be of use."""
+    motion = rk.SinePulse(0.35, 0.9) if motion == "sine" else rk.example_record()
+    engines = rk.Series(), rk.Series(tolerance=tolerance)
+    scales = jnp.linspace(0.6, 2.4, 150)
+    exact, found = (
+        jax.jit(jax.vmap(lambda a, e=e: rk.outcome(rk.Block(0.2, 2.5, 0.9), a * motion, engine=e)))(scales)
+        for e in engines
+    )
+    good = np.asarray(found.status == rk.Status.successful)
+    assert good.mean() > 0.95
+    np.testing.assert_array_equal(found.overturned[good], exact.overturned[good])
+    standing = good & ~np.asarray(exact.overturned) & np.asarray(exact.max_rotation > 0)
+    off = np.abs(found.max_rotation - exact.max_rotation)[standing]
+    assert standing.sum() > 20 and (off <= (found.error + exact.error)[standing]).all()
+    assert np.median(found.error[standing]) < most
+
+
+def test_less_is_computed_where_less_is_asked():
+    """Orders of steps follow the tolerance, but for what is asked for by itself."""
+    assert [POLICY.order(2, t) for t in (None, 1e-12, 1e-8, 1e-4)] == [16, 15, 11, 8]
+    assert [POLICY.order(5000, t) for t in (None, 1e-12, 1e-8, 1e-4)] == [8, 8, 7, 6]

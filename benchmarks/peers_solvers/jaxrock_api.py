@@ -57,12 +57,15 @@ def scenes(problem, engine, chosen):
 
 SETTINGS = {
     "pulse": (
-        (1e-6, "order 12, tolerance 1e-8", {"order": 12, "tolerance": 1e-8}),
-        (1e-10, "order 18, tolerance 1e-12", {"order": 18, "tolerance": 1e-12}),
-        (1e-12, "order 20", {"order": 20}),
+        (1e-6, "tolerance 1e-8", {"tolerance": 1e-8}),
+        (1e-10, "tolerance 1e-12", {"tolerance": 1e-12}),
         (1e-12, "default", {}),
     ),
-    "record": ((1e-6, "order 6", {"order": 6, "tolerance": 1e-10}), (1e-12, "default", {})),
+    "record": (
+        (1e-6, "tolerance 1e-6", {"tolerance": 1e-6}),
+        (1e-10, "tolerance 1e-8", {"tolerance": 1e-8}),
+        (1e-12, "default", {}),
+    ),
 }
 
 

@@ -53,13 +53,20 @@ Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
 
+def _exact(dtype) -> float:
+    """The tolerance with which rounding is all that is left."""
+    return float(jnp.finfo(dtype).eps) / 2
+
+
 class Series(AbstractEngine):
     """Settings of the series engine.
 
     **Arguments:**
 
-    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16.
-    - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit.
+    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16, and
+      fewer where a `tolerance` leaves room for it.
+    - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
+      ones take less time: half of it at 1e-8, for peaks within 1e-6.
     - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
       (`simulate`, which stores every step).
 
@@ -81,8 +88,8 @@ class Series(AbstractEngine):
             scene=scene,
             stop=stop,
             engine=self,
-            order=self.order or (POLICY.record_order if POLICY.is_record(scene.most_pieces) else POLICY.pulse_order),
-            tolerance=self.tolerance or float(jnp.finfo(scene.p.dtype).eps) / 2,
+            order=self.order or POLICY.order(scene.most_pieces, self.tolerance),
+            tolerance=self.tolerance or _exact(scene.p.dtype),
             history=history,
             taped=taped,
         )
@@ -116,6 +123,11 @@ class TaylorStepper(AbstractStepper):
         """Taylor coefficients of the ground acceleration [g] in a piece, in time/unit, and the unit [s]."""
         shaking, unit = self.scene.shaking(piece, local, self.order)
         return shaking.each(lambda terms: [keep(u, local) for u in terms]), keep(unit, local)
+
+    @property
+    def rounding(self) -> float:
+        """What a step adds to the error, over the slenderness, however small its last terms are."""
+        return min(self.tolerance, _exact(self.scene.p.dtype))
 
     def advance(self, state: State) -> State:
         """One step of a lane."""
@@ -350,7 +362,7 @@ class _Step(NamedTuple):
             coefficients=coefficients,
             length=length,
             full=full,
-            rounded=stepper.tolerance * size,
+            rounded=stepper.rounding * size,
             missed=last_size(coefficients) * length**order,
             signs=signs,
             faster=faster,

@@ -22,7 +22,7 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, step_length, tangent
+from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length, tangent
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
 
@@ -223,6 +223,14 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
 
+def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scalar) -> Scalar:
+    """What the last terms contribute to a step; `least`: what they may. A step that ends early misses less."""
+    if stepper.rounding == stepper.tolerance:
+        return least
+    contributed = last_size(terms) * at**stepper.order
+    return jnp.minimum(least, jnp.maximum(contributed, stepper.rounding / stepper.tolerance * least))
+
+
 def advance(stepper: TaylorStepper, state: State) -> State:
     """One step of a lane that rocks."""
     stepper = stepper.on(state.side)
@@ -245,7 +253,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
     time = jnp.where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
-    errors = 2 * least, 2 * least * jnp.maximum(order / time, 1.0)
+    missed = _missed(stepper, terms, at, least)
+    errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(
         state,

@@ -1,5 +1,6 @@
 """What is policy in the series engine, not mathematics: numbers that change times, but no result beyond its error."""
 
+import math
 from typing import NamedTuple
 
 
@@ -28,6 +29,13 @@ class Policy(NamedTuple):
     def is_record(self, pieces: int) -> bool:
         """Whether a motion of so many pieces counts as a record."""
         return pieces > self.many_pieces
+
+    def order(self, pieces: int, tolerance: float | None) -> int:
+        """Order of the steps where nobody has set it."""
+        digits = math.inf if tolerance is None else -math.log10(tolerance)
+        if self.is_record(pieces):  # whose steps are as long as their pieces, whatever the tolerance
+            return int(min(self.record_order, max(6, digits / 2 + 3)))
+        return int(min(self.pulse_order, max(8, digits + 3)))
 
 
 POLICY = Policy()
