@@ -50,8 +50,8 @@ def scene(
 
     - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars; `motion`: any motion; None leaves it out.
     - `axis`: matplotlib axis; None makes a figure.
-    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it; of a `Rolling`, the edges of
-      the block.
+    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it; of a `Rolling`, the block's
+      edges.
     - `rotation`: at which the block is drawn [rad], in [-pi/2, pi/2].
     - `bending`: displacement of the top of a flexible block by bending, in its first clamped mode [m].
 

@@ -126,7 +126,8 @@ def outcome(
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
     - `duration`: how long to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A rigid
       block is followed to its end.
-    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
+    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` or `Rolling` `Diffrax()`, of
+      tolerance 1e-10 under a record.
     - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is not a
       number, its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with
       `throw=False`, too.
@@ -144,7 +145,7 @@ def outcome(
             "`simulate`."
         )
     say_if_single()
-    model, engine = current_model(model, block, motion), engine_of(engine, model)
+    model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
     block, start = standing(block, model), start_of(initial, throw)
     in_place = isinstance(engine, Series) and is_in_place(motion)
     result = _outcome(block, motion if in_place else padded(motion), model, start, engine)
