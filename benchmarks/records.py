@@ -250,7 +250,7 @@ def main() -> None:
     ]
     header = "one block", "memory, 1,000 samples", f"memory, {COUNT:,} samples", "time, with compiling"
     lines += [
-        "Answered, in a process of its own (samples 5 ms apart; the largest memory that it held, Python and JAX included):",
+        "Answered, each in a process of its own: the largest memory that it held, Python and JAX included.",
         "",
         table(header, answering()),
         "",
