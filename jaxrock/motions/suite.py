@@ -38,6 +38,9 @@ class Suite(AbstractNamed):
     - `azimuth`: (azimuths,) of components [rad], from the first one towards the second: in which vertical planes a
       block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
 
+    `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
+    all scenes share the samples of all records.
+
     `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
     turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
 
