@@ -5,6 +5,7 @@ Needs `pip install "jaxrock[p695]" eqsig`.
 """
 
 import re
+import subprocess
 import sys
 import tempfile
 import time
@@ -67,6 +68,39 @@ def reading() -> list[tuple[str, ...]]:
             taken = min(timed(lambda path=path, given=given: rk.read_record(path, **given))[1] for _ in range(3))
             good = np.allclose(rk.read_record(path, **given).samples, values, atol=1e-12)
         rows.append((kind, f"{taken:.2f} s", str(good)))
+    return rows
+
+
+_ANSWERED = """
+import resource, time, jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+import jaxrock as rk
+noise = np.random.default_rng(7).normal(size={count} + 30)
+record = rk.Record(0.1 * np.convolve(noise, np.ones(31) / 31**0.5, "valid")[: {count}], 0.005)
+block, begin = rk.Block.from_dimensions(0.5, 2.0), time.process_time()
+scales = np.linspace(0.1, 2.0, 256)
+{what}.block_until_ready()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, time.process_time() - begin)
+"""
+ANSWERS = {
+    "an outcome": "rk.outcome(block, record).margin",
+    "outcomes at 256 scales": "jax.vmap(lambda s: rk.outcome(block, s * record).margin)(scales)",
+    "a history": "rk.simulate(block, record).rotation",
+}
+
+
+def answering() -> list[tuple[str, ...]]:
+    """Largest memory of a process that answers a record, with Python, JAX and compiling; and seconds with compiling."""
+    rows = []
+    for name, what in ANSWERS.items():
+        told = []
+        for count in (1000, COUNT):
+            script = _ANSWERED.format(count=count, what=what)
+            done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+            told.append([float(x) for x in done.stdout.split()])
+        (little, _), (much, busy) = told
+        rows.append((name, f"{little:.0f} MB", f"{much:.0f} MB", f"{busy:.0f} s"))
     return rows
 
 
@@ -212,6 +246,13 @@ def main() -> None:
         f"## A file of {COUNT:,} samples",
         "",
         table(("format", "read in", "every sample right"), reading()),
+        "",
+    ]
+    header = "one block", "memory, 1,000 samples", f"memory, {COUNT:,} samples", "time, with compiling"
+    lines += [
+        "Answered, each in a process of its own: the largest memory that it held, Python and JAX included.",
+        "",
+        table(header, answering()),
         "",
     ]
     print("\n".join(lines), flush=True)

@@ -6,8 +6,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.patches import Polygon
+from scipy.integrate import quad
 
 import jaxrock as rk
+from jaxrock.plot.bodies import Body
 
 BLOCK = rk.Block.from_dimensions(0.6, 1.8)
 ROCK = rk.AsymmetricBlock.from_corners([0.3, 0.0], [-0.2, 0.0], [0.0, 0.9], 0.5)
@@ -189,3 +191,46 @@ def test_other_endings_are_refused(response, tmp_path):
     film = started(rk.plot.animate(response, fps=2))
     with pytest.raises(ValueError, match="Argument `path` must end with .gif, .html or .mp4"):
         rk.plot.save_animation(film, tmp_path / "film.avi")
+
+
+# ------------------------------------------------------------------------------------------------- rounded edges
+
+PROFILE = rk.blocks.Edge([0.6, 0.2, 0.0], [0.0, 0.15, 0.3])
+EDGES = {
+    "circle": (BLOCK, rk.models.Rolling(0.3)),
+    "profile": (BLOCK, rk.models.Rolling(PROFILE)),
+    "two sides": (ROCK, rk.models.Rolling(0.4, 0.1)),
+}
+
+
+@pytest.mark.parametrize("rotation", [0.2, -0.2, 0.6])
+@pytest.mark.parametrize("name", EDGES)
+def test_a_rounded_edge_rolls_on_the_ground(name, rotation):
+    """Nothing of it is below the ground, it touches, and its centre is where the equation of motion has it."""
+    block, model = EDGES[name]
+    body = Body.of(block, model)
+    shapes = body.pose(rotation)
+    outline = rk.plot.scene(block, model=model, rotation=rotation).patches[1].get_xy()[:-1]
+    np.testing.assert_array_equal(outline, shapes.outline)
+    assert abs(outline[:, 1].min()) < 2e-4  # drawn by straight lines
+    edge = body.edges[0 if rotation > 0 else 1]
+    corner = body.right if rotation > 0 else body.left
+    radius, alpha = np.hypot(*(body.centre - corner)), np.arctan2(abs(corner[0] - body.centre[0]), body.centre[1])
+    x, reach = abs(rotation), quad(edge.at, 0, abs(rotation), points=(0.15, 0.3))[0]
+    np.testing.assert_allclose(shapes.pivot, corner + [np.sign(rotation) * radius * reach, 0.0], atol=1e-8)
+    away = np.array([np.sign(rotation), 1.0]) * (body.placed(body.centre, rotation) - shapes.pivot) / radius
+    expected = -np.sin(alpha - x) - float(edge.run(x)), np.cos(alpha - x) + float(edge.rise(x))
+    np.testing.assert_allclose(away, expected, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_film_of_a_block_that_rolls():
+    """It knows the edges of the response."""
+    model, initial = EDGES["circle"][1], (0.1, 0.0)
+    response = rk.simulate(BLOCK, rk.SinePulse(0.5, 0.6), model, initial=initial, duration=0.4)
+    film = rk.plot.animate(response, BLOCK, fps=5)
+    for number, time in enumerate((0.0, 0.2, 0.4)):
+        outline = film._func(number)[0].get_xy()[:-1]
+        rotation = float(response(np.array([time]))[0][0])
+        np.testing.assert_allclose(outline, Body.of(BLOCK, model).pose(rotation).outline, atol=1e-9)
+    assert abs(rotation) > 0.01

@@ -60,3 +60,10 @@ def test_scales_of_a_record_share_its_arrays(vertical):
     scales = jnp.linspace(0.5, 2.0, 200)
     memory = jax.jit(jax.vmap(margin)).lower(scales).compile().memory_analysis()
     assert memory.temp_size_in_bytes < (500 if vertical else 40) * record.samples.nbytes
+
+
+def test_one_scene_holds_its_lists_once():
+    """Not once for each lane of a vector: a record of a million samples is answered in little memory."""
+    record, block = rk.example_record(), rk.Block(0.2, 2.0)
+    memory = jax.jit(lambda r: rk.outcome(block, r, **QUICK).margin).lower(record).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 25 * record.samples.nbytes

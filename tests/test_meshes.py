@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.blocks.slab import Slab
 
 trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
 
@@ -147,3 +148,91 @@ def holed():
 def test_what_is_refused(mesh, given, message):
     with pytest.raises(OSError if message is None else ValueError, match=message):
         rk.AsymmetricBlock.from_mesh(mesh, 0.0, **given)
+
+
+# ------------------------------------------------------------------------------------------------ cuts by a plane
+
+
+def ellipsoid(*axes, height=0.0):
+    """A ball, drawn out; the ground takes the lowest part of it away."""
+    mesh = trimesh.creation.icosphere(5)
+    mesh.apply_scale(axes)
+    if height:
+        mesh = mesh.slice_plane([0, 0, -height], [0, 0, 1], cap=True)
+    return mesh
+
+
+def cone():
+    return trimesh.creation.cone(0.5, 2.0, sections=720)
+
+
+CUTS = {  # mesh, azimuth [rad]; alpha, height of the centre [m], gyration radius [m] of the cut
+    "box": (box, 0.0, np.arctan2(WIDTH, HEIGHT), HEIGHT / 2, np.sqrt((WIDTH**2 + HEIGHT**2) / 12)),
+    "box, from its narrow side": (box, np.pi / 2, np.arctan2(DEPTH, HEIGHT), 1.0, np.sqrt((DEPTH**2 + 4) / 12)),
+    "box, across its corners": (box, np.arctan2(DEPTH, WIDTH), np.arctan2(np.hypot(DEPTH, WIDTH), HEIGHT), 1.0,
+                                np.sqrt((DEPTH**2 + WIDTH**2 + 4) / 12)),
+    # A triangle: its centre is at a third of the height, that of the cone at a quarter.
+    "cone": (cone, 0.0, np.arctan2(0.5, 2 / 3), 2 / 3, np.sqrt(0.5**2 / 6 + 2**2 / 18)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_a_cut_is_the_slab_of_its_outline(name):
+    mesh, azimuth, alpha, height, gyration = CUTS[name]
+    section = rk.blocks.Rock.from_mesh(mesh(), tolerance=1e-6).section(azimuth, plane="cut")
+    assert section.slenderness == pytest.approx((alpha, alpha), rel=2e-5)
+    assert section.centre[1] == pytest.approx(height, rel=2e-5)
+    assert section.gyration_radius == pytest.approx(gyration, rel=2e-5)
+
+
+def test_what_a_plane_cuts_out_of_an_ellipsoid():
+    """An ellipse: area pi a c, second moment (a^2 + c^2)/4; with a hole where the body has one."""
+    a, c, inner = 0.5, 0.8, ellipsoid(0.2, 0.2, 0.2)
+    inner.invert()
+    whole = trimesh.util.concatenate([ellipsoid(a, 0.6, c), inner])
+    for mesh, hole in ((ellipsoid(a, 0.6, c), 0.0), (whole, 0.2)):
+        slab = Slab.cut(mesh.vertices[:, [0, 2]], mesh.vertices[:, 1], mesh.faces)
+        area = np.pi * (a * c - hole**2)
+        second = np.pi / 4 * (a * c * (a**2 + c**2) - 2 * hole**4)
+        assert slab.area == pytest.approx(area, rel=2e-3)
+        np.testing.assert_allclose(slab.centre, 0, atol=1e-9)
+        assert slab.gyration_radius == pytest.approx(np.sqrt(second / area), rel=2e-3)
+    with pytest.raises(ValueError, match="passes it by"):
+        Slab.cut(mesh.vertices[:, [0, 2]], mesh.vertices[:, 1] - 3.0, mesh.faces)
+
+
+def test_a_cut_block_beside_its_outline():
+    """A prism seen along its own axis: cut, projection and outline are one block."""
+    outline = np.array([[-0.3, 0.0], [0.2, 0.0], [0.5, 1.5], [-0.2, 1.2]])
+    ends = [np.column_stack([outline[:, 0], np.full(4, y), outline[:, 1]]) for y in (0.0, 0.7)]
+    mesh = trimesh.convex.convex_hull(np.concatenate(ends))
+    found = [rk.AsymmetricBlock.from_mesh(mesh, 0.0, plane=plane) for plane in ("cut", "projection")]
+    for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
+        cut, projected, plane = (float(getattr(x, name)) for x in (*found, rk.AsymmetricBlock.from_outline(outline)))
+        assert cut == pytest.approx(plane, rel=1e-9) and projected == pytest.approx(plane, rel=1e-9)
+
+
+def test_a_rounded_cut_rolls_as_its_prism_does():
+    rock = rk.blocks.Rock.from_mesh(rounded(), tolerance=0.005)
+    openings = np.linspace(0, 0.3, 7)
+    spacing = 1.0 / 400  # the plane cuts faces between their vertices, too
+    np.testing.assert_allclose(rock.arms(0.0, openings, "cut"), rock.arms(0.0, openings), atol=spacing)
+    assert rock.section(0.0, plane="cut").rolls == (True, True)
+    for one, other in zip(rock.edges(0.0, plane="cut"), rock.edges(0.0)):
+        np.testing.assert_allclose(one.run(openings), other.run(openings), atol=3 * spacing)
+
+
+def test_a_cut_that_does_not_stand():
+    """Of a rock on legs the plane through the centre cuts none."""
+    legs = [trimesh.creation.box((0.1, 0.1, 0.5)) for _ in range(4)]
+    for leg, (x, y) in zip(legs, ((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        leg.apply_translation([0.4 * x, 0.4 * y, 0.25])
+    top = trimesh.creation.box((1.0, 1.0, 0.5))
+    top.apply_translation([0, 0, 0.75])
+    rock = rk.blocks.Rock.from_mesh(trimesh.util.concatenate([*legs, top]))
+    assert rock.section(0.0).slenderness[0] == pytest.approx(np.arctan2(0.45, rock.centre[2]))
+    flat = rock.section(0.0, plane="cut")  # the plate alone, on its own ground
+    assert flat.slenderness[0] == pytest.approx(np.arctan2(0.5, 0.25))
+    bare = rock._replace(faces=None)
+    with pytest.raises(ValueError, match="without `faces`"):
+        bare.section(0.0, plane="cut")

@@ -5,6 +5,7 @@ import types
 
 import numpy as np
 import pytest
+import scipy.signal
 
 import jaxrock as rk
 from references.damaged_files import FILES, SAMPLES
@@ -190,6 +191,96 @@ def test_spectra_that_are_refused(file, text, message):
     assert text != V3, "nothing was replaced"
     with pytest.raises(ValueError, match=f"^File `motion.txt`: .*{message}"):
         rk.motions.read_spectra(file(text))
+
+
+# ------------------------------------------------------------------------------- whole files of an agency
+
+CHANNELS, COUNT, RATE = ("360 Deg", "Up", "90 Deg"), 1603, 200
+PERIODS, DAMPINGS = np.round(np.geomspace(0.04, 15.0, 91), 3), (0.0, 0.02, 0.05, 0.1, 0.2)
+
+
+def columns(values, form, each):
+    """Numbers in lines, as FORTRAN prints them, with the ends of lines of another system."""
+    told = [form % value for value in values]
+    return "".join("".join(told[k : k + each]) + "\r\n" for k in range(0, len(told), each))
+
+
+def shaken(channel):
+    """A made accelerogram of a channel [g], to the digits of a file."""
+    time = np.arange(COUNT) / RATE
+    return np.round(0.3 * np.sin((7 + 5 * channel) * time) * np.exp(-(((time - 3) / 1.5) ** 2)), 6)
+
+
+def peaks(samples, period, damping):
+    """Sd, Sv [inches, s] and Sa [g] by SciPy: of an oscillator relative to the ground, and its own acceleration."""
+    omega = 2 * np.pi / period
+    system = scipy.signal.lti(
+        [[0, 1], [-(omega**2), -2 * damping * omega]], [[0], [-980.665 / 2.54]], np.eye(2), np.zeros((2, 1))
+    )
+    step = min(1 / RATE, period / 40)  # straight lines between samples
+    time = np.arange(0, (COUNT - 1) / RATE, step)
+    _, state, _ = scipy.signal.lsim(system, np.interp(time, np.arange(COUNT) / RATE, samples), time)
+    own = (omega**2 * state[:, 0] + 2 * damping * omega * state[:, 1]) / (980.665 / 2.54)
+    return np.abs(state[:, 0]).max(), np.abs(state[:, 1]).max(), np.abs(own).max()
+
+
+def whole_v1(channel, name):
+    head = ["Uncorrected Accelerogram Data             Processed: 02/13/12, CGS  146be002",
+            "Record of Mon Feb 13, 2012 13:06:45.0 PST             (Avol1 v9.2)", "", "Start time:  2/13/12, 21:06 UTC",
+            "Station No. 89146   40.941N, 123.633W", "Willow Creek - Fire Station              CGS",
+            f"Chan  {channel + 1}: {name}", *[""] * 3, "Units of uncor data are sec and g .        "
+            f"Max  = {np.abs(shaken(channel)).max():6.3f} g , at   3.010 sec.", "", ""]  # fmt: skip
+    announced = f" {COUNT} Accelerogram points at {RATE} pts/sec in units of g .      Format: (8f9.6)\r\n"
+    return (
+        "\r\n".join(head) + "\r\n" + columns(np.zeros(100, int), "%5d", 16) + columns(np.zeros(50), "%10.3f", 8)
+        + announced + columns(shaken(channel), "%9.6f", 8)
+        + f"/&  ----------  End of Data for Channel  {channel + 1}  ----------\r\n"
+    )  # fmt: skip
+
+
+def whole_v3(channel, name, few):
+    """Spectra by SciPy at the periods `few`, and ones that agree with each other at the others."""
+    head = [f"Response and Fourier amplitude spectra ({PERIODS.size} periods,  .04 - 15.0 sec)   for",
+            "Corrected accelerogram, band of 0.1 to 40 Hz", "", "Record of Mon Feb 13, 2012 13:06:45.0 PST", "",
+            "Start time:  2/13/12, 21:06 UTC", "Station No. 89146   40.941N, 123.633W", "Willow Creek - Fire Station",
+            f"Chan  {channel + 1}: {name}", *[""] * 12,
+            "Units for spectra are inches and sec, except Sa is in fraction of g.", ""]  # fmt: skip
+    room = np.zeros(100 - PERIODS.size)
+    text = "\r\n".join(head) + "\r\n" + columns(np.zeros(100), "%10.3f", 8) + columns(DAMPINGS, "%10.3f", 8)
+    text += columns([*PERIODS, *room], "%10.3f", 8) + "Fourier amplitude spectra in in/sec.\r\n"
+    text += columns(np.zeros(100), "%10.2E", 8)
+    for damping in DAMPINGS:
+        spectra = np.stack([PERIODS, 2 * np.pi * np.ones_like(PERIODS), np.ones_like(PERIODS)])
+        for k in few:
+            spectra[:, k] = peaks(shaken(channel), PERIODS[k], damping)
+        pseudo, times = 2 * np.pi * spectra[0] / PERIODS, np.full(PERIODS.size, 3.0)
+        text += f"Damping = {damping:5.2f}. Data of Sd,Sv,Sa,Pssv,ttSd,ttSv,ttSa :\r\n"
+        for values in (*spectra, pseudo, times, times, times):
+            text += columns([*values, *room], "%10.3E", 8)
+    return text + f"/&   ----------  End of spectral data for channel  {channel + 1}  ----------\r\n"
+
+
+def test_three_channels_and_their_spectra(file):
+    """A V1 and a V3 of one station: what is published of a channel is what its record's oscillators do, by SciPy."""
+    few = (30, 60)
+    record_file = "".join(whole_v1(*each) for each in enumerate(CHANNELS))
+    spectra_file = "".join(whole_v3(*each, few) for each in enumerate(CHANNELS))
+    for channel, name in enumerate(CHANNELS):
+        record = rk.read_record(file(record_file), column=channel)
+        np.testing.assert_allclose(record.samples, shaken(channel), atol=1e-12)
+        assert (float(record.dt), record.samples.size, record.origin.component) == (1 / RATE, COUNT, name)
+        found = rk.motions.read_spectra(file(spectra_file), channel=channel)
+        assert found.origin.component == name and tuple(found.damping) == DAMPINGS
+        np.testing.assert_array_equal(found.period, PERIODS)
+        for row in (2, 3):
+            for k in few:
+                for pseudo, told in ((True, found.pseudo_velocity), (False, found.velocity)):
+                    own = rk.intensity.spectral_velocity(record, PERIODS[k], DAMPINGS[row], pseudo)
+                    assert told[row, k] == pytest.approx(float(own), rel=5e-3)
+        with pytest.raises(ValueError, match="the file is cut off, or holds more"):
+            whole = spectra_file[: spectra_file.rindex("/&")]
+            rk.motions.read_spectra(file(whole), channel=2)
+    assert rk.read_record(file(record_file.replace("\r\n", "\n")), column=1).origin.component == "Up"
 
 
 # ------------------------------------------------------------------------------------------- components

@@ -16,6 +16,7 @@ from scipy.integrate import quad, solve_ivp
 
 import jaxrock as rk
 from jaxrock.models.equation import Angle
+from jaxrock.responses.arguments import engine_of
 
 GRAVITY = 9.81
 EXACT = {"engine": rk.Diffrax(rtol=1e-11)}
@@ -125,6 +126,31 @@ def test_beside_newton(alpha, radius, dip):
     np.testing.assert_allclose(response.velocity[:-1], found[1], atol=2e-8)
     np.testing.assert_allclose(contact.horizontal[:-1], found[2], atol=1e-7)
     np.testing.assert_allclose(contact.normal[:-1], found[3], atol=1e-7)
+
+
+def test_the_tolerance_under_a_record():
+    """A step goes from sample to sample in any case: a tight tolerance costs nothing, and decides more."""
+    model = rk.models.Rolling(0.2)
+    usual = [engine_of(None, model, motion) for motion in (rk.example_record(), SINE)]
+    assert [engine.rtol for engine in usual] == [1e-10, 1e-8]
+    assert engine_of(None, rk.Housner(), SINE) == rk.Series() and engine_of(usual[1], model, SINE) is usual[1]
+
+
+@pytest.mark.slow
+def test_long_rocking_is_decided():
+    """Of 40 blocks that rock under the built-in record, none or one is too close to call."""
+    random, record, count = np.random.default_rng(1), rk.example_record(), 40
+    alpha, scale, p = random.uniform(0.12, 0.3, count), random.uniform(0.6, 1.6, count), random.uniform(1.5, 4.0, count)
+
+    def run(engine):
+        one = lambda a, p, s: rk.outcome(rk.Block(a, p), s * record, rk.models.Rolling(0.2), engine=engine)
+        return jax.vmap(one)(alpha, p, scale)
+
+    usual, loose = run(None), run(rk.Diffrax())
+    good = np.asarray(usual.status == rk.Status.successful)
+    both = good & np.asarray(loose.status == rk.Status.successful)
+    assert good.sum() >= max(both.sum(), count - 1)
+    np.testing.assert_array_equal(np.asarray(usual.overturned)[both], np.asarray(loose.overturned)[both])
 
 
 @pytest.mark.slow

@@ -237,6 +237,7 @@ class AsymmetricBlock(Owner):
         azimuth: ArrayLike,
         *,
         base: Annotated[str, word_of("narrow", "wide")] = "narrow",
+        plane: Annotated[str, word_of("projection", "cut")] = "projection",
         unit: Annotated[str, word_of("m", "cm", "mm")] = "m",
         tolerance: ArrayLike | None = None,
         restitution: Ratios = None,
@@ -249,14 +250,14 @@ class AsymmetricBlock(Owner):
 
         - `mesh`: a `Rock`, which knows `unit` and `tolerance`, or what `Rock.from_mesh` takes, with these as there.
         - `azimuth`: from the first axis towards the second [rad]; its direction is to the right (corner 1).
-        - `base`: "narrow" or "wide", as in `Rock.section`: where they differ the base is rounded, and it warns.
+        - `base`, `plane`: as in `Rock.section`. Where bases differ they are rounded, and it warns.
         - `restitution`, `gravity`: as in `from_radii`.
 
         **Returns:** an `AsymmetricBlock`: rocking in the plane alone, without twisting, rolling sideways, or sliding.
 
         **Raises:** as `Rock.from_mesh`, and ValueError for arguments outside their ranges.
         """
-        return cls.from_corners(*section_of(mesh, azimuth, base, unit, tolerance)[:4], restitution, gravity)
+        return cls.from_corners(*section_of(mesh, azimuth, base, plane, unit, tolerance)[:4], restitution, gravity)
 
     @property
     def radius_ratio(self) -> Real:

@@ -74,6 +74,18 @@ class Edge(eqx.Module):
             return found
         return found + jnp.sum(self._bends * 2 * sine_cosine(self._beyond(opening) / 2)[0] ** 2, -1)
 
+    def length(self, opening: ArrayLike) -> Real:
+        """How far it has rolled along the ground, over R: the integral of the radius."""
+        found = self._first * jnp.asarray(opening)
+        return found if self.angle is None else found + jnp.sum(self._bends * self._beyond(opening) ** 2, -1) / 2
+
+    def place(self, opening: ArrayLike) -> tuple[Real, Real]:
+        """Where the edge touches the ground when the block has opened by an angle, from the corner outward and upward
+        on the block as it stands, over R: the integrals of cos(y) radius(y) and sin(y) radius(y)."""
+        sine, cosine = sine_cosine(jnp.asarray(opening))
+        run, rise = self.run(opening), self.rise(opening)
+        return cosine * run + sine * rise, sine * run - cosine * rise
+
     @property
     def _first(self) -> Real:
         return self.radius if self.angle is None else self.radius[0]

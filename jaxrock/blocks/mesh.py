@@ -8,13 +8,15 @@ import warnings
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float, Int
 
 from jaxrock._arguments import arguments, at_least, path_of, word_of
 from jaxrock._checks import Values, finite, positive, scalar, shown
 from jaxrock.blocks.edge import Edge, fitted_edge
+from jaxrock.blocks.slab import Slab
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_PLANES = ("projection", "cut")
 _SMOOTH = 0.2  # of the longest arm of the weight, by which a smooth edge may differ from the faces of a mesh
 _SHARE = 0.01  # of the height, within which vertices stand on the ground
 
@@ -45,6 +47,7 @@ class Rock(NamedTuple):
 
     - `volume` [m^3]; `centre`: (3,) of mass; `inertia`: (3, 3) about it, over the mass [m^2].
     - `vertices`: (n, 3); `base`: (k, 3) those within `tolerance` of the lowest, on which it stands.
+    - `faces`: (m, 3) numbers of the vertices of its triangles, turned outward; None: it cannot be cut.
     """
 
     volume: float
@@ -53,6 +56,7 @@ class Rock(NamedTuple):
     vertices: Float[np.ndarray, "n 3"]
     base: Float[np.ndarray, "k 3"]
     tolerance: float
+    faces: Int[np.ndarray, "m 3"] | None = None
 
     @classmethod
     @arguments
@@ -86,7 +90,8 @@ class Rock(NamedTuple):
             _SHARE * height if tolerance is None else float(scalar("tolerance", positive("tolerance", tolerance)))
         )
         base = vertices[vertices[:, 2] <= vertices[:, 2].min() + tolerance]
-        rock = cls(volume, factor * np.asarray(mesh.center_mass, float), inertia, vertices, base, tolerance)
+        centre, faces = factor * np.asarray(mesh.center_mass, float), np.asarray(mesh.faces, int)
+        rock = cls(volume, centre, inertia, vertices, base, tolerance, faces)
         for azimuth in np.linspace(0, np.pi, 180, endpoint=False):
             section = rock._between(azimuth)
             if not section.left[0] < 0 < section.right[0]:
@@ -98,7 +103,12 @@ class Rock(NamedTuple):
         return rock
 
     @arguments
-    def section(self, azimuth: ArrayLike, base: Annotated[str, word_of("narrow", "wide")] = "narrow") -> Section:
+    def section(
+        self,
+        azimuth: ArrayLike,
+        base: Annotated[str, word_of("narrow", "wide")] = "narrow",
+        plane: Annotated[str, word_of(*_PLANES)] = "projection",
+    ) -> Section:
         """The rock as it rocks in the plane of an azimuth.
 
         **Arguments:**
@@ -109,27 +119,30 @@ class Rock(NamedTuple):
           which stands on its base and then rolls lies between those of the two at every rotation. So the two bound how
           it resists; that one topples and it does not is still possible, because toppling is not ordered. For a flat
           base both are the same.
+        - `plane`: "projection": of all vertices to the plane, with the rock's own mass and inertia: what rocks about an
+          axis across it. "cut": the slab of even thickness that the plane through the centre of mass cuts out, with
+          the slab's own centre, inertia and ground: a rock as a photograph or an outline tells it.
 
-        **Returns:** a `Section`: the projection of all vertices to the plane.
+        **Returns:** a `Section`.
 
-        **Raises:** ValueError for an azimuth that is not finite.
+        **Raises:** ValueError for an azimuth that is not finite; for a cut whose centre is not above its ground.
         """
-        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
-        narrow = self._between(azimuth)
-        points = self._projected(azimuth)
-        last = [_rolled(points * [side, 1], corner * [side, 1], self.centre[2]) * [side, 1]
+        narrow, points = self._seen(azimuth, plane)
+        last = [_rolled(points * [side, 1], corner * [side, 1], narrow.centre[1]) * [side, 1]
                 for side, corner in ((1, narrow.right), (-1, narrow.left))]  # fmt: skip
         right, left = (not np.allclose(end, corner) for end, corner in zip(last, (narrow.right, narrow.left)))
         found = narrow._replace(rolls=(right, left))
         return found._replace(right=last[0], left=last[1]) if base == "wide" else found
 
     @arguments
-    def arms(self, azimuth: ArrayLike, opening: Values) -> Float[np.ndarray, "2 openings"]:
+    def arms(
+        self, azimuth: ArrayLike, opening: Values, plane: Annotated[str, word_of(*_PLANES)] = "projection"
+    ) -> Float[np.ndarray, "2 openings"]:
         """How far out it touches the ground, from its centre of mass, when it has opened on its base by an angle.
 
         **Arguments:**
 
-        - `azimuth`: as in `section`.
+        - `azimuth`, `plane`: as in `section`.
         - `opening`: (openings,) opening angles [rad].
 
         **Returns:** (2, openings) distances along the ground to the right and to the left [m]: the arm of the weight,
@@ -140,18 +153,22 @@ class Rock(NamedTuple):
         angles = np.asarray(finite("opening", opening), float)
         if angles.ndim != 1:
             raise ValueError(f"Argument `opening` must be a list, but has shape {angles.shape}.")
-        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
-        narrow, points = self._between(azimuth), self._projected(azimuth)
+        narrow, points = self._seen(azimuth, plane)
         sides = (1.0, narrow.right), (-1.0, narrow.left)
-        return np.stack([_arms(points * [way, 1], end * [way, 1], self.centre[2], angles) for way, end in sides])
+        return np.stack([_arms(points * [way, 1], end * [way, 1], narrow.centre[1], angles) for way, end in sides])
 
     @arguments
-    def edges(self, azimuth: ArrayLike, knots: Annotated[int, at_least(2, 64)] = 8) -> tuple[Edge, Edge]:
+    def edges(
+        self,
+        azimuth: ArrayLike,
+        knots: Annotated[int, at_least(2, 64)] = 8,
+        plane: Annotated[str, word_of(*_PLANES)] = "projection",
+    ) -> tuple[Edge, Edge]:
         """The rounded edges on which it rolls to the right and to the left, for `jaxrock.models.Rolling`.
 
         **Arguments:**
 
-        - `azimuth`: as in `section`.
+        - `azimuth`, `plane`: as in `section`.
         - `knots`: at how many opening angles, from 0 to its balance, the radius of curvature is told.
 
         **Returns:** a pair of `Edge`: those whose points of contact are nearest to the vertices, by least squares; each
@@ -161,36 +178,13 @@ class Rock(NamedTuple):
 
         **Raises:** ValueError for arguments outside their ranges.
         """
-        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
-        section, points = self.section(azimuth), self._projected(azimuth)
+        section, points = self.section(azimuth, plane=plane), self._seen(azimuth, plane)[1]
 
         def edge(way, corner, rolls):
-            return self._edge(points * [way, 1], corner * [way, 1], knots) if rolls else Edge(0.0)
+            return _edge(points * [way, 1], corner * [way, 1], section.centre[1], knots) if rolls else Edge(0.0)
 
         right, left = section.rolls
         return edge(1.0, section.right, right), edge(-1.0, section.left, left)
-
-    def _edge(self, points: np.ndarray, corner: np.ndarray, knots: int) -> Edge:
-        """The rounded edge to the right of a corner."""
-        radius, alpha = (
-            np.hypot(corner[0], self.centre[2] - corner[1]),
-            np.arctan2(corner[0], self.centre[2] - corner[1]),
-        )
-        contact, opening = _touching(points, corner)
-        arms = contact[:, 0] * np.cos(opening) + (contact[:, 1] - self.centre[2]) * np.sin(opening)
-        last = int(np.argmax(arms <= 0)) + 1 if (arms <= 0).any() else arms.size
-        opening, arms = opening[:last], arms[:last]
-        found = fitted_edge(opening, arms / radius - np.sin(alpha - opening), knots)
-        angles = np.linspace(0.0, opening[-1], 200)
-        own = _arms(points, corner, self.centre[2], angles)
-        off = np.abs(radius * (np.sin(alpha - angles) + np.asarray(found.run(angles))) - own).max()
-        if off > _SMOOTH * own.max():
-            warnings.warn(
-                f"The base is made of faces: on a smooth edge the arm of the weight is up to {off:.3g} m off, of "
-                f"{own.max():.3g} m. See also what bounds it, by `base` of `AsymmetricBlock.from_mesh`.",
-                stacklevel=4,
-            )
-        return found
 
     @arguments
     def slenderness(self, azimuth: Values) -> Float[np.ndarray, "azimuths"]:
@@ -205,9 +199,15 @@ class Rock(NamedTuple):
         """How far all vertices lie in the direction of an azimuth from the centre of mass [m]."""
         return (self.vertices - self.centre)[:, :2] @ _direction(float(scalar("azimuth", finite("azimuth", azimuth))))
 
-    def _projected(self, azimuth: float) -> Float[np.ndarray, "n 2"]:
-        """Width, from the centre of mass, and height of all vertices."""
-        return np.stack([self.widths(azimuth), self.vertices[:, 2]], axis=1)
+    def _seen(self, azimuth: ArrayLike, plane: str) -> tuple[Section, Float[np.ndarray, "n 2"]]:
+        """The section by the points on the ground alone; width, from the centre of mass, and height of all points."""
+        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
+        points = np.stack([self.widths(azimuth), self.vertices[:, 2]], axis=1)
+        if plane == "projection":
+            return self._between(azimuth), points
+        if self.faces is None:
+            raise ValueError("Argument `plane` must be 'projection' for a rock without `faces`.")
+        return _standing(Slab.cut(points, self.widths(azimuth + np.pi / 2), self.faces), self.tolerance)
 
     def _between(self, azimuth: float) -> Section:
         """The section by the points on the ground alone."""
@@ -220,16 +220,53 @@ class Rock(NamedTuple):
         )
 
 
-def section_of(mesh: Any, azimuth: ArrayLike, base: str, unit: str, tolerance: ArrayLike | None) -> Section:
+def section_of(mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str, tolerance: ArrayLike | None) -> Section:
     """The section of a rock or a mesh; it warns of a base that rolls."""
     rock = mesh if isinstance(mesh, Rock) else Rock.from_mesh(mesh, unit=unit, tolerance=tolerance)
-    found = rock.section(azimuth, base)
+    found = rock.section(azimuth, base, plane)
     if any(found.rolls):
-        ends = [max(rock.section(azimuth, each).slenderness) for each in ("narrow", "wide")]
+        ends = [max(rock.section(azimuth, each, plane).slenderness) for each in ("narrow", "wide")]
         warnings.warn(
             f"The base is rounded: the rock rolls on before it is in balance, at {ends[0]:.3g} rad if it rocked about "
             f"the ground it stands on, at {ends[1]:.3g} rad if about where it rolls to. See both, with `base`; or let "
             "it roll, by the model `jaxrock.models.Rolling(*rock.edges(azimuth))`.",
+            stacklevel=4,
+        )
+    return found
+
+
+def _standing(slab: Slab, tolerance: float) -> tuple[Section, Float[np.ndarray, "n 2"]]:
+    """A slab on the ground within a tolerance of its lowest point, and the points of its outline."""
+    points = slab.points - [slab.centre[0], 0.0]
+    ground = points[points[:, 1] <= points[:, 1].min() + tolerance]
+    right, left = ground[ground[:, 0].argmax()], ground[ground[:, 0].argmin()]
+    if not left[0] < 0 < right[0]:
+        raise ValueError(
+            "Argument `plane` must be 'projection' for a rock whose cut does not stand: its centre is not above the "
+            f"ground within {tolerance:.3g} m of the lowest point of the cut."
+        )
+    centre = np.array([0.0, slab.centre[1]])
+    return Section(right, left, centre, slab.gyration_radius, (False, False)), points
+
+
+def _edge(points: np.ndarray, corner: np.ndarray, height: float, knots: int) -> Edge:
+    """The rounded edge to the right of a corner."""
+    radius, alpha = (
+        np.hypot(corner[0], height - corner[1]),
+        np.arctan2(corner[0], height - corner[1]),
+    )
+    contact, opening = _touching(points, corner)
+    arms = contact[:, 0] * np.cos(opening) + (contact[:, 1] - height) * np.sin(opening)
+    last = int(np.argmax(arms <= 0)) + 1 if (arms <= 0).any() else arms.size
+    opening, arms = opening[:last], arms[:last]
+    found = fitted_edge(opening, arms / radius - np.sin(alpha - opening), knots)
+    angles = np.linspace(0.0, opening[-1], 200)
+    own = _arms(points, corner, height, angles)
+    off = np.abs(radius * (np.sin(alpha - angles) + np.asarray(found.run(angles))) - own).max()
+    if off > _SMOOTH * own.max():
+        warnings.warn(
+            f"The base is made of faces: on a smooth edge the arm of the weight is up to {off:.3g} m off, of "
+            f"{own.max():.3g} m. See also what bounds it, by `base` of `AsymmetricBlock.from_mesh`.",
             stacklevel=4,
         )
     return found

@@ -28,8 +28,9 @@ class _Ahead(eqx.Module):
         """Of a component; no derivatives."""
         values = jax.lax.stop_gradient(jnp.pad(bounds.values, (0, 1)))
         if values.size <= _NEAR:
-            return cls(bounds, _running_maximum(values), values, values)
-        return cls(bounds, _running_maximum(values), *(_sliding_maximum(values, width) for width in (_NEAR, _FAR)))
+            return cls(bounds, _running_maximum(values, bounds.left), values, values)
+        to_end = _running_maximum(values, bounds.left)
+        return cls(bounds, to_end, *(_sliding_maximum(values, width) for width in (_NEAR, _FAR)))
 
     def at(self, values: Inexact[Array, " knots"], piece: Int[Array, ""]) -> Scalar:
         """One of these bounds."""
@@ -55,7 +56,7 @@ class Outlook(eqx.Module):
         """Bound of what ever acts against the threshold [g], with its derivatives."""
         horizontal = self.horizontal.bounds
         if self.vertical is None:
-            return horizontal.times_gain(jnp.max(horizontal.values))
+            return horizontal.strongest
         vertical = self.vertical.bounds
         weight = self.threshold * vertical.times_gain(vertical.values)
         return jnp.max(horizontal.times_gain(horizontal.values) + weight)
@@ -89,22 +90,26 @@ def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array,
     return _doubled(values, width.bit_length() - 1)
 
 
-def _running_maximum(values: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
-    """Largest of the values from each position on; XLA's own takes n^2 operations on CPUs."""
-    return _doubled(values, (values.size - 1).bit_length())
+def _running_maximum(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on, or of so many as are `left`; XLA's own takes n^2 operations on
+    CPUs."""
+    return _doubled(values, (values.size - 1).bit_length(), left)
 
 
-def _doubled(values: Inexact[Array, " n"], times: int) -> Inexact[Array, " n"]:
-    """Largest of the 2^times values from each position on (zeros beyond the end; none is negative).
+def _doubled(values: Inexact[Array, " n"], times: int, left: Int[Array, " m"] | None = None) -> Inexact[Array, " n"]:
+    """Largest of the 2^times values from each position on (zeros beyond the end, and beyond what is `left` from a
+    position on; none is negative).
 
     A loop for many: unrolled, or as a scan of JAX, it takes XLA longer to compile than all else around a scene.
     """
 
     def wider(values, reach):
         beyond = jnp.concatenate([values, jnp.zeros_like(values)])
-        return jnp.maximum(values, jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size))
+        more = jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size)
+        return jnp.maximum(values, more if room is None else jnp.where(reach < room, more, 0.0))
 
-    if values.size <= _NEAR:
+    room = None if left is None else jnp.pad(left, (0, values.size - left.size))
+    if values.size <= _NEAR and left is None:
         for k in range(times):
             values = jnp.maximum(values, jnp.pad(values[1 << k :], (0, min(1 << k, values.size))))
         return values

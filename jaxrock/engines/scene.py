@@ -15,6 +15,7 @@ from jaxrock.engines.outlook import Outlook
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking, sum_of_series
+from jaxrock.motions.together import in_place as found_in_place, is_in_place
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
@@ -49,6 +50,11 @@ def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) ->
     return _least_threshold(*_moments(block, model))
 
 
+def _real(x, dtype):
+    """A leaf of a block or a motion in the precision of all; what counts stays whole."""
+    return x if isinstance(x, jax.Array) and x.dtype == jnp.int32 else jnp.asarray(x, dtype)
+
+
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
@@ -69,18 +75,27 @@ class Scene(eqx.Module):
     count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
     outlook: Outlook
     falls_flat: bool = eqx.field(static=True)
+    first: Int[Array, ""] | None = None  # piece, where the motion is one of many that follow one another; None: 0
+    room: int | None = eqx.field(static=True, default=None)  # for pieces of one of them
 
     @classmethod
-    def of(cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation) -> "Scene":
-        """Build the scene; raise ValueError where a parameter is an array outside of `jax.vmap`."""
+    def of(
+        cls, block: Block | AsymmetricBlock, motion: AbstractMotion, model: AbstractEquation, in_place: bool = False
+    ) -> "Scene":
+        """Build the scene, of one record of many `in_place` or with arrays of its own; raise ValueError where a
+        parameter is an array outside of `jax.vmap`."""
         check_single(block=block, motion=motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
-        block, motion = jax.tree.map(lambda x: jnp.asarray(x, dtype), (block, motion))
+        block, motion = jax.tree.map(lambda x: _real(x, dtype), (block, motion))
+        stretch = found_in_place(motion) if in_place and is_in_place(motion) else None
+        motion = motion if stretch is None else stretch.motion
         knots, envelope = motion.knots, motion.envelope
         lengths = motion.lengths
-        # Up to the last piece with a length: a late motion's knots may all be one number.
-        lasting = jnp.where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
-        count = jnp.max(lasting) if knots.size > _MANY else None
+        if stretch is not None:
+            count = stretch.end
+        else:  # up to the last piece with a length: a late motion's knots may all be one number
+            lasting = jnp.where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
+            count = jnp.max(lasting) if knots.size > _MANY else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."
@@ -100,17 +115,19 @@ class Scene(eqx.Module):
             far_reset=far_reset,
             motion=motion,
             knots=knots,
-            lengths=_endless(lengths, count),
-            scales=_endless(motion.scales, count),
+            lengths=_endless(lengths, None if stretch else count),
+            scales=_endless(motion.scales, None if stretch else count),
             count=count,
             outlook=Outlook.of(envelope, _least_threshold(moments, far)),
             falls_flat=model.falls_flat,
+            first=None if stretch is None else stretch.first,
+            room=None if stretch is None else stretch.room,
         )
 
     @property
     def most_pieces(self) -> int:
         """For how many pieces there is room."""
-        return self.knots.size - 1
+        return self.knots.size - 1 if self.room is None else self.room
 
     @property
     def pieces(self) -> Int[ArrayLike, ""]:

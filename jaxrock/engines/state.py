@@ -70,7 +70,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     if scene.motion.lateness is not None:  # a push that comes too late: at first a velocity that is missing
         spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.lateness)
     return State(
-        piece=count,
+        piece=count if scene.first is None else scene.first,
         local=zero,
         side=side,
         opening=opening,

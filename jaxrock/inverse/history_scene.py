@@ -62,7 +62,7 @@ class FittedScene(eqx.Module):
             initial = (float(np.ravel(rotation)[0]), 0.0) if free else (0.0, 0.0)
         block = _given(block, names)
         if engine is None:
-            engine = Series(order=8, tolerance=1e-10) if model.is_series else engine_of(None, model)
+            engine = Series(order=8, tolerance=1e-10) if model.is_series else engine_of(None, model, motion)
         model = current_model(model, block, motion)
         return cls(names, block, motion, model, start_of(initial), engine)
 

@@ -47,8 +47,7 @@ class Rolling(AbstractEquation):
 
     **Raises:** ValueError for values outside their ranges; for a symmetric block whose `other` edge was given.
 
-    **Source:** Lagrange's equation of rolling without slipping; Bachmann, Vassiliou & Stojadinović (2019) for columns
-    on round edges.
+    **Source:** derived here, as Lagrange's equation of rolling without slipping.
     """
 
     edge: Edge

@@ -1,5 +1,6 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
+import abc
 import functools
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
 _SHORT = 64  # samples of a record that is a program of its own
 
 
-class _Straight(AbstractMotion):
+class Straight(AbstractMotion):
     """Straight lines between samples."""
 
     samples: eqx.AbstractVar[Inexact[Array, "*batch n"]]
@@ -63,7 +64,7 @@ class Origin(NamedTuple):
     file: str = ""
 
 
-class Record(_Straight):
+class Record(Straight):
     """An accelerogram: straight lines between equally spaced samples.
 
     **Arguments:**
@@ -112,7 +113,16 @@ class Record(_Straight):
         return self.dt * jnp.arange(self.samples.shape[-1])
 
 
-class _Padded(_Straight):
+class AbstractChosen(AbstractMotion):
+    """A record whose samples lie among those of others."""
+
+    @property
+    @abc.abstractmethod
+    def alone(self) -> "Padded":
+        """The record with samples of its own."""
+
+
+class Padded(Straight):
     """A record with room for more samples, which are zero and at its end."""
 
     samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
@@ -129,28 +139,40 @@ def padded(motion: AbstractMotion) -> AbstractMotion:
 
     There is room for a quarter more samples at most. Its pieces beyond the end have no length.
     """
-    return jax.tree.map(_padded, motion, is_leaf=lambda part: type(part) is Record)
+    return jax.tree.map(_padded, motion, is_leaf=_is_record)
 
 
 def with_room(motion: AbstractMotion) -> AbstractMotion:
     """The same motion, with room in its records for as many samples as the next power of two, 1024 at least: so that a
     few programs serve a suite of any lengths."""
-    return jax.tree.map(_doubled, motion, is_leaf=lambda part: type(part) is Record)
+    return jax.tree.map(_doubled, motion, is_leaf=_is_record)
+
+
+def roomy(count: int) -> int:
+    """Room for so many, and for a quarter more at most: a few numbers serve all."""
+    return count + -count % (1 << max((count - 1).bit_length() - 3, 0))
+
+
+def _is_record(part) -> bool:
+    return type(part) is Record or isinstance(part, AbstractChosen)
 
 
 def _doubled(part):
+    if isinstance(part, AbstractChosen):
+        return part.alone
     if type(part) is not Record:
         return part
     count = part.samples.shape[-1]
-    return _Padded(*_with_room(part.samples, part.dt, max(1024, 1 << (count - 1).bit_length()) - count))
+    return Padded(*_with_room(part.samples, part.dt, max(1024, 1 << (count - 1).bit_length()) - count))
 
 
 def _padded(part):
+    if isinstance(part, AbstractChosen):
+        return part.alone
     if type(part) is not Record or part.samples.shape[-1] <= _SHORT:
         return part
     count = part.samples.shape[-1]
-    unit = 1 << (count - 1).bit_length() - 3
-    return _Padded(*_with_room(part.samples, part.dt, -count % unit))
+    return Padded(*_with_room(part.samples, part.dt, roomy(count) - count))
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple, overload
 
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Inexact, Int
 
 from jaxrock.numerics.polynomial import horner, rescaled, shifted
 
@@ -50,19 +50,30 @@ class Shaking(NamedTuple):
 
 class Bounds(NamedTuple):
     """Upper bounds of a component's absolute acceleration within each piece [g], times `gain` where there is one: what
-    only scales a motion leaves the array to all scales alike."""
+    only scales a motion leaves the array to all scales alike.
+
+    Of a motion in which many follow one another: `left`, how many pieces there are from each on to the end of its own,
+    and `peak`, the largest value among those of one; None: all pieces belong together.
+    """
 
     values: Inexact[Array, " pieces"]
     gain: Scalar | None = None
+    left: Int[Array, " pieces"] | None = None
+    peak: Scalar | None = None
 
     def scaled(self, factor: Scalar) -> "Bounds":
         """Those of a motion that is so many times as strong."""
         factor = jnp.abs(factor)
-        return Bounds(self.values, factor if self.gain is None else factor * self.gain)
+        return self._replace(gain=factor if self.gain is None else factor * self.gain)
 
     def times_gain(self, values: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
         """Some of the values, or what was made of them, as bounds."""
         return values if self.gain is None else self.gain * values
+
+    @property
+    def strongest(self) -> Scalar:
+        """The largest bound."""
+        return self.times_gain(jnp.max(self.values) if self.peak is None else self.peak)
 
 
 class Envelope(NamedTuple):

@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, finite
+from jaxrock._checks import Values, finite, is_traced, shown, watched
+from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.record import with_room
+from jaxrock.motions.record import Record, with_room
+from jaxrock.motions.together import Chosen, Together
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
@@ -25,7 +27,7 @@ def _is_motion(value) -> bool:
     return isinstance(value, (AbstractMotion, Components))
 
 
-class Suite(eqx.Module):
+class Suite(AbstractNamed):
     """Ground motions of any kinds, with their peaks.
 
     **Arguments:**
@@ -35,6 +37,9 @@ class Suite(eqx.Module):
     - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
     - `azimuth`: (azimuths,) of components [rad], from the first one towards the second: in which vertical planes a
       block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
+
+    `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
+    all scenes share the samples of all records.
 
     `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
     turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
@@ -79,6 +84,39 @@ class Suite(eqx.Module):
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __getitem__(self, number) -> AbstractMotion:
+        """One of its motions. Where its number is traced, scenes of all records share their samples.
+
+        **Raises:** IndexError for a number without a motion, ValueError for one that is traced; ValueError for a traced
+        number where motions are of several kinds, or made of records.
+        """
+        if not is_traced(number):
+            place = range(len(self))[number]
+            ends = np.cumsum([size_of(group) for group in self.groups])
+            group = int(np.searchsorted(ends, place, side="right"))
+            return one_of_many(self.groups[group], place - int(ends[group]) + size_of(self.groups[group]))
+        if jnp.ndim(number) or not jnp.issubdtype(number.dtype, jnp.integer):
+            raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.")
+        failed = (number < 0) | (number >= len(self))
+        number = watched(number, f"The number of a motion must be in [0, {len(self) - 1}]", failed)
+        return self._chosen(number.astype(jnp.int32))
+
+    def _chosen(self, number) -> AbstractMotion:
+        """The motion of a traced number."""
+        if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
+            return Chosen(Together.of([record for record in self.motions()]), number)
+        kinds = {jax.tree.structure(group) for group in self.groups}
+        if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
+            raise ValueError(
+                "Motions of a suite must be records, or numbers of one kind of pulse, to be chosen by a traced number: "
+                "take `jaxrock.hazard.suite_outcomes`, or one motion after the other."
+            )
+        every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *self.groups)
+        return one_of_many(every, number)
+
+    def __iter__(self) -> Iterator[AbstractMotion]:
+        return self.motions()
 
     def motions(self) -> Iterator[AbstractMotion]:
         """Its motions, one by one."""

@@ -31,13 +31,14 @@ class _Piece(NamedTuple):
 class Plan:
     """A program (closed, of one lane) as machine code for many: leaves that are not `shared` are a lane's own.
 
-    `refilled`: in the program's one loop a lane that is done does not wait for others.
+    `refilled`: in the program's one loop a lane that is done does not wait for others. `alone`: whether there is only
+    one lane, whose long lists all lanes of a vector may then look up.
     Raises `Unsupported` if the program does what is not known in `operations`.
     """
 
-    def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False):
+    def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
         program = hoisted(program, lambda equation: not is_known(equation) or any(map(_is_large, equation.outvars)))
-        self._program, self._shared = program, shared
+        self._program, self._shared, self._alone = program, shared, alone
         self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)
         own = self._first_own()
         self._pieces = []
@@ -55,7 +56,7 @@ class Plan:
     def _first_own(self) -> set:
         """Variables that a lane has of its own before its machine code runs."""
         inputs = {v for v, same in zip(self._program.jaxpr.invars, self._shared) if not same}
-        return inputs | set(self._each.outputs)
+        return inputs | {v for v in self._each.outputs if not (self._alone and is_long(v.aval.shape))}
 
     def __call__(self, leaves: list, threads: int, count=None) -> list:
         """Results, with a leading axis of lanes, of leaves; `count`: of how many lanes, the first, there have to be
@@ -68,6 +69,7 @@ class Plan:
         told = size + more, size if count is None else count, threads
         sizes = jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
         own = self._first_own()
+        values.update((v, values[v][0]) for v in self._each.outputs if v not in own)
         for v in [v for v in self._rest.inputs if v in own]:
             x = values[v]
             x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x

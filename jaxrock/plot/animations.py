@@ -10,10 +10,12 @@ import numpy as np
 
 from jaxrock._arguments import arguments, at_least, path_of
 from jaxrock._checks import Values, scalar, size
+from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.rigid import Block
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.models.rolling import RollingMoments
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes
 from jaxrock.plot.drawings import draw, draw_ground
 from jaxrock.plot.responses import acceleration_of
@@ -44,7 +46,7 @@ def animate(
     - `response`: result of `simulate`, of one scene.
     - `block`: what is drawn; None: the rectangle of the response's slenderness and frequency parameter, or its flexible
       block. An asymmetric block must be given.
-    - `model`: a `Spring`, whose column is drawn then.
+    - `model`: a `Spring`, whose column is drawn then. Edges on which a block rolls are known.
     - `speed`: seconds of the response per second of the film, positive; None: 1, or what makes it last 20 s.
     - `fps`: pictures per second, at least 1.
 
@@ -57,7 +59,7 @@ def animate(
 
     duration = float(response.duration)
     rate = max(1.0, duration / _LONGEST) if speed is None else float(scalar("speed", size("speed", speed)))
-    body = Body.of(_drawn(response, block), model)
+    body = Body.of(_drawn(response, block), model, _edges(response))
     count = int(np.ceil(duration * fps / rate)) + 1
     time = np.minimum(np.arange(count) * rate / fps, duration)
     rotation, bending = np.asarray(response(time)[0]), [None] * count
@@ -83,6 +85,14 @@ def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> Any
     if response.scene.far is not None:
         raise ValueError("Argument `block` must be given for the response of an asymmetric block: its shape is drawn.")
     return Block(response.scene.alpha, response.scene.p, 1.0)
+
+
+def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
+    """Those on which a block has rolled."""
+    if isinstance(response, FlexibleResponse) or not isinstance(response.scene.moments, RollingMoments):
+        return None
+    here, there = response.scene.both_moments
+    return here.edge, there.edge
 
 
 class _Parts:

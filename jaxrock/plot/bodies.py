@@ -6,9 +6,11 @@ import numpy as np
 
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.rolling import Rolling
 from jaxrock.models.spring import Spring
 
 AnyBlock = Block | AsymmetricBlock | FlexibleBlock
@@ -26,7 +28,7 @@ class Shapes(NamedTuple):
 class Body(NamedTuple):
     """A block at rest: the corners on the ground, midway between them the origin; and the column that models it.
 
-    A rigid block has the column's heights and masses empty.
+    A rigid block has the column's heights and masses empty; one that rolls has edges, to the right and to the left.
     """
 
     outline: np.ndarray  # (n, 2) [m]
@@ -35,14 +37,20 @@ class Body(NamedTuple):
     centre: np.ndarray
     heights: np.ndarray  # of the nodes of the column [m]
     masses: np.ndarray  # heights of its masses [m]
+    edges: tuple[Edge, Edge] | None = None
 
     @classmethod
-    def of(cls, block: AnyBlock, model: AbstractEquation) -> "Body":
+    def of(cls, block: AnyBlock, model: AbstractEquation, edges: tuple[Edge, Edge] | None = None) -> "Body":
         """Of a block of scalars. What its parameters do not tell is drawn as simply as may be: the rectangle of its p,
-        or the parallelogram about its centre of mass."""
-        check_single(block=block)
-        if isinstance(block, AsymmetricBlock):
-            return cls._asymmetric(block)
+        or the parallelogram about its centre of mass; with `edges`, or those of the model, on which it rolls."""
+        check_single(block=block, model=model)
+        if isinstance(model, Rolling):
+            edges = model.edge, model.other or model.edge
+        body = cls._asymmetric(block) if isinstance(block, AsymmetricBlock) else cls._symmetric(block, model)
+        return body if edges is None else body._rounded(edges)
+
+    @classmethod
+    def _symmetric(cls, block: Block | FlexibleBlock, model: AbstractEquation) -> "Body":
         alpha = float(block.alpha)
         radius = float(block.length) / 2 if isinstance(block, FlexibleBlock) else float(block.half_diagonal)
         b, h = radius * np.sin(alpha), radius * np.cos(alpha)
@@ -63,14 +71,44 @@ class Body(NamedTuple):
         outline = np.stack([left, right, 2 * centre - left, 2 * centre - right])
         return cls(outline, right, left, centre, np.zeros(0), np.zeros(0))
 
+    def _rounded(self, edges: tuple[Edge, Edge]) -> "Body":
+        """The body with its edges, to where they are upright or as high as it is; its sides begin there."""
+        top, parts = self.outline[:, 1].max(), []
+        for way, corner, edge in zip((1, -1), (self.right, self.left), edges):
+            out, up = map(np.asarray, edge.place(np.linspace(0, np.pi / 2, 60)))
+            arc = corner + np.hypot(*(self.centre - corner)) * np.stack([way * out, up], 1)
+            arc = arc[: max(int((arc[:, 1] <= top).sum()), 1)]
+            above = 2 * self.centre - (self.left if way > 0 else self.right)
+            parts += [arc, [above + [arc[-1, 0] - corner[0], 0.0]]]
+        right, over_right, left, over_left = parts
+        return self._replace(outline=np.concatenate([right, over_right, over_left, left[::-1]]), edges=edges)
+
+    def placed(self, points: np.ndarray, rotation: float) -> np.ndarray:
+        """Places [m] of the block at rest, where they are at a rotation [rad]."""
+        side, corner = (1, self.right) if rotation >= 0 else (-1, self.left)
+        if self.edges is None:
+            return turned(points, corner, rotation)
+        edge, radius = self.edges[0 if side > 0 else 1], np.hypot(*(self.centre - corner))
+        out, up = map(float, edge.place(abs(rotation)))
+        touching = corner + radius * np.array([side * out, up])
+        return turned(points, touching, rotation) + self.contact(rotation) - touching
+
+    def contact(self, rotation: float) -> np.ndarray:
+        """Where it touches the ground at a rotation [rad]: a corner, or where its edge has rolled to."""
+        side, corner = (1, self.right) if rotation >= 0 else (-1, self.left)
+        if self.edges is None:
+            return corner
+        rolled = np.hypot(*(self.centre - corner)) * float(self.edges[0 if side > 0 else 1].length(abs(rotation)))
+        return corner + np.array([side * rolled, 0.0])
+
     @property
     def size(self) -> float:
         """Largest distance from the origin [m]."""
         return float(max(np.hypot(*self.outline.T).max(), self.heights.max(initial=0.0)))
 
     def pose(self, rotation: float, bending: np.ndarray | None = None) -> Shapes:
-        """Turned by a rotation [rad] about the corner on which it stands, and bent: (nodes,) [m], across the column."""
-        pivot = self.right if rotation >= 0 else self.left
+        """Turned by a rotation [rad] about the corner on which it stands, or rolled, and bent: (nodes,) [m], across the
+        column."""
         outline, column = self.outline, np.stack([0 * self.heights, self.heights], 1)
         if bending is not None and self.heights.size:
             share = self.outline[:, 1] / self.outline[:, 1].max() * self.heights[-1]
@@ -78,7 +116,7 @@ class Body(NamedTuple):
             column = column + np.stack([bending, 0 * bending], 1)
         column = turned(column, np.zeros(2), rotation)
         masses = np.stack([np.interp(self.masses, self.heights, x) for x in column.T], 1) if column.size else column
-        return Shapes(turned(outline, pivot, rotation), column, masses, pivot)
+        return Shapes(self.placed(outline, rotation), column, masses, self.contact(rotation))
 
 
 def _column(block: Block | FlexibleBlock, model: AbstractEquation, radius: float, h: float) -> tuple:

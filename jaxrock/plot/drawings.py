@@ -50,7 +50,8 @@ def scene(
 
     - `block`: a `Block`, `AsymmetricBlock` or `FlexibleBlock` of scalars; `motion`: any motion; None leaves it out.
     - `axis`: matplotlib axis; None makes a figure.
-    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it.
+    - `model`: as in `outcome`: of a `Spring`, its column is drawn, and the block behind it; of a `Rolling`, the block's
+      edges.
     - `rotation`: at which the block is drawn [rad], in [-pi/2, pi/2].
     - `bending`: displacement of the top of a flexible block by bending, in its first clamped mode [m].
 
@@ -149,11 +150,12 @@ def _acceleration(axis: "Axes", body: Body) -> None:
 def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
     """Of a block with two equal sides."""
     side, size = (1 if rotation >= 0 else -1), body.size
-    pivot, top = (body.right if side > 0 else body.left), body.outline[:, 1].max()
+    corner, top = (body.right if side > 0 else body.left), body.outline[:, 1].max()
 
     def at(*place):
-        return turned(np.array(place), pivot, rotation)
+        return body.placed(np.array(place), rotation)
 
+    pivot = at(*corner)
     b, gap = body.right[0], 0.08 * size
     _acceleration(axis, body)
     _between(axis, at(-b, top + gap), at(b, top + gap), "$2b$", at(0, top + 1.7 * gap) - at(0, top + gap))
@@ -191,16 +193,16 @@ def _column_symbols(axis: "Axes", body: Body, rotation: float, side: int) -> Non
 
 def _sides(axis: "Axes", body: Body, rotation: float) -> None:
     """Of a block whose sides differ."""
-    pivot, gap = (body.right if rotation >= 0 else body.left), 0.08 * body.size
+    gap = 0.08 * body.size
     _acceleration(axis, body)
-    centre = turned(body.centre, pivot, rotation)
+    centre = body.placed(body.centre, rotation)
     axis.plot(*centre, "o", color="black", markersize=4)
     for corner, side, number in ((body.right, 1, 1), (body.left, -1, 2)):
-        at, upright = turned(corner, pivot, rotation), np.pi / 2 - rotation
+        at, upright = body.placed(corner, rotation), np.pi / 2 - rotation
         alpha = float(np.arctan2(side * (corner - body.centre)[0], body.centre[1] - corner[1]))
         reach = np.hypot(*(centre - at))
         axis.plot(*np.transpose([at, centre]), **_INK)
-        axis.plot(*np.transpose([at, turned(corner + [0, 0.8 * reach], pivot, rotation)]), color=GREY, linewidth=0.7,
+        axis.plot(*np.transpose([at, body.placed(corner + [0, 0.8 * reach], rotation)]), color=GREY, linewidth=0.7,
                   linestyle=":")  # fmt: skip
         axis.text(*(at + 0.55 * (centre - at) + [side * 0.9 * gap, 0]), f"$R_{number}$", ha="center", fontsize=11)
         _arc(axis, at, 0.7 * reach, upright, upright + side * alpha, rf"$\alpha_{number}$")

@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.plot.style import BLUE, GREY, RED, broken_curve
-from jaxrock.responses.arguments import engine_of
 from jaxrock.studies.borders import Region, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -186,7 +185,7 @@ def _is_quick(result: OverturningMap) -> bool:
     if result.scene is None or min(result.state.shape) < 2:
         return False
     *_, model, engine = result.scene
-    return isinstance(engine_of(engine, model), Series)
+    return isinstance(engine, Series) if engine is not None else model.is_series
 
 
 def _within(x: np.ndarray, ranges: np.ndarray) -> np.ndarray:

@@ -5,13 +5,16 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import as_real, checked, marked, scalar, shown, strength
+from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
+from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.motion import AbstractMotion
 
 Scalar = Inexact[Array, ""]
 RigidBlock = Block | AsymmetricBlock
@@ -20,15 +23,20 @@ AnyBlock = RigidBlock | FlexibleBlock
 USUAL = Housner()  # the model of a rigid block that nothing is said about
 
 
-def engine_of(engine: AbstractEngine | None, model: AbstractEquation) -> AbstractEngine:
-    """The engine that was asked for, or the usual one of a model."""
+def engine_of(engine: AbstractEngine | None, model: AbstractEquation, motion: AbstractMotion) -> AbstractEngine:
+    """The engine that was asked for, or the usual one of a model.
+
+    Under a record a step goes from sample to sample, however loose the tolerance; a tight one decides more scenes, in
+    the same time.
+    """
     if engine is not None:
         return engine
     if model.is_series:
         return Series()
     from jaxrock.engines.diffrax.arcs import Diffrax  # it takes a fifth of a second
 
-    return Diffrax()
+    check_single(motion=motion)
+    return Diffrax(rtol=1e-10) if POLICY.is_record(motion.knots.size - 1) else Diffrax()
 
 
 def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[Scalar, Scalar]:

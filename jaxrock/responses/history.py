@@ -233,7 +233,7 @@ def simulate(
             duration = scalar("duration", span("duration", duration))
     say_if_single()
     model = current_model(model, block, motion)
-    engine = engine_of(engine, model)
+    engine = engine_of(engine, model, motion)
     block, start = standing(block, model), start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)

@@ -22,6 +22,7 @@ from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
+from jaxrock.motions.together import is_in_place
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.status import Status, marked_result
@@ -125,7 +126,8 @@ def outcome(
     - `initial`: rotation [rad] and angular velocity [rad/s] at time 0.
     - `duration`: how long to follow a `FlexibleBlock` [s], positive; None: the motion and 10/p of free rocking. A rigid
       block is followed to its end.
-    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` `Diffrax()`.
+    - `engine`: `Series(...)` or `Diffrax(...)`; None takes `Series()`, for an `Equation` or `Rolling` `Diffrax()`, of
+      tolerance 1e-10 under a record.
     - `throw`: whether a number outside of its range raises. False, for trial steps of optimisers: the outcome is not a
       number, its derivatives are zero, and its status is `Status.not_finite`. Make block and motion with
       `throw=False`, too.
@@ -143,9 +145,10 @@ def outcome(
             "`simulate`."
         )
     say_if_single()
-    model, engine = current_model(model, block, motion), engine_of(engine, model)
+    model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
     block, start = standing(block, model), start_of(initial, throw)
-    result = _outcome(block, padded(motion), model, start, engine)
+    in_place = isinstance(engine, Series) and is_in_place(motion)
+    result = _outcome(block, motion if in_place else padded(motion), model, start, engine)
     return result if throw else marked_result(result, (block, motion, model, start))
 
 
@@ -185,7 +188,7 @@ def _passes(rounds: bool) -> Passes:
 
     def begin(scene):
         block, motion, model, initial, engine = scene
-        scene = Scene.of(block, motion, model)
+        scene = Scene.of(block, motion, model, in_place=True)
         stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
         return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
 

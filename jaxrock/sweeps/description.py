@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,12 @@ TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and 
 _ABOUT, _CHECKSUM = "jaxrock_store", "jaxrock_checksum"  # attributes
 
 
-def fingerprint(axes: dict[str, np.ndarray], outer: bool, program: str) -> dict[str, str]:
-    """What tells a sweep from others, part by part."""
+def fingerprint(
+    axes: dict[str, np.ndarray], outer: bool, program: str, words: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
+    """What tells a sweep from others, part by part; `words`: of the axes that have words, which are numbered."""
     hashes = {f"axis `{name}`": digest_of_axis(values) for name, values in axes.items()}
+    hashes |= {f"words of axis `{name}`": _checksum({"words": list(told)}) for name, told in words.items()}
     return hashes | {
         "order of the axes": ", ".join(axes),
         "layout": layout_name(outer),

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Shaped
 
 from jaxrock._aside import uninterrupted, written_aside
 from jaxrock._tables import is_status, items_of, needed
 from jaxrock.sweeps import netcdf
 from jaxrock.sweeps.description import fingerprint
-from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, own_names, shape_of
+from jaxrock.sweeps.labels import POINT, dimensions, layout_name, names_of, numbered, own_names, shape_of
 from jaxrock.sweeps.plan import Plan
 from jaxrock.sweeps.store import create, local, opened
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 class Grid(eqx.Module):
     """Results of a sweep over labelled axes.
 
-    - `axes`: values of every axis by name.
+    - `axes`: values of every axis by name; of one along a suite, the names of its motions.
     - `values`: what the function returns, an `Outcome` or any pytree, as NumPy arrays in host memory. The first axes
       of every array are those of the grid, in their order; one axis if they went side by side.
     - `outer`: whether the points are the outer product of the axes; else the axes go side by side.
     - `resumed`: how many points had been computed before, and came from a store.
     """
 
-    axes: dict[str, Num[np.ndarray, " n"]]
+    axes: dict[str, Shaped[np.ndarray, " n"]]
     values: Any
     outer: bool = eqx.field(static=True, default=True)
     resumed: int = eqx.field(static=True, default=0)
@@ -113,21 +113,22 @@ class Grid(eqx.Module):
             raise OSError(error.errno, f"{error.strerror or error}. Nothing was saved", str(path)) from error
 
     def _to_netcdf(self, path: Path) -> None:
-        for name, leaf in (self.axes | self._leaves()).items():
+        for name, leaf in (numbered(self.axes)[0] | self._leaves()).items():
             if leaf.dtype.kind not in "biuf" or leaf.dtype == np.float16:
                 raise ValueError(f"NetCDF has no {leaf.dtype}, which {name!r} is: take a path that ends with .zarr.")
         stopped = threading.Event()
         uninterrupted(netcdf.write, self.to_xarray(), path, stopped, stop=stopped.set)
 
     def _to_zarr(self, path: Path) -> None:
-        axes, leaves = {name: np.asarray(values) for name, values in self.axes.items()}, self._leaves()
+        axes, words = numbered({name: np.asarray(values) for name, values in self.axes.items()})
+        leaves = self._leaves()
         plan = Plan.of(tuple(axes.values()), self.outer)
         like = {name: jax.ShapeDtypeStruct(x.shape[len(self.shape) :], x.dtype) for name, x in leaves.items()}
-        made_by, stopped = fingerprint(axes, self.outer, "saved results"), threading.Event()
+        made_by, stopped = fingerprint(axes, self.outer, "saved results", words), threading.Event()
 
         def written():
             with written_aside(path) as aside:
-                store = create(aside, axes, self.outer, like, plan.block, made_by)
+                store = create(aside, axes, self.outer, like, plan.block, made_by, words)
                 for number in range(store.count):
                     if stopped.is_set():
                         raise InterruptedError
@@ -153,7 +154,7 @@ class Grid(eqx.Module):
             store = opened(path)
             return cls(store.axes(), _rebuilt(dict(zip(store.names, store.read()))), store.outer)
         with netcdf.opened(path) as data:
-            axes = {str(name): np.asarray(values) for name, values in data.coords.items()}
+            axes = {str(name): _known(np.asarray(values)) for name, values in data.coords.items()}
             values = {str(name): np.asarray(values) for name, values in data.data_vars.items()}
             return cls(axes, _rebuilt(values), data.attrs["layout"] == layout_name(True))
 
@@ -169,6 +170,11 @@ def known_again(example: Callable[[], Any]) -> None:
     - `example`: makes one of this kind, with numbers of any values; called when something is loaded.
     """
     _examples.append(example)
+
+
+def _known(values: np.ndarray) -> np.ndarray:
+    """An axis of a file, whose words are objects there."""
+    return values.astype(str) if values.dtype.kind == "O" else values
 
 
 def _rebuilt(values: dict[str, np.ndarray]) -> Any:

@@ -1,7 +1,7 @@
 """How axes, results and their dimensions are called, in memory and in files."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +16,13 @@ def shape_of(axes: Iterable[np.ndarray], outer: bool) -> tuple[int, ...]:
     """Shape of the grid that axes span."""
     sizes = tuple(np.size(values) for values in axes)
     return sizes if outer else sizes[:1]
+
+
+def numbered(axes: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, tuple[str, ...]]]:
+    """Axes in numbers alone, and the words of those that have words: they are numbered as they stand."""
+    words = {name: tuple(map(str, values)) for name, values in axes.items() if np.asarray(values).dtype.kind in "OU"}
+    numbers = {name: np.arange(len(words[name])) if name in words else values for name, values in axes.items()}
+    return numbers, words
 
 
 def layout_name(outer: bool) -> str:

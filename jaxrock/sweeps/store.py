@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ _DIGEST = hashlib.sha256().digest_size
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:(/|:)")  # a letter alone is a drive
 _MANY = 5  # files that a message names
 _AXIS_CHUNK = 2**20
+_WORDS = "words"  # an attribute of an axis: what its numbers stand for
 
 
 def local(argument: str, path: Any) -> Path:
@@ -78,13 +80,14 @@ class Store:
         return values if good else None
 
     def axes(self) -> dict[str, np.ndarray]:
-        """All axes.
+        """All axes; in words, where they have words.
 
         **Raises:** ValueError where one is damaged.
         """
         found = {name: self.axis(name) for name in self._about["axes"]}
         _refuse(self.path, [self.path / name for name, values in found.items() if values is None])
-        return {name: values for name, values in found.items() if values is not None}
+        words = {name: self._metadata[name]["attributes"].get(_WORDS) for name in found}
+        return {name: np.array(words[name]) if words[name] else np.asarray(found[name]) for name in found}
 
     def mend(self, axes: dict[str, np.ndarray]) -> list[Path]:
         """Write again what is damaged of axes and description; which files these were."""
@@ -218,17 +221,18 @@ def made_or_mended(
     leaves: dict[str, jax.ShapeDtypeStruct],
     block: tuple[int, ...],
     made_by: dict[str, str],
+    words: Mapping[str, Sequence[str]],
 ) -> list[Path]:
     """See that there is a store of a sweep, whose axes and description are good; which files were damaged."""
-    return uninterrupted(_made_or_mended, path, axes, outer, leaves, block, made_by)
+    return uninterrupted(_made_or_mended, path, axes, outer, leaves, block, made_by, words)
 
 
-def _made_or_mended(path, axes, outer, leaves, block, made_by) -> list[Path]:
+def _made_or_mended(path, axes, outer, leaves, block, made_by, words) -> list[Path]:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with written_aside(path) as aside:
-                create(aside, axes, outer, leaves, block, made_by)
+                create(aside, axes, outer, leaves, block, made_by, words)
             return []
         except FileExistsError:  # somebody was faster
             pass
@@ -255,8 +259,10 @@ def create(
     leaves: dict[str, jax.ShapeDtypeStruct],
     block: tuple[int, ...],
     made_by: dict[str, str],
+    words: Mapping[str, Sequence[str]],
 ) -> Store:
-    """Make a store of which no block is done. `leaves`: results by name, as of one point."""
+    """Make a store of which no block is done. `leaves`: results by name, as of one point; `words`: what the numbers of
+    axes stand for."""
     zarr = needed("zarr")
     for name, values in (axes | leaves).items():
         if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):
@@ -278,7 +284,8 @@ def create(
     for name, values in axes.items():
         array = group.create_array(
             name, shape=values.shape, dtype=values.dtype, chunks=(min(values.size, _AXIS_CHUNK),),
-            dimension_names=(name if outer else POINT,), fill_value=_empty(values.dtype)[1], **usual,
+            dimension_names=(name if outer else POINT,), fill_value=_empty(values.dtype)[1],
+            attributes={_WORDS: list(words[name])} if name in words else {}, **usual,
         )  # fmt: skip
         array[...] = values
     # Its own chunk for every block: two processes never write the same file.

@@ -20,6 +20,7 @@ from jaxtyping import ArrayLike
 from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
 from jaxrock._checks import is_traced
+from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import exchange, meet, process, shared_out
@@ -42,7 +43,7 @@ def sweep(
     block: int | None = ...,
     progress: bool | None = ...,
     version: str | None = ...,
-    **axes: ArrayLike | Sequence[float | int],
+    **axes: ArrayLike | Sequence[float | int] | AbstractNamed,
 ) -> Grid: ...
 
 
@@ -57,7 +58,7 @@ def sweep(
     block: int | None = ...,
     progress: bool | None = ...,
     version: str | None = ...,
-    **axes: ArrayLike | Sequence[float | int],
+    **axes: ArrayLike | Sequence[float | int] | AbstractNamed,
 ) -> Grid | None: ...
 
 
@@ -72,7 +73,7 @@ def sweep(
     block: Annotated[int | None, at_least(1)] = None,
     progress: bool | None = None,
     version: str | None = None,
-    **axes: ArrayLike | Sequence,
+    **axes: ArrayLike | Sequence | AbstractNamed,
 ) -> Grid | None:
     """Evaluate a function at every point of labelled axes, on all devices, and on all machines of a job.
 
@@ -80,7 +81,8 @@ def sweep(
 
     - `function`: called with one number for every axis, by name; returns an `Outcome` or any pytree of arrays. It is
       traced, as under `jax.vmap`.
-    - `axes`: (n,) values of each axis, at least one. Neighbours along the last axis are computed together.
+    - `axes`: (n,) values of each axis, at least one. Neighbours along the last axis are computed together. An axis may
+      be a `Suite`: the function gets its motions, which share their samples, and their names are the axis.
     - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
     - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
       it is called again. What is there is held against its checksums first; what is damaged is named in a warning, and
@@ -104,12 +106,17 @@ def sweep(
     path = None if store is None else local("store", store)
     if path is None and not load:
         raise ValueError("Argument `load` must be True where there is no `store`.")
-    lists = {name: _axis(name, values) for name, values in axes.items()}
+    suites = {name: values for name, values in axes.items() if isinstance(values, AbstractNamed)}
+    words = {name: suite.names for name, suite in suites.items()}
+    lists = {name: _axis(name, np.arange(len(values)) if name in words else values) for name, values in axes.items()}
     if not outer and len({values.size for values in lists.values()}) > 1:
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
 
-    traced = Traced(function, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
+    def at_point(**point):
+        return function(**{name: suites[name][x] if name in suites else x for name, x in point.items()})
+
+    traced = Traced(at_point, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
     names = own_names(list(axes), outer, traced.shapes, 0)
     plan = Plan.of(tuple(lists.values()), outer, block)
     with shared_out():
@@ -121,23 +128,30 @@ def sweep(
                     "whether what it calls has changed."
                 )
             leaves = dict(zip(names, jax.tree.leaves(traced.shapes)))
-            keeper = _keeper(path, plan, lists, leaves, traced.fingerprint, version)
+            keeper = _keeper(path, plan, lists, words, leaves, traced.fingerprint, version)
             plan = plan._replace(block=keeper.block)
         values, resumed = compute(traced.program, plan, traced.constants, "sweep", progress, store=keeper, load=load)
-    return Grid(lists, values, outer, resumed) if load else None
+    labels = {name: np.array(words[name]) if name in words else values for name, values in lists.items()}
+    return Grid(labels, values, outer, resumed) if load else None
 
 
 def _keeper(
-    path: Path, plan: Plan, axes: dict[str, np.ndarray], leaves: dict, program: str, version: str | None
+    path: Path,
+    plan: Plan,
+    axes: dict[str, np.ndarray],
+    words: dict[str, tuple[str, ...]],
+    leaves: dict,
+    program: str,
+    version: str | None,
 ) -> Store:
     """The store at a path: made or mended by the first process; a sweep's own, in every process."""
-    made_by = fingerprint(axes, plan.outer, program)
+    made_by = fingerprint(axes, plan.outer, program, words)
     if version is not None:
         made_by["argument `version`"] = str(version)
     damaged = []
     try:
         if process()[0] == 0:
-            damaged = made_or_mended(path, axes, plan.outer, leaves, plan.block, made_by)
+            damaged = made_or_mended(path, axes, plan.outer, leaves, plan.block, made_by, words)
     finally:
         meet()  # whatever became of it
     store = of_sweep(path, made_by)

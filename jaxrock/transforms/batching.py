@@ -95,10 +95,11 @@ class Lanes:
         return [self._plan(quick, own) for quick in ([True, False] if self._is_quick else [False])]
 
     def _plan(self, quick: bool, own: tuple[bool, ...]):
-        key = quick, own
+        alone = self.size is None
+        key = quick, own, alone
         if key not in self.recipe.plans:
             program = self.recipe.quick if quick else self.recipe.program
-            self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled)
+            self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled, alone)
         return self.recipe.plans[key]
 
     def _natively(self, leaves) -> list:

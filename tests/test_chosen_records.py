@@ -1,0 +1,147 @@
+"""One record of a suite by its number: under `jax.vmap`, as an axis of a sweep, in place and without copies."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxrock as rk
+from jaxrock.engines.scene import Scene
+from jaxrock.motions.together import Chosen, Together
+
+SAMPLES = 1.5 * np.asarray(rk.example_record().samples)
+LENGTHS, STEPS = (300, 2, 310, 265), (0.01, 0.02, 0.005, 0.013)
+RECORDS = [rk.Record(SAMPLES[380 : 380 + n] + 0.02, dt, f"of {n}") for n, dt in zip(LENGTHS, STEPS)]
+SUITE = rk.motions.Suite(RECORDS)
+BLOCK = rk.Block(0.15, 3.0)
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
+SCALES = np.geomspace(0.3, 6.0, 20)
+
+
+def outcome(motion, scale=1.0):
+    return rk.outcome(BLOCK, scale * motion, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    """Eighty scenes: the quick pass, too."""
+    return rk.sweep(lambda motion, scale: outcome(motion, scale), motion=SUITE, scale=SCALES, progress=False)
+
+
+@pytest.fixture(scope="module")
+def by_hand():
+    """The same, record after record with samples of its own."""
+    parts = [jax.vmap(lambda scale, motion=motion: outcome(motion, scale))(SCALES) for motion in RECORDS]
+    return jax.tree.map(lambda *rows: np.stack(rows), *parts)
+
+
+@pytest.mark.parametrize("name", ["overturned", "impact_count", "max_rotation", "margin", "time_of_max", "clearance"])
+def test_an_axis_of_records_beside_one_after_the_other(grid, by_hand, name):
+    """Also in the record of one piece, and where the next one is stronger than what is left of one's own."""
+    assert 0.2 < by_hand.overturned.mean() < 0.8
+    np.testing.assert_allclose(getattr(grid.values, name), getattr(by_hand, name), rtol=1e-8)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_bounds_of_what_is_to_come_end_with_a_record(number):
+    """They are those of the record alone: what follows in the array is another motion."""
+    motion = Chosen(Together.of(RECORDS), jnp.int32(number))
+    among = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=True)
+    alone = Scene.of(BLOCK, 2.0 * RECORDS[number], rk.Linear())
+    here = slice(int(among.first), int(among.pieces) + 1)
+    ahead, own = among.outlook.horizontal, alone.outlook.horizontal
+    np.testing.assert_array_equal(ahead.to_end[here], own.to_end)
+    np.testing.assert_allclose(among.lengths[here], alone.lengths, rtol=1e-9)
+    assert among.outlook.strongest_drive == alone.outlook.strongest_drive == 2 * max(own.bounds.values)
+
+
+def test_labels_are_the_names_of_records(grid, tmp_path):
+    pytest.importorskip("h5netcdf")
+    pytest.importorskip("zarr")
+    names = [f"of {n}" for n in LENGTHS]
+    assert list(grid.axes["motion"]) == names
+    assert grid.to_xarray().margin.sel(motion="of 310", scale=SCALES[3]) == grid.values.margin[2, 3]
+    for kind in ("nc", "zarr"):
+        grid.save(tmp_path / f"found.{kind}")
+        again = rk.Grid.load(tmp_path / f"found.{kind}")
+        assert list(again.axes["motion"]) == names
+        np.testing.assert_array_equal(again.values.margin, grid.values.margin)
+
+
+def test_a_store_knows_the_names_of_records(grid, tmp_path):
+    pytest.importorskip("zarr")
+
+    def run(names):
+        suite = rk.motions.Suite(RECORDS[:2], names)
+        return rk.sweep(lambda motion: outcome(motion), motion=suite, store=tmp_path / "s.zarr", progress=False)
+
+    run(["a", "b"])
+    again = run(["a", "b"])
+    assert again.resumed == 2 and list(again.axes["motion"]) == ["a", "b"]
+    with pytest.raises(ValueError, match="other words of axis `motion`"):
+        run(["a", "c"])
+
+
+def test_lanes_share_the_samples_of_all_records():
+    """No lane has arrays of its own."""
+
+    def margin(number):
+        return outcome(SUITE[number]).margin
+
+    numbers = jnp.arange(60) % len(SUITE)  # without a quick pass, which takes longer to compile
+    memory = jax.jit(jax.vmap(margin)).lower(numbers).compile().memory_analysis()
+    lanes = numbers.size * max(LENGTHS) * SAMPLES.itemsize  # one copy for each
+    assert memory.temp_size_in_bytes < lanes / 2
+
+
+def test_measures_of_a_chosen_record():
+    peaks = jax.jit(jax.vmap(lambda number: rk.intensity.peak_acceleration(SUITE[number])))(jnp.arange(4))
+    np.testing.assert_allclose(peaks, SUITE.peak_acceleration, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_and_other_ways_go_through():
+    """A chosen record within other motions has samples of its own."""
+
+    def margin(number, scale, delay):
+        return rk.outcome(BLOCK, (scale * SUITE[number]).shifted(delay), **QUICK).margin
+
+    def in_place(number, scale):
+        return outcome(SUITE[number], scale).margin
+
+    numbers = jnp.arange(4)
+    assert_close = np.testing.assert_allclose
+    apart = [rk.outcome(BLOCK, (1.2 * motion).shifted(0.3), **QUICK).margin for motion in RECORDS]
+    assert_close(jax.vmap(margin, (0, None, None))(numbers, 1.2, 0.3), apart, rtol=1e-8)
+    slopes = [jax.grad(lambda s, m=motion: outcome(m, s).margin)(1.2) for motion in RECORDS]
+    assert_close(jax.vmap(jax.grad(in_place, 1), (0, None))(numbers, 1.2), slopes, rtol=1e-7)
+    one, other = (rk.simulate(BLOCK, motion, samples=51, **QUICK) for motion in (RECORDS[2], SUITE[2]))
+    assert_close(one.rotation, other.rotation, rtol=0, atol=1e-12)
+
+
+def test_pulses_of_one_kind_are_chosen_by_number():
+    suite = rk.motions.Suite([rk.SinePulse(0.4, 0.5), rk.SinePulse(0.3, 0.8)])
+    found = jax.vmap(lambda number: rk.intensity.peak_acceleration(suite[number]))(jnp.arange(2))
+    np.testing.assert_allclose(found, [0.4, 0.3], rtol=1e-9)
+
+
+MIXED = rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
+
+
+@pytest.mark.parametrize(
+    "choose, error, message",
+    [
+        (lambda: SUITE[4], IndexError, "out of range"),
+        (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(4), Exception, r"must be in \[0, 3\]"),
+        (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(1.5), ValueError, "has a whole number"),
+        (lambda: jax.jit(lambda k: outcome(MIXED[k]).margin)(1), ValueError, "must be records, or"),
+    ],
+)
+def test_what_is_refused(choose, error, message):
+    with pytest.raises(error, match=message):
+        choose()
+
+
+def test_a_suite_is_a_sequence():
+    assert [motion.samples.size for motion in SUITE] == list(LENGTHS)
+    assert SUITE[-1].samples.size == LENGTHS[-1] and MIXED[1].acceleration(0.125) == pytest.approx(0.4)
