@@ -64,6 +64,21 @@ def test_any_solver(engine, tolerance):
 
 
 @pytest.mark.slow
+def test_the_edge_of_certain_loss():
+    """An arc ends where no forcing can bring the block back; what rounding leaves there must not end the next at once,
+    and all after it. Of functions nothing is known beyond, so these blocks go on."""
+
+    def found(amplitude, model, engine):
+        return rk.outcome(BLOCK, rk.SinePulse(amplitude, 1.4), model, engine=engine)
+
+    amplitudes = np.linspace(0.6, 0.9, 61)
+    exact = jax.vmap(lambda a: found(a, rk.Housner(), rk.Series()))(amplitudes)
+    lanes = jax.vmap(lambda a: found(a, rk.Equation(sine, cosine), rk.Diffrax()))(amplitudes)
+    assert (lanes.status == rk.Status.successful).all()
+    np.testing.assert_array_equal(lanes.overturned, exact.overturned)
+
+
+@pytest.mark.slow
 def test_history_to_rest():
     """More than a hundred impacts, one by one: times, velocities and the dense history agree with the series engine."""
     exact, found = (rk.simulate(BLOCK, PULSE, engine=e, samples=401) for e in (rk.Series(), rk.Diffrax()))
