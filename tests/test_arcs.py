@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.responses.outcome import _by_steps
 
 BLOCK, PULSE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.23, 1.4)  # three impacts, then safe
 
@@ -158,6 +159,17 @@ def exact_slopes():
     points = np.concatenate([PARAMETERS + k * steps for k in (-2, -1, 1, 2)])
     far, near, plus, further = np.asarray(values(points)).reshape(4, 5)
     return (far - 8 * near + 8 * plus - further) / (12 * 1e-5 * PARAMETERS)
+
+
+def test_derivatives_do_not_call_back():
+    """JAX keeps no program that calls back to Python."""
+
+    def margin(p):
+        block = eqx.tree_at(lambda block: block.p, BLOCK, p)
+        return _by_steps((block, PULSE, rk.Housner(), (0.0, 0.0), rk.Diffrax())).margin
+
+    program = jax.jit(lambda p: jax.jvp(margin, (p,), (1.0,))).lower(2.0).as_text()
+    assert "while" in program and "callback" not in program
 
 
 def test_forward_derivatives(exact_slopes):
