@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
 
-from jaxrock._checks import Range, one_of, shown, whole
+from jaxrock._checks import Range, one_of, shown, truth, whole
 
 Taking = TypeVar("Taking", bound=Callable)
 Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
@@ -71,7 +71,7 @@ def check_of(hint: Any) -> Check | None:
     if hint is int:
         return lambda name, value: whole(name, value)
     if hint is bool:
-        return lambda name, value: _kind(name, value, (bool, np.bool_), "be True or False")
+        return truth
     if hint is str:
         return lambda name, value: _kind(name, value, (str,), "be a word")
     if hint is collections.abc.Callable or get_origin(hint) is collections.abc.Callable:

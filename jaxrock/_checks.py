@@ -172,9 +172,7 @@ def with_throw(function: Making) -> Making:
 
     @functools.wraps(function)
     def made(*args: Any, throw: bool = True, **kwargs: Any) -> Any:
-        if throw is not True and throw is not False:
-            raise ValueError(f"Argument `throw` must be True or False, but is {shown(throw)}.")
-        if throw:
+        if truth("throw", throw):
             return function(*args, **kwargs)
         with marked():
             return function(*args, **kwargs)
@@ -254,6 +252,13 @@ def whole(name: str, value: Any, least: int | None = None, most: int | None = No
         ends = "" if least is None else f", at least {least}" if most is None else f" from {least} to {most}"
         raise ValueError(f"Argument `{name}` must be a whole number{ends}, but is {shown(value)}.")
     return int(value)
+
+
+def truth(name: str, value: Any) -> bool:
+    """Return `value` if it is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"Argument `{name}` must be True or False, but is {shown(value)}.")
+    return bool(value)
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:

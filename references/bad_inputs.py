@@ -222,6 +222,8 @@ CALLS: dict[str, Call] = {
             "damping": "modal",
             "impacts": "every",
             "base": "linear",
+            "rotations": "finite",
+            "p_delta": True,
             "gravity": 9.81,
         },
     ),

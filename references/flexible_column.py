@@ -74,3 +74,109 @@ def independent(block, motion, duration):
         return found[-1], np.cos(alpha) * found[n - 1]
 
     return at, impacts
+
+
+class Chain:
+    """The same column with finite rotations, any law of its base and its weight, by SciPy: a chain of rigid elements
+    that springs hold straight, in the angles of its elements.
+
+    Its masses move by the sum of the elements before them; forces are turned into moments of the elements by how places
+    change with angles. The damping is in proportion to stiffness.
+    """
+
+    def __init__(self, block, motion):
+        width, height, modulus, density, ratio = (
+            float(getattr(block, k)) for k in ("width", "height", "youngs_modulus", "density", "damping_ratio")
+        )
+        self.length, self.alpha = np.hypot(width, height), np.arctan2(width, height)
+        self.mass = density * width * height
+        self.base, self.p_delta, self.finite = block.base, block.p_delta, block.rotations == "finite"
+        self.masses, _, stiffness = beam(block.masses, self.length, modulus * width**3 / 12, self.mass)
+        self.count = len(self.masses)
+        self.arms = np.tri(self.count) * self.length / self.count  # of elements, on masses
+        self.bend = self.arms.T @ stiffness @ self.arms
+        slowest = np.linalg.eigvalsh(stiffness / np.sqrt(np.outer(self.masses, self.masses)))[0]
+        self.damping = 2 * ratio / np.sqrt(slowest)
+        self.restitution, self.motion = float(block.restitution), motion
+        self.moment = self.mass * 9.81 * self.length / 2
+
+    def places(self, angles):
+        """How masses move with the angles, across and up."""
+        sine, cosine = (np.sin(angles), np.cos(angles)) if self.finite else (angles, np.ones_like(angles))
+        return self.arms * cosine, -self.arms * sine
+
+    def spring(self, theta, side):
+        """Moment of the base."""
+        sine = np.sin(theta) if self.finite else theta
+        x = side * theta
+        law = {"sine": np.sin(self.alpha - x), "linear": np.sin(self.alpha) * (1 - x / self.alpha),
+               "plastic": np.sin(self.alpha) - side * sine}[self.base]  # fmt: skip
+        return self.moment * (side * law + self.p_delta * sine)
+
+    def turn(self, angles, speeds, theta, side):
+        """Velocity of the base, from the balance of moments there: damping holds it back."""
+        ones = np.ones(self.count)
+        held = ones @ self.bend @ (angles - theta) - self.spring(theta, side)
+        return (held / self.damping + ones @ self.bend @ speeds) / (ones @ self.bend @ ones)
+
+    def rates(self, t, x, side):
+        angles, speeds, theta = x[: self.count], x[self.count : -1], x[-1]
+        turn = self.turn(angles, speeds, theta, side) if side else 0.0
+        across, up = self.places(angles)
+        push = -self.ground(t) * np.cos(self.alpha) * self.masses
+        moments = across.T @ push - self.bend @ (angles - theta + self.damping * (speeds - turn))
+        if self.p_delta:
+            moments -= up.T @ (9.81 * self.masses) if self.finite else -self.arms.T @ (9.81 * self.masses) * angles
+        inertia = across.T @ (self.masses[:, None] * across)
+        if self.finite:
+            inertia = inertia + up.T @ (self.masses[:, None] * up)
+            # Masses on a circle: toward its centre.
+            moments = (
+                moments - across.T @ (self.masses * (up @ speeds**2)) + up.T @ (self.masses * (across @ speeds**2))
+            )
+        return np.concatenate([speeds, np.linalg.solve(inertia, moments), [turn]])
+
+    def ground(self, t):
+        """Acceleration of a sine pulse [m/s^2]."""
+        period = float(self.motion.period)
+        return float(self.motion.amplitude) * 9.81 * np.sin(2 * np.pi * t / period) if t < period else 0.0
+
+    def held(self, x):
+        """Moment at a locked base."""
+        return np.sum(self.bend @ (x[: self.count] + self.damping * x[self.count : -1]))
+
+    def follow(self, duration, tolerance=1e-10):
+        """Paths (start, end, function) and times of impacts."""
+        strength = self.moment * np.sin(self.alpha)
+        t, x, side, last = 0.0, np.zeros(2 * self.count + 1), 0, 0
+        pieces, impacts = [], []
+        while t < duration:
+            stop = float(self.motion.period) if t < float(self.motion.period) else duration
+
+            def edge(t, x, side=side):
+                return side * x[-1] if side else strength - abs(self.held(x))
+
+            edge.terminal, edge.direction = True, -1
+            path = solve_ivp(
+                lambda t, x, side=side: self.rates(t, x, side), (t, stop), x, "DOP853", events=edge, rtol=tolerance,
+                atol=tolerance / 1000, dense_output=True, max_step=0.02,
+            )  # fmt: skip
+            pieces.append((t, path.t[-1], path.sol))
+            t, x = path.t[-1], path.y[:, -1].copy()
+            if path.status == 1 and side:
+                if side != last:
+                    impacts.append(t)
+                    x[self.count : -1] *= self.restitution
+                x[-1], last = 0.0, side
+                pushed = self.held(x)
+                side = int(np.sign(pushed)) if abs(pushed) > strength else 0
+            elif path.status == 1:
+                side = int(np.sign(self.held(x)))
+        return pieces, impacts
+
+    def at(self, pieces, time):
+        """Rotation of the base, and displacement of the top [m]."""
+        found = next(path for start, end, path in reversed(pieces) if time >= start)(time)
+        angles = found[: self.count]
+        across = self.length / self.count * np.sum(np.sin(angles) if self.finite else angles)
+        return found[-1], np.cos(self.alpha) * across

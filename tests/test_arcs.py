@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.responses.outcome import _by_steps
 
 BLOCK, PULSE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.23, 1.4)  # three impacts, then safe
 
@@ -61,6 +62,21 @@ def test_any_solver(engine, tolerance):
     assert found.impact_count == exact.impact_count == 3
     assert abs(float(found.max_rotation - exact.max_rotation)) < tolerance * 0.2
     assert abs(float(found.margin - exact.margin)) < 3 * tolerance
+
+
+@pytest.mark.slow
+def test_the_edge_of_certain_loss():
+    """An arc ends where no forcing can bring the block back; what rounding leaves there must not end the next at once,
+    and all after it. Of functions nothing is known beyond, so these blocks go on."""
+
+    def found(amplitude, model, engine):
+        return rk.outcome(BLOCK, rk.SinePulse(amplitude, 1.4), model, engine=engine)
+
+    amplitudes = np.linspace(0.6, 0.9, 61)
+    exact = jax.vmap(lambda a: found(a, rk.Housner(), rk.Series()))(amplitudes)
+    lanes = jax.vmap(lambda a: found(a, rk.Equation(sine, cosine), rk.Diffrax()))(amplitudes)
+    assert (lanes.status == rk.Status.successful).all()
+    np.testing.assert_array_equal(lanes.overturned, exact.overturned)
 
 
 @pytest.mark.slow
@@ -143,6 +159,17 @@ def exact_slopes():
     points = np.concatenate([PARAMETERS + k * steps for k in (-2, -1, 1, 2)])
     far, near, plus, further = np.asarray(values(points)).reshape(4, 5)
     return (far - 8 * near + 8 * plus - further) / (12 * 1e-5 * PARAMETERS)
+
+
+def test_derivatives_do_not_call_back():
+    """JAX keeps no program that calls back to Python."""
+
+    def margin(p):
+        block = eqx.tree_at(lambda block: block.p, BLOCK, p)
+        return _by_steps((block, PULSE, rk.Housner(), (0.0, 0.0), rk.Diffrax())).margin
+
+    program = jax.jit(lambda p: jax.jvp(margin, (p,), (1.0,))).lower(2.0).as_text()
+    assert "while" in program and "callback" not in program
 
 
 def test_forward_derivatives(exact_slopes):

@@ -18,6 +18,10 @@ class UnitColumn(NamedTuple):
     rotation: Float[np.ndarray, " modes"]  # y' M shape: the modes of a unit rotation about the base
     translation: Float[np.ndarray, " modes"]  # 1' M shape
     tip: Float[np.ndarray, " modes"]  # the shapes at the top
+    chords: Float[np.ndarray, "elements modes"]  # by how much the elements turn
+    carried: Float[np.ndarray, " elements"]  # moment of the weight that an element carries, per turn of it
+    sway: Float[np.ndarray, "elements elements"]  # masses, as the turning elements feel them
+    buckling: float  # its own weight that a clamped column just bears, over bending stiffness/length^2
 
 
 @functools.cache
@@ -42,7 +46,14 @@ def unit_column(masses: int) -> UnitColumn:
     vectors = np.where(from_soft, soft, stiff)
     shapes = vectors / root[:, None]
     shapes = shapes * np.sign(shapes[-1])
-    return UnitColumn(np.sqrt(squares), shapes, (height * mass) @ shapes, mass @ shapes, shapes[-1])
+    chords = elements * np.diff(shapes, axis=0, prepend=0.0)
+    above = mass[::-1].cumsum()[::-1]
+    sway = np.minimum.outer(above, above) / elements**2
+    weight = (chords.T * above / elements) @ chords / np.sqrt(np.outer(squares, squares))
+    return UnitColumn(
+        np.sqrt(squares), shapes, (height * mass) @ shapes, mass @ shapes, shapes[-1], chords, above / elements, sway,
+        float(1 / np.linalg.eigvalsh(weight)[-1]),
+    )  # fmt: skip
 
 
 def _stiffness(elements: int) -> Float[np.ndarray, "nodes nodes"]:

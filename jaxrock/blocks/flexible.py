@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, below_one, checked, one_of, size, whole, with_throw
+from jaxrock._checks import Range, below_one, checked, one_of, size, truth, whole, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
@@ -21,9 +21,10 @@ _stiff = Range("be positive and finite, from 1e-9 to 1e30", 0.0, math.inf, lambd
 class FlexibleBlock(Owner):
     """A rectangular elastic block that rocks: lumped masses on a cantilever whose base is a rocking spring (mmSM).
 
-    Small rotations: the column of length 2R carries the ground's acceleration times cos(alpha), and its base turns
-    against the moment M0 (1 - |theta|/balance), M0 = m g R sin(alpha); below M0 it is locked. When the rotation
-    returns to zero the velocities of all masses are multiplied by the restitution.
+    The column of length 2R carries the ground's acceleration times cos(alpha), and its base turns against a moment that
+    falls with its rotation; below M0 = m g R sin(alpha) it is locked. When the rotation returns to zero the velocities
+    of all masses are multiplied by the restitution. With small rotations, "linear" or "plastic", and without P-Delta
+    every phase is linear, and solved exactly; else what is not linear is followed beside the linear part.
 
     **Arguments:**
 
@@ -42,16 +43,20 @@ class FlexibleBlock(Owner):
     - `impacts`: which returns of the base to zero count as impacts: "alternate": the first from either side, and later
       ones from that side that end a longer stay, so that a column that bounces on one edge is not braked twice, and
       one that trembles as it uplifts is braked when it comes down; "every": all of them.
-    - `base`: moment of the base. "linear": a constant negative stiffness that balances at alpha; "plastic": M0, less
-      what the weight of the leaning column pulls, m g R theta, so that it balances at sin(alpha).
+    - `base`: moment of the base at the rotation x, less what the weight of the straight column pulls. "sine":
+      m g R sin(alpha - x), the block's own; "linear": M0 (1 - x/alpha), a constant negative stiffness; "plastic":
+      M0 - m g R sin(x), or m g R x with small rotations, so that it balances at alpha, or at sin(alpha).
+    - `rotations`: "small": sines of rotations are rotations, cosines 1; "finite": the elements of the column turn as
+      they are, so that its top moves by cos(alpha) times their sines, and the ground pushes with their cosines.
+    - `p_delta`: whether the weight pulls at the column as it is bent, and not only at its base.
     - `gravity`: [m/s^2], positive.
 
-    All but `masses`, `base`, `damping` and `impacts` may be arrays of one shape, for use under `jax.vmap`.
+    Numbers may be arrays of one shape, for use under `jax.vmap`; `masses`, words and `p_delta` are one for all.
 
     **Raises:** ValueError for a value outside its range.
 
-    **Source:** Diamantopoulos & Fragiadakis (2017), sections 3.4 and 6, with the constant negative stiffness of
-    figure 3b, or the rigid-plastic law of figure 3c; Vassiliou, Mackie & Stojadinovic (2016).
+    **Source:** Diamantopoulos & Fragiadakis (2017), sections 3.4 and 6, with the laws of figure 3: of a stiff column
+    equations 13 ("sine"), 14 ("linear") and 15 ("plastic"); Vassiliou, Mackie & Stojadinovic (2016).
     """
 
     width: Real = parameter("m", size)
@@ -65,6 +70,8 @@ class FlexibleBlock(Owner):
     damping: str = eqx.field(static=True)
     impacts: str = eqx.field(static=True)
     base: str = eqx.field(static=True)
+    rotations: str = eqx.field(static=True)
+    p_delta: bool = eqx.field(static=True)
 
     __repr__ = described
 
@@ -82,12 +89,16 @@ class FlexibleBlock(Owner):
         damping: str = "stiffness",
         impacts: str = "alternate",
         base: str = "linear",
+        rotations: str = "small",
+        p_delta: bool = False,
         gravity: ArrayLike = GRAVITY,
         throw: bool = True,
     ):
         self.damping = one_of("damping", damping, ("stiffness", "modal", "rayleigh"))
         self.impacts = one_of("impacts", impacts, ("alternate", "every"))
-        self.base = one_of("base", base, ("linear", "plastic"))
+        self.base = one_of("base", base, ("sine", "linear", "plastic"))
+        self.rotations = one_of("rotations", rotations, ("small", "finite"))
+        self.p_delta = truth("p_delta", p_delta)
         least = 3 if damping == "rayleigh" else 2
         self.masses = whole("masses", masses, least, 60)
         set_parameters(self, width=width, height=height, youngs_modulus=youngs_modulus, density=density)
@@ -108,6 +119,13 @@ class FlexibleBlock(Owner):
             "make the column at most 1e12 times as stiff as its base is unstable: rounding shows above (a rigid block)",
             lambda x: jnp.sum(self._column_stiffness, -1) < 1e12 * self.spring_rate,
         )
+        if self.p_delta:
+            self.youngs_modulus = checked(
+                "youngs_modulus",
+                self.youngs_modulus,
+                "make the column, held at its base, bear twice its own weight when `p_delta` is True",
+                lambda x: unit_column(self.masses).buckling * self._bending_rate**2 > 2 * self.gravity / self.length,
+            )
 
     @property
     def alpha(self) -> Real:
@@ -148,11 +166,13 @@ class FlexibleBlock(Owner):
     @property
     def frequencies(self) -> Inexact[Array, "*batch modes"]:
         """Angular frequencies of the clamped column of masses [rad/s]."""
-        # sqrt(E I/(m L^3)), with section width^3/12 and mass density width height, both per depth.
-        rate = (
-            jnp.sqrt(self.youngs_modulus / (12 * self.density * self.height * self.length)) * self.width / self.length
-        )
-        return rate[..., None] * unit_column(self.masses).frequencies
+        return self._bending_rate[..., None] * unit_column(self.masses).frequencies
+
+    @property
+    def _bending_rate(self) -> Real:
+        """sqrt(E I/(m L^3)), with section width^3/12 and mass density width height, both per depth [1/s]."""
+        inertia = 12 * self.density * self.height * self.length
+        return jnp.sqrt(self.youngs_modulus / inertia) * self.width / self.length
 
     @property
     def _column_stiffness(self) -> Inexact[Array, "*batch modes"]:
@@ -166,13 +186,23 @@ class FlexibleBlock(Owner):
 
     @property
     def spring_rate(self) -> Real:
-        """Negative stiffness of the base, over m L^2 [1/s^2]."""
-        return self.strength / self.balance
+        """Negative stiffness of the base where it balances, over m L^2 [1/s^2]."""
+        if self.base == "linear":
+            return self.strength / self.alpha
+        weight = self.gravity / (2 * self.length)
+        return weight * jnp.cos(self.alpha) if self.base == "plastic" and self.rotations == "finite" else weight
 
     @property
     def balance(self) -> Real:
-        """Rotation of the unstable equilibrium [rad]."""
-        return self.alpha if self.base == "linear" else jnp.sin(self.alpha)  # D&F 2017, figure 3 b, c for small angles
+        """Rotation of the unstable equilibrium of a column that does not bend [rad]."""
+        if self.base == "plastic" and self.rotations == "small":
+            return jnp.sin(self.alpha)
+        return self.alpha
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether every phase of its motion is linear."""
+        return self.base != "sine" and self.rotations == "small" and not self.p_delta
 
     @property
     def damping_rates(self) -> tuple[Real, Inexact[Array, "*batch modes"]]:

@@ -45,6 +45,9 @@ class Numbers(eqx.Module):
     balance: Scalar  # rotation of the unstable equilibrium [rad]
     alpha: Scalar
     damped: Bool[Array, ""]
+    lean: Scalar  # displacement of the top with a unit rotation, over L, less 1
+    center: Inexact[Array, " states"]  # (q, q', theta) of the unstable equilibrium
+    offsets: Inexact[Array, " outputs"]  # and its outputs
 
     @classmethod
     def of(cls, block: FlexibleBlock) -> "Numbers":
@@ -59,11 +62,12 @@ class Numbers(eqx.Module):
         # At critical damping two rates coincide and the modes do not span the motion: keep clear of it.
         decay = mass_damping + damping
         critical = jnp.abs(decay**2 - 4 * squares) < 1e-11 * squares
+        rotation = jnp.asarray(column.rotation, dtype)
         return cls(
             squares=squares,
             damping=jnp.where(critical, damping * (1 + 1e-10), damping),
             mass_damping=mass_damping,
-            rotation=jnp.asarray(column.rotation, dtype),
+            rotation=rotation,
             load=jnp.asarray(column.translation, dtype) * jnp.cos(block.alpha) * block.gravity / block.length,
             tip=jnp.asarray(column.tip, dtype),
             strength=block.strength,
@@ -71,6 +75,9 @@ class Numbers(eqx.Module):
             balance=block.balance,
             alpha=block.alpha,
             damped=damped,
+            lean=jnp.zeros((), dtype),
+            center=block.balance * jnp.concatenate([rotation, 0 * rotation, jnp.ones(1, dtype)]),
+            offsets=block.balance * jnp.array([1.0, 1.0, 0.0, 0.0], dtype),
         )
 
     def moment(self, state: Inexact[Array, " states"]) -> Scalar:
@@ -161,7 +168,7 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
     project = jnp.where(dropped[:, None], 0.0, project)
     # Strong damping in proportion to stiffness crowds rates together: the inverse of the modes, once corrected.
     project = 2 * project - (project @ modes) @ project
-    bending = -jnp.sum(numbers.tip * numbers.rotation * inertia / denominator, 1)
+    bending = numbers.lean - jnp.sum(numbers.tip * numbers.rotation * inertia / denominator, 1)
     phase = Phase(
         rates=jnp.where(dropped, -1.0, rates),
         modes=modes,
@@ -254,9 +261,7 @@ class Arc(eqx.Module):
 
 def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array, " order"], length: Scalar) -> Arc:
     """The motion from `state` on one side (0: locked) under a_g = sum of load[k] x^k, x = time/length."""
-    n = numbers.rotation.size
-    center = numbers.balance * side * jnp.concatenate([numbers.rotation, jnp.zeros(n), jnp.ones(1)])
-    offsets = numbers.balance * side * jnp.array([1.0, 1.0, 0.0, 0.0], center.dtype)
+    center, offsets = side * numbers.center, side * numbers.offsets
     start = phase.project @ (state - center)
     exponents = phase.rates * length
     slow = jnp.abs(exponents) < 1
@@ -265,6 +270,22 @@ def arc(numbers: Numbers, phase: Phase, side: Scalar, state, load: Inexact[Array
     amplitudes = jnp.where(slow, 0.0, start - follows[0])
     errors = 8 * jnp.finfo(center.dtype).eps * (jnp.abs(phase.project) @ (jnp.abs(state) + jnp.abs(center)))
     return Arc(phase, center, offsets, amplitudes, exponents, jnp.where(slow, series, follows), errors)
+
+
+def answers(exponents: Complex[Array, " modes"], count: int) -> Complex[Array, "count terms modes"]:
+    """How modes that start at zero answer x^0, x^1, ...: series of those that hardly turn, polynomials of others."""
+    slow = jnp.abs(exponents) < 1
+    series, follows = jnp.where(slow, exponents, 0.0), jnp.where(slow, 1.0, exponents)
+
+    def answer(load):
+        return jnp.where(slow, _series(series, 0.0, 1.0, load), _follows(follows, 1.0, load))
+
+    return jax.vmap(answer)(jnp.eye(count))
+
+
+def rising_terms(exponents: Complex[Array, " modes"]) -> Complex[Array, "terms modes"]:
+    """Series of e^(exponent x), of modes that hardly turn."""
+    return powers(jnp.where(jnp.abs(exponents) < 1, exponents, 0.0), _TERMS) / _FACTORIALS[:, None]
 
 
 def _series(exponents, start, drive, load) -> Complex[Array, "terms modes"]:

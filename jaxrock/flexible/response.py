@@ -5,7 +5,6 @@ from typing import Annotated
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
@@ -13,9 +12,9 @@ from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, along_time
-from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
+from jaxrock.flexible.bent import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status, marked_result
@@ -132,7 +131,7 @@ def outcome_flexible(
     motion: AbstractMotion,
     *,
     duration: ArrayLike | None = None,
-    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
+    max_steps: Annotated[int | None, at_least(1, 10**9)] = None,
     throw: bool = True,
 ) -> FlexibleOutcome:
     """Tell what becomes of a flexible block under a motion.
@@ -142,16 +141,19 @@ def outcome_flexible(
     - `block`: a `FlexibleBlock` of scalars (use `jax.vmap` for many).
     - `motion`: any horizontal motion; the ground rests after its end.
     - `duration`: how long to follow the block [s], positive; None: the motion and 10/p of free rocking.
-    - `max_steps`: budget of steps besides four for each piece of the motion, at least 1.
+    - `max_steps`: budget of steps besides four for each piece of the motion, at least 1; None: 4,096, or 32,768 where
+      phases are not linear (then every vibration that matters takes a step a turn or so).
     - `throw`: as in `outcome`.
 
-    **Returns:** a `FlexibleOutcome`. Its derivatives (forward and reverse) by block and motion are exact.
+    **Returns:** a `FlexibleOutcome`. Its derivatives (forward and reverse) by block and motion are exact. Its verdict,
+    where the block is still rocking at the end, is that of the balance's own modes: exact where phases are linear, and
+    near the balance where they are not.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
     say_if_single()
     stop = _duration(block, motion, duration, throw)
-    result = _outcome(block, motion, stop, _budget(motion, max_steps))
+    result = _outcome(block, motion, stop, _budget(block, motion, max_steps))
     return result if throw else marked_result(result, (block, motion, stop))
 
 
@@ -162,7 +164,7 @@ def simulate_flexible(
     *,
     duration: ArrayLike | None = None,
     samples: Annotated[int, at_least(2, 10**7)] = 2001,
-    max_steps: Annotated[int, at_least(1, 10**9)] = 4096,
+    max_steps: Annotated[int | None, at_least(1, 10**9)] = None,
     throw: bool = True,
 ) -> FlexibleResponse:
     """Compute the history of a flexible block under a motion.
@@ -179,7 +181,7 @@ def simulate_flexible(
     """
     say_if_single()
     stop = _duration(block, motion, duration, throw)
-    result, path = _simulate(block, motion, stop, _budget(motion, max_steps))
+    result, path = _simulate(block, motion, stop, _budget(block, motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     rotation, displacement, bending = _along(path, time, "outputs")[:3]
     response = FlexibleResponse(time, rotation, displacement, bending, result, path)
@@ -198,14 +200,15 @@ def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike 
         return scalar("duration", span("duration", duration))
 
 
-def _budget(motion: AbstractMotion, max_steps: int) -> int:
-    return max_steps + 4 * motion.knots.size
+def _budget(block: FlexibleBlock, motion: AbstractMotion, max_steps: int | None) -> int:
+    usual = 4096 if block.is_linear else 32_768
+    return (max_steps or usual) + 4 * motion.knots.size
 
 
 @eqx.filter_jit
 def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
     def run(given):
-        scene = FlexibleScene.of(*given)
+        scene = scene_of(*given)
         state = jax.lax.while_loop(lambda s: ~s.done & (s.steps < budget), lambda s: scene.advance(s), scene.start())
         return scene.conclude(state)
 
@@ -214,7 +217,7 @@ def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
 
 @eqx.filter_jit
 def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajectory]:
-    scene = FlexibleScene.of(block, motion, stop)
+    scene = scene_of(block, motion, stop)
 
     def loop(unfinished, step, carry, budget):
         return jax.lax.while_loop(unfinished, step, carry)
@@ -230,7 +233,6 @@ def _along(path: Trajectory, time, what: str):
     """Outputs, displacements of the masses, or energies, at times."""
     scene = path.stepper
     reach = jnp.cos(scene.numbers.alpha) * scene.block.length
-    shapes = np.vstack([np.zeros(scene.block.masses - 1), unit_column(scene.block.masses).shapes])
     scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * reach
 
     def follow(node, elapsed):
@@ -239,6 +241,6 @@ def _along(path: Trajectory, time, what: str):
         if what == "outputs":
             return tuple(curve.outputs(x) * scales)
         state = curve.state(x)
-        return scene.energy(state) if what == "energy" else reach * (shapes @ state[: shapes.shape[1]])
+        return scene.energy(state) if what == "energy" else reach * scene.column(state)
 
     return path.along(time, follow)

@@ -4,12 +4,15 @@ Each phase (locked base, rocking on either corner) is linear, so a step is exact
 polynomial that answers the motion's Taylor series. Steps end where the series does, at knots, and at events.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Inexact, Int
 
 from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
@@ -40,6 +43,7 @@ class FlexibleState(eqx.Module):
     impacts: Int[Array, ""]
     impacted: Bool[Array, ""]  # just now
     fallen: Bool[Array, ""]
+    stride: Scalar  # how long a step may be, by what is beside the linear phase [s]
     done: Bool[Array, ""]
     status: Status
     steps: Int[Array, ""]
@@ -118,6 +122,7 @@ class FlexibleScene(eqx.Module):
             impacts=count,
             impacted=no,
             fallen=no,
+            stride=zero + jnp.inf,
             done=~(finite & self.whole),
             status=Status.where(finite & ~self.whole, Status.solver_failed, status),
             steps=count,
@@ -127,9 +132,19 @@ class FlexibleScene(eqx.Module):
         """Time of a state [s]."""
         return self.knots[state.piece] + state.local
 
+    def longest(self, state: FlexibleState) -> Scalar:
+        """How long a step may be [s]: grown by more than e^10, the unstable mode would hide the others."""
+        return 10 / jax.lax.stop_gradient(jnp.max(self.rocking.rates.real))
+
     def arc(self, state: FlexibleState) -> tuple[Arc, Scalar, Scalar, Bool[Array, ""]]:
         """The motion from here: the arc, its length [s], the share of it that belongs to this piece (1, or 0 of a
         piece without length), and whether it ends with the piece."""
+        load, *step = self.load(state)
+        phase = Phase.where(state.side == 0, self.locked, self.rocking)
+        return arc(self.numbers, phase, state.side, state.motion, load, step[0]), *step
+
+    def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Scalar, Scalar, Bool[Array, ""]]:
+        """The ground's acceleration [g] along the arc from here, and the rest that `arc` returns."""
         last = self.knots.size - 1
         quiet, inner = state.piece >= last, jnp.minimum(state.piece, last - 1)
         lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
@@ -138,22 +153,23 @@ class FlexibleScene(eqx.Module):
         scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
         unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, 1.0))
         load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
-        # Grown by more than e^10, the unstable mode would hide the others.
-        fastest = jax.lax.stop_gradient(jnp.max(self.rocking.rates.real))
-        cap = jnp.minimum(left, 10 / fastest) / unit
+        cap = jnp.minimum(left, self.longest(state)) / unit
         if len(load) > 4:
             size = jnp.finfo(left.dtype).eps / 4 * jnp.max(self.ground.bounds)
             cap = step_length(jax.lax.stop_gradient(load), jax.lax.stop_gradient(size), cap)
         length = jnp.where(left > 0, cap * unit, 1.0)
         whole = cap * unit >= left
         share = jnp.where(whole, remaining / length, 1.0)
-        load = jnp.stack(load) * powers(length / unit, len(load))
-        phase = Phase.where(state.side == 0, self.locked, self.rocking)
-        return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
+        return jnp.stack(load) * powers(length / unit, len(load)), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
         """One step: to an event, to the end of a piece, or as far as the motion's series holds."""
-        path, length, share, whole = self.arc(state)
+        return self.along(state, *self.arc(state))
+
+    def along(
+        self, state: FlexibleState, path: Arc, length: Scalar, share: Scalar, whole: Bool[Array, ""]
+    ) -> FlexibleState:
+        """One step along an arc."""
         rows = path.curves()
         turned, moment = (jax.tree.map(lambda x, i=i: x[i], rows) for i in (0, 3))
         rocking, limit = state.side != 0, self.numbers.strength
@@ -200,7 +216,7 @@ class FlexibleScene(eqx.Module):
         n = numbers.rotation.size
         after = jnp.where(counts, still.at[n:-1].multiply(self.reset.ratio(jnp.abs(speed))), still)
         # A damped column may push the base over at once.
-        pushed = numbers.moment(after)
+        pushed = self.moment(after)
         over = numbers.damped & (jnp.abs(pushed) > numbers.strength)
         side = jnp.where(returned, jnp.where(over, jnp.sign(pushed), 0.0), state.side)
         side = jnp.where(~rocking & (below | above), jnp.where(above, 1.0, -1.0), side)
@@ -212,7 +228,8 @@ class FlexibleScene(eqx.Module):
         local = jnp.where(stopped, state.local + elapsed, local)
         piece = jnp.where(stopped, state.piece, piece)
         finite = jnp.isfinite(after).all() & jnp.isfinite(elapsed)
-        return FlexibleState(
+        return replace(
+            state,
             piece=piece,
             local=local,
             motion=after,
@@ -220,9 +237,6 @@ class FlexibleScene(eqx.Module):
             last_side=jnp.where(returned, state.side, state.last_side),
             stay=jnp.where(returned, 0.0, stay),
             braked_stay=jnp.where(counts, stay, state.braked_stay),
-            maxima=state.maxima,
-            closeness=state.closeness,
-            closeness_beyond=state.closeness_beyond,
             impacts=state.impacts + counts,
             impacted=counts,
             fallen=state.fallen | fallen,
@@ -230,6 +244,20 @@ class FlexibleScene(eqx.Module):
             status=Status.where(finite, state.status, Status.not_finite),
             steps=state.steps + 1,
         )
+
+    def moment(self, motion: Inexact[Array, " states"]) -> Scalar:
+        """Moment at a locked base, over m L^2 [1/s^2]."""
+        return self.numbers.moment(motion)
+
+    def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
+        """Displacements of the masses from the base to the top, over L cos(alpha)."""
+        column = unit_column(self.block.masses)
+        return jnp.concatenate([jnp.zeros(1), column.shapes @ motion[: self.block.masses - 1]])
+
+    @property
+    def summit(self) -> Scalar:
+        """Energy of the unstable equilibrium, over m L^2 [1/s^2]."""
+        return self.numbers.strength * self.numbers.balance / 2
 
     def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
         """Kinetic energy, strain energy of the column, potential energy of the base, over m L^2 [1/s^2]."""
@@ -243,7 +271,7 @@ class FlexibleScene(eqx.Module):
     def conclude(self, state: FlexibleState) -> FlexibleOutcome:
         """What came of it, from the state at the end."""
         lost = state.fallen | self._never_returns(state)
-        total = sum(self.energy(state.motion)) / (self.numbers.strength * self.numbers.balance / 2)
+        total = sum(self.energy(state.motion)) / self.summit
         quiet = self.time(state) >= self.knots[-1]
         status = Status.where(lost | (total < 1) | ~quiet, state.status, Status.undecided)
         status = Status.where(state.status == Status.successful, status, state.status)
@@ -257,9 +285,7 @@ class FlexibleScene(eqx.Module):
 
     def _amplitudes(self, state: FlexibleState) -> Complex[Array, " modes"]:
         """Of the modes of the rocking base [rad], about its balance."""
-        n = self.numbers.rotation.size
-        shape = jnp.concatenate([self.numbers.rotation, jnp.zeros(n), jnp.ones(1)])
-        return self.rocking.project @ (state.motion - self.numbers.balance * state.side * shape)
+        return self.rocking.project @ (state.motion - state.side * self.numbers.center)
 
     def _never_returns(self, state: FlexibleState) -> Bool[Array, ""]:
         """Whether, without further shaking, the unstable mode outgrows all others from here on."""

@@ -65,7 +65,8 @@ def animate(
     rotation, bending = np.asarray(response(time)[0]), [None] * count
     if isinstance(response, FlexibleResponse):
         alpha, heights = float(response.scene.block.alpha), body.heights
-        bending = np.asarray(response.column(time)) - np.cos(alpha) * rotation[:, None] * heights
+        lean = np.sin(rotation) if response.scene.block.rotations == "finite" else rotation
+        bending = np.asarray(response.column(time)) - np.cos(alpha) * lean[:, None] * heights
     parts = _Parts(response, body, rate)
     last = min(fps, 20)  # pictures of the verdict
 

@@ -40,9 +40,10 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.roots import carried
 from jaxrock.status import Status
 from jaxrock.transforms.branches import either
-from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 from jaxrock.transforms.held import Held
 
 Scalar = Inexact[Array, ""]
@@ -169,6 +170,36 @@ class Diffrax(AbstractEngine):
             throw=False,
         )
 
+    def locate(
+        self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
+    ) -> tuple[Any, Scalar, Pair]:
+        """The arc up to its event; its end (p t), and opening angle and velocity there, with their derivatives.
+
+        Where the event is is found without derivatives; those of the arc are taken at that time, and the time moves by
+        the implicit function. (Optimistix, which does that for diffrax, checks its quotient by calling back to Python,
+        and JAX keeps no program that calls back.)
+        """
+        held = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (arc, length))
+        solution = self.solve(held[0], limits, held[1], event)
+        end = jax.lax.stop_gradient(solution.ts[-1])
+        there = self.solve(arc, limits, end, None).ys[-1]
+        y = with_derivatives_of(jax.lax.stop_gradient(solution.ys[-1]), there)
+        flow, bent = jax.jvp(arc.flow, (end, y), (jnp.ones_like(end), arc.flow(end, y)))
+        first = jnp.argmin(jax.lax.stop_gradient(arc.guards(end, y)))
+
+        def at(time):
+            return y + (time - end) * flow + (time - end) ** 2 / 2 * bent
+
+        def guard(time):
+            return arc.guards(time, at(time))[first]
+
+        def left(time):
+            value, slope = jax.jvp(guard, (time,), (jnp.ones_like(time),))
+            return jnp.where(slope == 0, 0.0, value / jnp.where(slope == 0, 1.0, slope))
+
+        time = jnp.where(solution.event_mask, carried(end, left), length + (end - jax.lax.stop_gradient(length)))
+        return solution, time, at(time)
+
 
 class ArcStepper(AbstractStepper):
     """One scene with the engine's settings, and how far to follow it."""
@@ -266,8 +297,7 @@ class ArcStepper(AbstractStepper):
         arc = replace(arc, hop=self._is_hop(state, arc.start_acceleration, forcing))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
-        solution = engine.solve(arc, engine.limits(scene, state.piece), length, event)
-        time, y = solution.ts[-1], solution.ys[-1]
+        solution, time, y = engine.locate(arc, engine.limits(scene, state.piece), length, event)
         void = rocking & arc.is_void(time, y, solution.event_mask)
         time = jnp.where(void, jnp.maximum(time, jnp.minimum(arc.horizon, length)), time)
         y = jnp.where(void, 0.0, y)

@@ -159,7 +159,8 @@ class Arc(eqx.Module):
         forced = self.helpful[0] > 0
         if self.helpful[1] is not None:
             forced = forced | (self.helpful[1] != 1)
-        return jnp.stack([*guards, _guard(time, self._hold(y[0]), [held], forced & (held > 0))])
+        # The arc that ends here leaves a rest that rounding makes: the next must not end at once, and all after it.
+        return jnp.stack([*guards, _guard(time, self._hold(y[0]), [held], forced & (held > self.noise))])
 
     def _hold(self, opening: Scalar) -> Scalar:
         """What the restoring moment and the most helpful forcing do against overturning."""

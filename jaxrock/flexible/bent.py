@@ -1,0 +1,102 @@
+"""A flexible block whose phases are not linear, on its way: the same steps, as long as what is beside the linear phase
+allows.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact
+
+from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.restitution import Reset
+from jaxrock.flexible.beside import BentArc, Tangents, bent
+from jaxrock.flexible.column import Column
+from jaxrock.flexible.phases import Phase, arc, locked_phase, rocking_phase
+from jaxrock.flexible.stepper import FlexibleScene, FlexibleState
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.status import Status
+
+Scalar = Inexact[Array, ""]
+_PRECISION = 10_000  # of a step, in units of the last digit
+_SHORTEST = 1e-12  # step over duration
+
+
+class BentScene(FlexibleScene):
+    """A flexible block with a law of its base, with rotations or with a weight that are not linear, under a motion."""
+
+    tangents: Tangents
+
+    @classmethod
+    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "BentScene":
+        """Build the scene from scalars."""
+        tangents = Tangents.of(Column.of(block))
+        numbers = tangents.numbers
+        rocking, whole = rocking_phase(numbers)
+        # A column that leans too far before it balances is none of these.
+        whole &= (numbers.balance > 0) & (numbers.balance < jnp.pi / 2) & (numbers.squares > 0).all()
+        reset = Reset.of(block.law, block.corners, jnp.ones_like(block.alpha))
+        locked = locked_phase(numbers)
+        return cls(block, ground, stop, numbers, locked, rocking, whole, reset, ground.knots, tangents)
+
+    def longest(self, state: FlexibleState) -> Scalar:
+        """How long a step may be [s]."""
+        return jnp.minimum(super().longest(state), state.stride)
+
+    def arc(self, state: FlexibleState) -> tuple[BentArc, Scalar, Scalar, Bool[Array, ""]]:
+        """The motion from here, as of a linear block, with what is beside that."""
+        load, length, *rest = self.load(state)
+        phase = Phase.where(state.side == 0, self.locked, self.rocking)
+        path = arc(self.numbers, phase, state.side, state.motion, load, length)
+        return bent(self.tangents, path, state.side, load, length), length, *rest
+
+    def advance(self, state: FlexibleState) -> FlexibleState:
+        """One step, or none but a shorter stride."""
+        path, length, share, whole = self.arc(state)
+        allowed = _PRECISION * jnp.finfo(length.dtype).eps * self.numbers.balance
+        miss = jax.lax.stop_gradient(path.error / allowed)
+        good = (miss <= 1) & jnp.isfinite(miss)
+        factor = jnp.where(jnp.isfinite(miss), jnp.clip(0.9 * jnp.maximum(miss, 1e-30) ** -0.1, 0.25, 2.0), 0.25)
+        held = jax.lax.stop_gradient(length)
+        next_ = self.along(state, path, length, share, whole)
+        # A good step tells nothing against as long a one; if it ended with the piece, not even against a longer one.
+        longer = jnp.maximum(factor, 1.0) * held
+        next_ = replace(next_, stride=jnp.where(whole, jnp.maximum(longer, state.stride), longer))
+        failed = held < _SHORTEST * self.stop
+        again = replace(
+            state,
+            stride=jnp.minimum(factor, 0.7) * held,
+            impacted=jnp.zeros_like(state.impacted),
+            steps=state.steps + 1,
+            done=failed,
+            status=Status.where(failed, Status.solver_failed, state.status),
+        )
+        return jax.tree.map(lambda a, b: jnp.where(good, a, b), next_, again)
+
+    def moment(self, motion: Inexact[Array, " states"]) -> Scalar:
+        """Moment at a locked base, over m L^2 [1/s^2]."""
+        column, (q, v) = self.tangents.column, self._clamped(motion)
+        return jnp.sum(column.numbers.rotation * column.elastic(q, v, jnp.zeros(()), jnp.zeros(())))
+
+    def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
+        """Displacements of the masses from the base to the top, over L cos(alpha)."""
+        return self.tangents.column.displacements(self._clamped(motion)[0])
+
+    def energy(self, motion: Inexact[Array, " states"]) -> tuple[Scalar, Scalar, Scalar]:
+        """Kinetic energy, strain energy of the column, potential energy of base and weight, over m L^2 [1/s^2]."""
+        column, (q, v), rotation = self.tangents.column, self._clamped(motion), motion[-1]
+        return column.kinetic(q, v), column.strain(q, rotation), column.potential(q, rotation)
+
+    @property
+    def summit(self) -> Scalar:
+        """Energy of the unstable equilibrium, over m L^2 [1/s^2]."""
+        return sum(self.energy(self.numbers.center))
+
+    def _clamped(self, motion: Inexact[Array, " states"]) -> tuple:
+        """Displacements and velocities of the clamped modes."""
+        return tuple(self.tangents.turn @ x for x in jnp.split(motion[:-1], 2))
+
+
+def scene_of(block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> FlexibleScene:
+    """The scene of a block, linear or not."""
+    return (FlexibleScene if block.is_linear else BentScene).of(block, ground, stop)

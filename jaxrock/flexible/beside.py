@@ -1,0 +1,242 @@
+"""The motion of a column that is not linear: the linear phase about its balance, and a polynomial of what is beside it.
+
+The linear phase is that of the tangents at the unstable equilibrium, so that it is exact near there and knows how fast
+every mode turns and fades. What is beside it is small or slow: it is taken at Chebyshev points of a step, made a
+polynomial, and the modes answer it exactly; that is repeated until it stays. So steps are as long as the polynomial
+holds, however stiff the column is.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact
+
+from jaxrock.flexible.column import Column
+from jaxrock.flexible.phases import Arc, Numbers, answers, rising_terms
+from jaxrock.numerics.exponential_sums import Curve, powers
+
+Scalar = Inexact[Array, ""]
+States = Inexact[Array, "points states"]
+
+POINTS = 11
+_ROUNDS = 5  # of taking what is beside the linear phase, and answering it
+_PLACES = (1 - np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))) / 2
+
+
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """Matrices that take values at the points to Chebyshev coefficients, and to those of powers."""
+    k = np.arange(POINTS)
+    weight = np.where((k == 0) | (k == POINTS - 1), 0.5, 1.0)
+    waves = np.cos(np.pi * np.outer(k, (POINTS - 1) - k) / (POINTS - 1))
+    spectrum = 2 / (POINTS - 1) * weight[:, None] * waves * weight
+    # T_k(2 x - 1) in powers of x: whole numbers.
+    shapes = [np.polynomial.Polynomial([1.0]), np.polynomial.Polynomial([-1.0, 2.0])]
+    for _ in range(POINTS - 2):
+        shapes.append(2 * shapes[1] * shapes[-1] - shapes[-2])
+    to_powers = np.stack([np.pad(s.coef, (0, POINTS - s.coef.size)) for s in shapes], 1)
+    return spectrum, to_powers @ spectrum
+
+
+_SPECTRUM, _POWERS = _tables()
+_SLOPE = np.diag(np.arange(1.0, POINTS), 1)  # coefficients to those of the derivative
+
+
+class Tangents(eqx.Module):
+    """The linear column about its unstable equilibrium, in modes in which its weight does not couple them."""
+
+    column: Column
+    numbers: Numbers
+    turn: Inexact[Array, "modes modes"]  # clamped modes of these
+    pull: Inexact[Array, "modes modes"]  # of the weight on these
+    force: Inexact[Array, " modes"]  # of the weight on clamped modes, in balance
+    moment: Scalar  # of the spring, in balance
+    slope: Scalar  # of the spring, there
+
+    @classmethod
+    def of(cls, column: Column) -> "Tangents":
+        """Of a column."""
+        numbers, n = column.numbers, column.numbers.rotation.size
+        one, none = jnp.ones(()), jnp.zeros(n)
+        q, rotation = column.saddle()
+        moment, slope = jax.jvp(lambda x: column.spring(x, one), (rotation,), (one,))
+        force, eye = jnp.zeros(n), jnp.eye(n)
+        if not column.p_delta:
+            return cls(column, numbers, eye, 0 * eye, force, moment, slope)
+        force = column.further(q, none, none, 0 * rotation)
+        pull = jax.jacfwd(lambda q: column.further(q, none, none, 0 * rotation))(q)
+        pull = (pull + pull.T) / 2
+        squares, turn = jnp.linalg.eigh(jnp.diag(numbers.squares) - pull)
+        turn = turn * jnp.sign(jnp.diag(turn))
+        lever = (numbers.squares * numbers.rotation) @ turn / squares
+        tip = numbers.tip @ turn
+        place = q @ turn
+        offsets = jnp.stack([rotation, tip @ place, tip @ place - rotation, 0 * rotation])
+        about = Numbers(
+            squares=squares,
+            damping=numbers.damping @ turn**2,
+            mass_damping=numbers.mass_damping,
+            rotation=lever,
+            load=numbers.load @ turn,
+            tip=tip,
+            strength=numbers.strength,
+            spring_rate=(turn @ lever) @ pull @ numbers.rotation - slope,
+            balance=rotation,
+            alpha=numbers.alpha,
+            damped=numbers.damped,
+            lean=tip @ lever - 1,
+            center=jnp.concatenate([place, none, rotation[None]]),
+            offsets=offsets,
+        )
+        return cls(column, about, turn, turn.T @ pull @ turn, force, moment, slope)
+
+    def beside(self, state, rate, ground: Scalar, side: Scalar) -> "Beside":
+        """What is beside the linear phase, at a state (q, q', theta) and its rate of change."""
+        column, about, n = self.column, self.numbers, self.numbers.rotation.size
+        q, v, rotation = state[:n], state[n:-1], state[-1]
+        clamped = (self.turn @ x for x in (q, v, rate[n:-1]))
+        force = (column.further(*clamped, ground) - side * self.force) @ self.turn
+        force = force - self.pull @ (q - side * about.center[:n])
+        away = rotation - side * about.center[-1]
+        moment = column.spring(rotation, side) - side * self.moment - self.slope * away
+        lost = jnp.zeros(())
+        if column.p_delta:
+            # Damping, which couples the modes of the column under its weight a little.
+            own = column.numbers.damping * (self.turn @ v - column.numbers.rotation * rate[-1])
+            shared = about.damping * (v - about.rotation * rate[-1])
+            force, lost = force + shared - own @ self.turn, about.rotation @ shared - column.numbers.rotation @ own
+        displaced = column.displacements(self.turn @ q)[-1]
+        straight = jnp.sum(about.tip * q)
+        bending = (displaced - column.sine(rotation)) - (straight - rotation)
+        return Beside(force, moment + lost, displaced - straight, bending, -lost)
+
+
+class Beside(NamedTuple):
+    """What is beside the linear phase: forces on modes, moment at the base; and beside its outputs."""
+
+    force: Inexact[Array, "*points modes"]
+    moment: Inexact[Array, "*points"]
+    displacement: Inexact[Array, "*points"]
+    bending: Inexact[Array, "*points"]
+    locked_moment: Inexact[Array, "*points"]
+
+
+class BentArc(Arc):
+    """The motion from a state on, with what is beside the linear phase."""
+
+    shift: Inexact[Array, " terms"]  # of the rotation
+    further: Inexact[Array, "outputs terms"]  # of the outputs
+    doubts: Inexact[Array, " outputs"]  # how far polynomials may be off
+    error: Scalar  # of the whole step [rad]
+
+    def mode_amplitudes(self, x: Scalar) -> Inexact[Array, " modes"]:
+        """Of the modes at x, with their share in what shifts the rotation."""
+        return super().mode_amplitudes(x) + self.phase.project[:, -1] * self._shift(x)
+
+    def _shift(self, x: Scalar) -> Scalar:
+        return powers(x, self.shift.size) @ self.shift
+
+    def state(self, x: Scalar) -> Inexact[Array, " states"]:
+        """(q, q', theta) at x."""
+        state = self.center + (self.phase.modes @ super().mode_amplitudes(x)).real
+        return state.at[-1].add(self._shift(x))
+
+    def outputs(self, x: Scalar) -> Inexact[Array, " outputs"]:
+        """Rotation, top displacement over L cos(alpha), its bending part, base moment over m L^2, at x."""
+        linear = self.offsets + (self.phase.outputs @ super().mode_amplitudes(x)).real
+        return linear + self.further @ powers(x, self.shift.size)
+
+    def curves(self) -> Curve:
+        """The outputs as curves; the errors of polynomials are those of a mode that is not there, and turns fast."""
+        linear, none = super().curves(), jnp.zeros((len(self.doubts), 1))
+        return Curve(
+            jnp.concatenate([linear.amplitudes, none], 1),
+            jnp.concatenate([linear.rates, none + 1j * POINTS**2], 1),
+            linear.coefficients + self.further,
+            jnp.concatenate([linear.errors, self.doubts[:, None]], 1),
+        )
+
+
+class _Step(eqx.Module):
+    """One step of a linear phase, with tables of how its modes answer powers of x."""
+
+    tangents: Tangents
+    path: Arc
+    side: Scalar
+    ground: Inexact[Array, " points"]
+    length: Scalar
+    answers: Inexact[Array, "points terms modes"]
+    rising: Inexact[Array, "terms modes"]
+
+    def arc(self, force, shift) -> tuple:
+        """Amplitudes and coefficients of the modes with these forces and this shift of the rotation (powers of x)."""
+        numbers, path, n = self.tangents.numbers, self.path, self.tangents.numbers.rotation.size
+        onto, turned = path.phase.project[:, n:-1], path.phase.project[:, -1]
+        total = force + shift[:, None] * (numbers.rotation * numbers.squares)
+        drive = self.length * (total @ onto.T) - (_SLOPE @ shift)[:, None] * turned
+        answer = jnp.einsum("jtm,jm->tm", self.answers, drive)
+        slow, start = jnp.abs(path.exponents) < 1, -turned * shift[0]
+        amplitudes = path.amplitudes + jnp.where(slow, 0.0, start - answer[0])
+        return amplitudes, path.coefficients + answer + jnp.where(slow, start * self.rising, 0.0)
+
+    def beside(self, amplitudes, coefficients, shift) -> tuple[Beside, Inexact[Array, "points modes"]]:
+        """What is beside the linear phase at the points, and its modes there."""
+        path, x = self.path, jnp.asarray(_PLACES)
+        terms = np.arange(len(coefficients))
+        waves = amplitudes * jnp.exp(path.exponents * x[:, None])
+        table = powers(x, terms.size).T
+        slopes = jnp.concatenate([jnp.zeros((POINTS, 1)), table[:, :-1]], 1) * terms
+        modes = waves + table @ coefficients
+        state = path.center + (modes @ path.phase.modes.T).real
+        rate = ((waves * path.exponents + slopes @ coefficients) @ path.phase.modes.T).real
+        state = state.at[:, -1].add(table[:, :POINTS] @ shift)
+        rate = rate.at[:, -1].add(table[:, :POINTS] @ (_SLOPE @ shift))
+        found = jax.vmap(self.tangents.beside, (0, 0, 0, None))(state, rate / self.length, self.ground, self.side)
+        return found, modes
+
+    def shift(self, found: Beside) -> Inexact[Array, " points"]:
+        """By how much the moment beside the linear phase turns the base against the column."""
+        numbers = self.tangents.numbers
+        stiffness = jnp.sum(numbers.rotation**2 * numbers.squares) - numbers.spring_rate
+        return jnp.where(self.side == 0, 0.0, -found.moment / stiffness)
+
+
+def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " order"], length: Scalar) -> BentArc:
+    """The arc with what is beside its linear phase; `load`: the ground's acceleration [g] by powers of x."""
+    terms = len(path.coefficients)
+    ground = powers(jnp.asarray(_PLACES), load.size).T @ load
+    step = _Step(tangents, path, side, ground, length, answers(path.exponents, POINTS), rising_terms(path.exponents))
+    n = tangents.numbers.rotation.size
+    force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)
+
+    def round_(_, carry):
+        force, shift, before, _ = carry
+        found, modes = step.beside(*step.arc(force, shift), shift)
+        change = jnp.max(jnp.abs(modes - before))
+        return _POWERS @ found.force, _POWERS @ step.shift(found), modes, change
+
+    start = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.zeros(())
+    force, shift, _, change = jax.lax.fori_loop(0, _ROUNDS, round_, start)
+    amplitudes, coefficients = step.arc(force, shift)
+    found, _ = step.beside(amplitudes, coefficients, shift)
+    turned = step.shift(found)
+    locked = jnp.where(side == 0, found.locked_moment, 0.0)
+    outputs = jnp.stack([turned, found.displacement, found.bending - turned, locked], 1)
+    tails = _tail(outputs)
+    onto = jnp.abs(path.phase.project[:, n:-1])
+    forced = onto @ (_tail(found.force) + tails[0] * jnp.abs(tangents.numbers.rotation * tangents.numbers.squares))
+    forced = jnp.max(forced * length / (1 + jnp.abs(path.exponents)))
+    change = jnp.maximum(change - 8 * jnp.max(path.errors), 0.0)  # rounding alone does not get smaller
+    error = jax.lax.stop_gradient(forced + change + jnp.max(tails[:3]))
+    further = jnp.pad((_POWERS @ outputs).T, ((0, 0), (0, terms - POINTS)))
+    return BentArc(
+        path.phase, path.center, path.offsets, amplitudes, path.exponents, coefficients, path.errors,
+        shift=jnp.pad(shift, (0, terms - POINTS)), further=further, doubts=jax.lax.stop_gradient(tails), error=error,
+    )  # fmt: skip
+
+
+def _tail(values: Inexact[Array, "points *more"]) -> Inexact[Array, "*more"]:
+    """Size of the last two Chebyshev coefficients."""
+    return jnp.max(jnp.abs(_SPECTRUM[-2:] @ values), 0)
