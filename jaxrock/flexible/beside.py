@@ -226,9 +226,11 @@ def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " ord
     outputs = jnp.stack([turned, found.displacement, found.bending - turned, locked], 1)
     tails = _tail(outputs)
     onto = jnp.abs(path.phase.project[:, n:-1])
-    forced = onto @ (_tail(found.force) + tails[0] * jnp.abs(tangents.numbers.rotation * tangents.numbers.squares))
+    rounding = 8 * jnp.finfo(tails.dtype).eps * tangents.numbers.balance  # which no shorter step makes smaller
+    turns = jnp.maximum(tails[0] - rounding, 0.0)
+    forced = onto @ (_tail(found.force) + turns * jnp.abs(tangents.numbers.rotation * tangents.numbers.squares))
     forced = jnp.max(forced * length / (1 + jnp.abs(path.exponents)))
-    change = jnp.maximum(change - 8 * jnp.max(path.errors), 0.0)  # rounding alone does not get smaller
+    change = jnp.maximum(change - 8 * jnp.max(path.errors), 0.0)
     error = jax.lax.stop_gradient(forced + change + jnp.max(tails[:3]))
     further = jnp.pad((_POWERS @ outputs).T, ((0, 0), (0, terms - POINTS)))
     return BentArc(
