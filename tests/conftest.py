@@ -8,6 +8,7 @@ XLA compiles as after `keep_compiled`, which takes a quarter less time; with `XL
 """
 
 import gc
+import importlib
 import importlib.util
 import json
 import os
@@ -35,8 +36,8 @@ install_import_hook(list(checked_modules()), "beartype.beartype")
 # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
 gc.set_threshold(200_000, 10, 10)
 
-if jax.version.__version_info__ < (0, 13):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+if "XLA_FLAGS" not in os.environ:
+    importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
 os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)

@@ -73,3 +73,7 @@ def test_every_public_name_has_its_place():
     public = {name: home for home, space in homes.items() for name in dir(space) if is_public(space, name)}
     assert len(public) > 100
     assert not [home + name for name, home in public.items() if not re.search(rf"\b{re.escape(home)}{name}\b", text)]
+
+
+def test_who_cites_names_this_version():
+    assert f"\nversion: {rk.__version__}\n" in (ROOT / "CITATION.cff").read_text()

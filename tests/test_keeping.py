@@ -19,7 +19,7 @@ from jaxrock.transforms import lowering
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "kept"))
-    return tmp_path / "kept"
+    return folder.folder()
 
 
 def test_what_is_written_is_read(place):
@@ -47,12 +47,14 @@ def test_the_oldest_goes_first(place):
         os.utime(place / "kind" / str(i), (i, i))
     folder.read("kind", "0")  # used now
     folder.write(folder.OF_JAX, "its own", bytes(5000))
+    (place.parent / "of the user").write_bytes(bytes(5000))
     folder.prune(3 * 1032)
     assert sorted(path.name for path in folder.kept()) == ["0", "3", "4", "its own"]
+    assert (place.parent / "of the user").exists()
 
 
 def test_nothing_fails_where_nothing_can_be_kept(place):
-    place.write_text("a file is in the way")
+    place.parent.write_text("a file is in the way")
     folder.write("kind", "name", b"content")
     assert folder.read("kind", "name") is None
     assert float(jax.jit(lambda a: rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(a, 0.8)).margin)(0.3)) > 0

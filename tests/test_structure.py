@@ -321,7 +321,7 @@ def test_what_tests_and_benchmarks_share_lies_in_references(folder, allowed):
     if not (ROOT / folder).exists():
         pytest.skip("a package without its repository")
     homes = {path.stem: name for name in ("benchmarks", "tests") for path in (ROOT / name).glob("*.py")}
-    homes |= {path.name: "benchmarks" for path in (ROOT / "benchmarks").iterdir() if path.is_dir()}
+    homes |= {path.name: "benchmarks" for path in (ROOT / "benchmarks").glob("*/")}
     homes |= {name: name for name in FOLDERS}
     for path in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

@@ -224,5 +224,5 @@ def test_nrml(tmp_path):
     root = ElementTree.parse(path).getroot()
     assert root.find(".//n:imls", space).text == "0.1 0.2 0.4"
     assert root.find(".//n:poes", space).text == "0 0.7 0.6"
-    with pytest.raises(ValueError, match="`fragilities` must hold lognormal or tabulated"):
+    with pytest.raises(ValueError, match="`fragilities` must hold fragilities by name"):
         rk.hazard.write_nrml({}, path)

@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +17,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
     parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
-        "--measure", default="PGA", help="what levels are: PGA [g], PGV [m/s], PGD, IA, CAV, SA(0.5), SV(0.5)"
+        "--measure",
+        default="PGA",
+        help="of PGA [g], PGV [m/s], PGD [m], IA [m/s], CAV [m/s], SA(0.5) [g], SV(0.5) [m/s] (default PGA)",
     )
-    parser.add_argument(
-        "--levels", type=number, nargs=2, default=(0.1, 2.0), metavar=("FROM", "TO"), help="(default 0.1 2)"
-    )
+    ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}
+    parser.add_argument("--levels", default=(0.1, 2.0), help="range of the measure (default 0.1 2)", **ends)
     parser.add_argument("--points", type=int, default=24, help="levels, in equal ratios (default 24)")
     parser.add_argument("--scatter", type=number, default=0.0, help="standard deviation of ln slenderness (default 0)")
     parser.add_argument("--draws", type=int, default=32, help="blocks that are drawn if it is not 0 (default 32)")
@@ -37,7 +39,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     if arguments.scatter != 0:
         block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
     levels = np.geomspace(*arguments.levels, arguments.points)
-    found = rk.hazard.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure)
+    found = rk.hazard.simulated_fragility(block, suite, levels, model_of(arguments), measure=arguments.measure.upper())
     fits = {bound: found.fit(bound) for bound in ("lower", "upper")}
     report.title(f"{len(suite)} records")
     report.table(_entries(found, fits))

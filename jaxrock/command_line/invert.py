@@ -40,8 +40,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--example", action=_Example, help="print an example of such a file, and leave")
     parser.add_argument(
         "rocks",
-        help="CSV file of rocks; columns such as alpha_deg,alpha_deg_sd,half_diagonal_m,observed; of two unlike "
-        "sides alpha1_deg,alpha2_deg,radius1_m,radius2_m,facing,observed",
+        help="CSV file of rocks (--example prints one); columns such as alpha_deg, alpha_deg_sd, half_diagonal_m, "
+        "observed; of two unlike sides alpha1_deg, alpha2_deg, radius1_m, radius2_m, facing, observed",
     )
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="kind of motion (default sine)")
     ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}

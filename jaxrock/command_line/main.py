@@ -22,7 +22,7 @@ from jaxrock.sweeps.devices import use_cpu_devices
 # Another command is a module like `run`, and its entry here.
 _COMMANDS = {command.name: command for command in (RUN, SPECTRUM, MAP, FRAGILITY, INVERT, CACHE)}
 
-_EPILOG = """examples:
+_EXAMPLES = """\
   jaxrock run                                     a 0.6 m x 3 m block under the built-in 1979 record
   jaxrock run motion.AT2 --width 0.5 --height 2   the same for your block and record
   jaxrock run data.csv --dt 0.01 --unit cm/s2     a column of numbers
@@ -30,21 +30,28 @@ _EPILOG = """examples:
   jaxrock spectrum motion.AT2 --slenderness 5     blocks of height/width 5, every size
   jaxrock map --pulse cosine --points 200         who overturns under a pulse
   jaxrock fragility motions/*.AT2 --width 0.5     how probable it is that a block topples
+  jaxrock invert --example > rocks.csv            a table of rocks, to be filled with yours
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
-
-exit status: 0 good, 1 something was not computed, 2 bad input
 """
+_EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input"
+
+
+def _epilog(command: str = "") -> str:
+    """Examples of a command, or of all, and what exit statuses mean."""
+    lines = [line for line in _EXAMPLES.splitlines() if line.startswith(f"  jaxrock {command}")]
+    return "\n".join(["examples:", *lines, "", _EXIT])
 
 
 def _parser() -> argparse.ArgumentParser:
-    shared = {"epilog": _EPILOG, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    shared = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     description = "Rocking and overturning of free-standing blocks under earthquakes."
-    parser = argparse.ArgumentParser(prog="jaxrock", description=description, **shared)
+    parser = argparse.ArgumentParser(prog="jaxrock", description=description, epilog=_epilog(), **shared)
     parser.add_argument("--version", action="version", version=f"jaxrock {version('jaxrock')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():
-        sub = commands.add_parser(command.name, help=command.purpose, description=command.purpose, **shared)
+        told = {"help": command.purpose, "description": command.purpose, "epilog": _epilog(command.name)}
+        sub = commands.add_parser(command.name, **told, **shared)
         sub.add_argument("--json", action="store_true", help="print one JSON object, for programs")
         sub.add_argument("-q", "--quiet", action="store_true", help="print nothing but what went wrong")
         sub.add_argument("-v", "--verbose", action="store_true", help="also say what the package does")

@@ -34,7 +34,7 @@ def add_record(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "record",
         nargs="?",
-        help="PEER AT2, CSMIP V2, COSMOS, ESM, SMC, K-NET, CSV or text file (default: the built-in record)",
+        help="PEER AT2, CSMIP V1 or V2, COSMOS, ESM, SMC, K-NET, CSV or text file (default: the built-in record)",
     )
     add_description(parser)
     parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")

@@ -39,7 +39,8 @@ def write_nrml(
     kinds = {type(each) for each in fragilities.values()} if good else set()
     if kinds not in ({LogNormalFragility}, {TabulatedFragility}):
         raise ValueError(
-            f"Argument `fragilities` must hold lognormal or tabulated ones by name, but is {shown(fragilities)}."
+            "Argument `fragilities` must hold fragilities by name, all lognormal or all tabulated, but is "
+            f"{shown(fragilities)}."
         )
     root = ElementTree.Element("nrml", xmlns=_SPACE)
     model = ElementTree.SubElement(

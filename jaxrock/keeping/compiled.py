@@ -9,7 +9,7 @@ from jaxrock._precision import setting
 from jaxrock.keeping.folder import LARGEST, OF_JAX, folder
 
 _EMITTERS = "--xla_cpu_use_fusion_emitters"
-_KNOWN = (0, 13)  # of jaxlib; an option that it does not know would end the program
+_LAST = (0, 10)  # of the jaxlibs that know it; in 0.11.2 and 0.12 an option that is not known ends the program
 
 
 def keep_compiled() -> None:
@@ -20,7 +20,7 @@ def keep_compiled() -> None:
     without it. It sets options of JAX (`jax_compilation_cache_dir` and its limits) and one of XLA (in `XLA_FLAGS`, if
     that says nothing of it), for all that this process compiles; last digits of what XLA computes may change by it.
     """
-    _compile_quickly()
+    compile_quickly()
     place = folder()
     if place is None or setting("jax_compilation_cache_dir"):
         return
@@ -37,10 +37,10 @@ def keep_compiled() -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-def _compile_quickly() -> None:
+def compile_quickly() -> None:
     """XLA's newer emitters of fused loops take a third to half of the time in which it compiles programs of scalars as
     these are (an outcome by Diffrax 9.8 s of processor time with them and 5.0 s without, the gradient of a closed form
     3.1 and 2.1 s), and what they emit is no faster."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if _EMITTERS not in flags and jaxlib.version.__version_info__ < _KNOWN:
+    if _EMITTERS not in flags and jaxlib.version.__version_info__[:2] <= _LAST:
         os.environ["XLA_FLAGS"] = f"{flags} {_EMITTERS}=false".strip()

@@ -15,17 +15,18 @@ import platformdirs
 from jaxrock._aside import written_aside
 
 LARGEST = 2**30  # bytes
+_OWN = "jaxrock-compiled"  # within a folder that the user names, where other things may lie: all of this may be deleted
 OF_JAX = "xla"  # the part that JAX looks after (see `compiled`)
 _DIGEST = hashlib.sha256().digest_size
 _PATIENCE = 600  # seconds after which a file that was never finished is nobody's
 
 
 def folder() -> Path | None:
-    """Where things are kept: the user's cache folder, or what JAXROCK_CACHE says; None if that is `off`."""
+    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that is `off`."""
     said = os.environ.get("JAXROCK_CACHE", "")
     if said == "off":
         return None
-    return Path(said) if said else platformdirs.user_cache_path("jaxrock") / "compiled"
+    return Path(said) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
 
 
 def name_of(*parts: object) -> str:
