@@ -126,6 +126,7 @@ x = jnp.array([0.2, 0.3]) * jnp.linspace(0.98, 1.02, 70)[:, None]
 found = [peak(x[0])[None], jax.vmap(peak)(x), *jax.vmap(jax.grad(peak))(x).T,
          rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **given).rotation,
          rk.overturning_map(x[:, 1] * 5, [2.0, 3.0], progress=False, **given).margin.ravel()]
+assert "scipy" not in sys.modules  # JAX takes it to get LAPACK ready, which takes longer than an answer
 print(len(traced), jnp.concatenate(found).tobytes().hex())
 """
 

@@ -1,6 +1,8 @@
 """Forward mode along every number of a scene that moves: value and Jacobian, in one recipe."""
 
-from collections.abc import Callable
+import functools
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,54 +15,85 @@ from jaxrock.transforms.recipe import Recipe
 def value_and_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     """The recipe of (value, Jacobian): for every leaf of the value the derivatives by the leaves that move (a list of
     arrays, the leaf's shape behind), None for integers."""
-    return recipe.derivative(moves, lambda: _made(recipe, moves))
+    return recipe.derivative(moves, _with_jacobian)
 
 
-def _made(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
-    value = recipe.results
-    moving = [leaf for leaf, move in zip(recipe.like, moves) if move]
+def value_and_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
+    """The recipe of (value, change) along one direction, whose leaves follow the recipe's; for integers None."""
+    return recipe.derivative(moves, _with_change)
+
+
+def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
+    moving = _moving(recipe.like, moves)
+
+    def both(leaves):
+        along = functools.partial(_pushed, recipe, moves, leaves)
+        value, tangents = jax.vmap(along, out_axes=(None, 0))(*directions_of(_moving(leaves, moves)))
+        columns = [columns_of(*pair, moving) for pair in zip(value, tangents, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
 
     def shapes(out):
-        if not jnp.issubdtype(out.dtype, jnp.inexact):
-            return None
         return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
 
+    return _made(recipe, moves, both, recipe.like, "by", shapes)
+
+
+def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
+    like = (*recipe.like, *_moving(recipe.like, moves))
+
+    def both(leaves):
+        own, direction = leaves[: len(moves)], leaves[len(moves) :]
+        value, tangents = _pushed(recipe, moves, own, *direction)
+        changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
+
+    return _made(recipe, moves, both, like, "along", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
+
+
+def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequence, word: str, shapes: Callable):
+    value = recipe.results
     return Recipe(
-        _both(recipe, moves),
-        jax.tree.structure(list(recipe.like)),
-        recipe.like,
-        facts=None if recipe.facts is None else f"{recipe.facts} by {[int(move) for move in moves]}",
-        results=(value, [shapes(out) for out in jax.tree.leaves(value)]),
+        both,
+        jax.tree.structure(list(like)),
+        like,
+        facts=None if recipe.facts is None else f"{recipe.facts} {word} {[int(move) for move in moves]}",
+        results=(value, [shapes(out) if _is_real(out) else None for out in jax.tree.leaves(value)]),
         in_lanes=recipe.in_lanes,
         refilled=recipe.refilled,
+        order=recipe.order + 1,
     )
 
 
-def _both(recipe: Recipe, moves: tuple[bool, ...]) -> Callable:
-    def both(leaves):
-        moving = [leaf for leaf, move in zip(leaves, moves) if move]
-        sizes = [leaf.size for leaf in moving]
-        directions = jnp.split(jnp.eye(sum(sizes), dtype=jnp.result_type(*moving)), np.cumsum(sizes)[:-1], axis=1)
-        directions = [d.reshape(-1, *leaf.shape).astype(leaf.dtype) for d, leaf in zip(directions, moving)]
-
-        def function(moving):
-            rest = iter(moving)
-            return recipe.forward([next(rest) if move else x for x, move in zip(leaves, moves)])
-
-        def along(*directions):
-            return jax.jvp(function, (moving,), (list(directions),))
-
-        value, tangents = jax.vmap(along, out_axes=(None, 0))(*directions)
-        columns = [_columns(*pair, moving) for pair in zip(value, tangents, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
-
-    return both
+def _moving(leaves: Sequence, moves: tuple[bool, ...]) -> list:
+    return [leaf for leaf, move in zip(leaves, moves) if move]
 
 
-def _columns(out: Any, column: Any, moving: list) -> list | None:
-    """Derivatives of a leaf of the value by the moving leaves, in their shapes."""
-    if not jnp.issubdtype(out.dtype, jnp.inexact):
+def _is_real(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)
+
+
+def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *direction: Any) -> tuple[list, list]:
+    """The recipe's leaves, and their change along a direction."""
+
+    def function(moving):
+        rest = iter(moving)
+        return recipe.forward([next(rest) if move else x for x, move in zip(leaves, moves)])
+
+    return jax.jvp(function, (_moving(leaves, moves),), (list(direction),))
+
+
+def directions_of(moving: Sequence) -> list:
+    """Changes of some leaves by one of their numbers each, in a leading axis."""
+    sizes = [math.prod(leaf.shape) for leaf in moving]
+    whole = jnp.eye(sum(sizes), dtype=jnp.result_type(*(leaf.dtype for leaf in moving)))
+    parts = jnp.split(whole, np.cumsum(sizes)[:-1], axis=1)
+    return [part.reshape(-1, *leaf.shape).astype(leaf.dtype) for part, leaf in zip(parts, moving)]
+
+
+def columns_of(out: Any, column: Any, moving: Sequence) -> list | None:
+    """Derivatives of a leaf of the value by the moving leaves, in their shapes; `column`: along all directions."""
+    if not _is_real(out):
         return None
-    cuts = np.cumsum([leaf.size for leaf in moving])[:-1]
+    cuts = np.cumsum([math.prod(leaf.shape) for leaf in moving])[:-1]
     parts = jnp.split(column, cuts, axis=0)
     return [jnp.moveaxis(p, 0, -1).reshape(*out.shape, *leaf.shape) for p, leaf in zip(parts, moving)]

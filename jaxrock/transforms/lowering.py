@@ -46,8 +46,8 @@ def _inlined(program: jax.export.Exported, context, leaves) -> Sequence:
     with context.module_context.module.context:
         module = deserialize_portable_artifact(program.mlir_module_serialized)
     results = ir.SymbolTable(module.operation)["main"].type.results
-    there = context.module_context
-    name = mlir.merge_mlir_modules(there.module, "jaxrock_kept", module, dst_symtab=there.symbol_table)
+    whole = context.module_context
+    name = mlir.merge_mlir_modules(whole.module, "jaxrock_kept", module, dst_symtab=whole.symbol_table)
     used = [leaves[i] for i in program.module_kept_var_idx]
     return func.CallOp(results, ir.FlatSymbolRefAttr.get(name), used).results
 

@@ -52,6 +52,7 @@ class Recipe:
     - `results`: what it returns, a tree of `jax.ShapeDtypeStruct`; None: tracing tells.
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
     - `plain`: the same function as forward mode goes through it best; None: as it is.
+    - `order`: of the derivatives that it computes.
     """
 
     def __init__(
@@ -66,8 +67,9 @@ class Recipe:
         in_lanes: bool = False,
         refilled: bool = False,
         plain: Callable | None = None,
+        order: int = 0,
     ):
-        self.function, self.structure, self.like = function, structure, tuple(like)
+        self.function, self.structure, self.like, self.order = function, structure, tuple(like), order
         self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
         self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
         self.plain, self.plans, self._derivatives = plain, {}, {}  # the last two: what has been made of it
@@ -113,10 +115,10 @@ class Recipe:
         return jax.tree.leaves(self.on_tape(self.structure.unflatten(leaves)))
 
     def derivative(self, moves: tuple[bool, ...], make: Callable) -> "Recipe":
-        """The recipe of value and derivatives by some leaves, which `make` makes once."""
-        if moves not in self._derivatives:
-            self._derivatives[moves] = make()
-        return self._derivatives[moves]
+        """The recipe of value and derivatives by some leaves, which `make(recipe, moves)` makes once."""
+        if (make, moves) not in self._derivatives:
+            self._derivatives[make, moves] = make(self, moves)
+        return self._derivatives[make, moves]
 
     @functools.cached_property
     def name(self) -> str:
