@@ -111,6 +111,21 @@ def test_what_is_linear_stays_so(base, damping):
     assert found.impact_count == expected.impact_count
 
 
+@pytest.mark.slow
+def test_small_rotations_are_a_limit():
+    """Of columns ever more slender, their pulses and stiffness in proportion: what is left goes as alpha^2."""
+    off = []
+    for alpha in (0.04, 0.02):
+        shape = dict(width=50 * alpha, height=50.0, youngs_modulus=30e9 * (0.1 / alpha) ** 2, density=2500.0)
+        pulse = rk.SinePulse(5 * alpha, 1.6)
+        small, finite = (
+            rk.outcome(rk.FlexibleBlock(**shape, damping_ratio=0.01, rotations=kind), pulse, duration=5.0)
+            for kind in ("small", "finite")
+        )
+        off.append(float(finite.max_rotation / small.max_rotation) - 1)
+    assert 0 < abs(off[0]) < 1e-3 and off[0] / off[1] == pytest.approx(4, rel=0.1)
+
+
 # ---------------------------------------------------------------- the balance
 
 
@@ -165,6 +180,23 @@ def by_amplitude():
         return jax.jvp(numbers, (amplitude,), (1.0,), has_aux=True)
 
     return jax.jit(jax.vmap(one))
+
+
+@pytest.mark.slow
+def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
+    """It passes through zero with a slope, which is its derivative, where the verdict changes."""
+    low, high = 0.7, 0.8
+    for _ in range(10):
+        tried = np.linspace(low, high, 9)
+        lost = np.asarray(by_amplitude(tried)[2].overturned)
+        assert lost[-1] and not lost[0]
+        first = int(np.argmax(lost))
+        low, high = tried[first - 1], tried[first]
+    away = np.array([-1e-3, -1e-4, -1e-5, 1e-5, 1e-4, 1e-3])
+    (_, margin), (_, slope), found = by_amplitude(low * (1 + away))
+    np.testing.assert_array_equal(margin < 0, found.overturned)
+    near = np.abs(away) < 2e-4
+    np.testing.assert_allclose((margin / (low * away))[near], slope[near], rtol=5e-3)
 
 
 @pytest.mark.slow

@@ -45,10 +45,10 @@ class BentScene(FlexibleScene):
 
     def arc(self, state: FlexibleState) -> tuple[BentArc, Scalar, Scalar, Bool[Array, ""]]:
         """The motion from here, as of a linear block, with what is beside that."""
-        load, length, *rest = self.load(state)
+        load, length, share, whole = self.load(state)
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         path = arc(self.numbers, phase, state.side, state.motion, load, length)
-        return bent(self.tangents, path, state.side, load, length), length, *rest
+        return bent(self.tangents, path, state.side, load, length), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
         """One step, or none but a shorter stride."""
@@ -90,7 +90,8 @@ class BentScene(FlexibleScene):
     @property
     def summit(self) -> Scalar:
         """Energy of the unstable equilibrium, over m L^2 [1/s^2]."""
-        return sum(self.energy(self.numbers.center))
+        kinetic, strain, potential = self.energy(self.numbers.center)
+        return kinetic + strain + potential
 
     def _clamped(self, motion: Inexact[Array, " states"]) -> tuple:
         """Displacements and velocities of the clamped modes."""

@@ -22,7 +22,7 @@ Scalar = Inexact[Array, ""]
 States = Inexact[Array, "points states"]
 
 POINTS = 11
-_ROUNDS = 5  # of taking what is beside the linear phase, and answering it
+_ROUNDS = 7  # of taking what is beside the linear phase, and answering it
 _PLACES = (1 - np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))) / 2
 
 
@@ -37,7 +37,7 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     for _ in range(POINTS - 2):
         shapes.append(2 * shapes[1] * shapes[-1] - shapes[-2])
     to_powers = np.stack([np.pad(s.coef, (0, POINTS - s.coef.size)) for s in shapes], 1)
-    return spectrum, to_powers @ spectrum
+    return spectrum, np.asarray(to_powers, float) @ spectrum
 
 
 _SPECTRUM, _POWERS = _tables()
@@ -96,8 +96,8 @@ class Tangents(eqx.Module):
         """What is beside the linear phase, at a state (q, q', theta) and its rate of change."""
         column, about, n = self.column, self.numbers, self.numbers.rotation.size
         q, v, rotation = state[:n], state[n:-1], state[-1]
-        clamped = (self.turn @ x for x in (q, v, rate[n:-1]))
-        force = (column.further(*clamped, ground) - side * self.force) @ self.turn
+        amplitudes, speeds, rates = (self.turn @ x for x in (q, v, rate[n:-1]))
+        force = (column.further(amplitudes, speeds, rates, ground) - side * self.force) @ self.turn
         force = force - self.pull @ (q - side * about.center[:n])
         away = rotation - side * about.center[-1]
         moment = column.spring(rotation, side) - side * self.moment - self.slope * away

@@ -139,9 +139,9 @@ class FlexibleScene(eqx.Module):
     def arc(self, state: FlexibleState) -> tuple[Arc, Scalar, Scalar, Bool[Array, ""]]:
         """The motion from here: the arc, its length [s], the share of it that belongs to this piece (1, or 0 of a
         piece without length), and whether it ends with the piece."""
-        load, *step = self.load(state)
+        load, length, share, whole = self.load(state)
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
-        return arc(self.numbers, phase, state.side, state.motion, load, step[0]), *step
+        return arc(self.numbers, phase, state.side, state.motion, load, length), length, share, whole
 
     def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Scalar, Scalar, Bool[Array, ""]]:
         """The ground's acceleration [g] along the arc from here, and the rest that `arc` returns."""

@@ -105,7 +105,7 @@ class Suite(AbstractNamed):
     def _chosen(self, number) -> AbstractMotion:
         """The motion of a traced number."""
         if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
-            return Chosen(Together.of([record for record in self.motions()]), number)
+            return Chosen(Together.of([record for record in self.motions() if isinstance(record, Record)]), number)
         kinds = {jax.tree.structure(group) for group in self.groups}
         if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
             raise ValueError(

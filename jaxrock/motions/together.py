@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Array, Inexact, Int
 
 from jaxrock._checks import is_traced, size, strength
-from jaxrock._parameters import parameter
+from jaxrock._parameters import Owner, parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
 from jaxrock.motions.record import AbstractChosen, Padded, Record, Straight, roomy
 from jaxrock.motions.shaking import Bounds, Envelope
 
 
-class Together(eqx.Module):
+class Together(Owner):
     """Records one after the other, with room for more at the end: so that one program serves many suites.
 
     A record of n samples has n places: its n - 1 pieces, and one for the quiet after it.
@@ -64,12 +64,12 @@ class _InPlace(Straight):
     together: Together
     record: Int[Array, ""]
 
-    @property
-    def samples(self) -> Inexact[Array, " places"]:
+    @property  # type: ignore[misc]
+    def samples(self) -> Inexact[Array, " places"]:  # type: ignore[override]
         return self.together.samples
 
-    @property
-    def dt(self) -> Scalar:
+    @property  # type: ignore[misc]
+    def dt(self) -> Scalar:  # type: ignore[override]
         return self.together.dt[self.record]
 
     @property
@@ -150,5 +150,7 @@ def in_place(motion: AbstractMotion) -> Stretch:
 
     (chosen,) = filter(is_chosen, jax.tree.leaves(motion, is_leaf=is_chosen))
     many, record = chosen.together, chosen.record
-    whole = jax.tree.map(lambda part: _InPlace(many, record) if is_chosen(part) else part, motion, is_leaf=is_chosen)
+    whole = jax.tree.map(
+        lambda part: _InPlace(together=many, record=record) if is_chosen(part) else part, motion, is_leaf=is_chosen
+    )
     return Stretch(whole, many.first[record], many.first[record] + many.count[record] - 1, many.longest - 1)

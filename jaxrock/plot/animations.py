@@ -92,7 +92,8 @@ def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
     """Those on which a block has rolled."""
     if isinstance(response, FlexibleResponse) or not isinstance(response.scene.moments, RollingMoments):
         return None
-    here, there = response.scene.both_moments
+    moments: Any = response.scene.both_moments
+    here, there = moments
     return here.edge, there.edge
 
 

@@ -26,7 +26,8 @@ class Runner:
         devices = local_devices()
         self._layout = layout(points, len(devices), devices[0].platform)
         self._mesh = Mesh(np.array(devices), ("devices",))
-        leaves, structure = jax.tree.flatten(self._at_hand(scene))
+        flat: tuple[list, Any] = jax.tree.flatten(self._at_hand(scene))
+        leaves, structure = flat
         self._scene = structure.unflatten(leaves)
         kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
         self._call, self._messages, self.tree, self.shapes = _compiled(

@@ -108,7 +108,8 @@ def sweep(
         raise ValueError("Argument `load` must be True where there is no `store`.")
     suites = {name: values for name, values in axes.items() if isinstance(values, AbstractNamed)}
     words = {name: suite.names for name, suite in suites.items()}
-    lists = {name: _axis(name, np.arange(len(values)) if name in words else values) for name, values in axes.items()}
+    given: dict[str, Any] = axes | {name: np.arange(len(names)) for name, names in words.items()}
+    lists = {name: _axis(name, values) for name, values in given.items()}
     if not outer and len({values.size for values in lists.values()}) > 1:
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")

@@ -7,6 +7,7 @@ import contextvars
 import json
 import logging
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 from jax.extend.mlir import deserialize_portable_artifact, ir
@@ -45,11 +46,11 @@ def _inlined(program: jax.export.Exported, context, leaves) -> Sequence:
     """What `program.call` is lowered to; but that gets LAPACK ready first, which takes longer than all the rest."""
     with context.module_context.module.context:
         module = deserialize_portable_artifact(program.mlir_module_serialized)
-    results = ir.SymbolTable(module.operation)["main"].type.results
+    main: Any = ir.SymbolTable(module.operation)["main"]
     whole = context.module_context
     name = mlir.merge_mlir_modules(whole.module, "jaxrock_kept", module, dst_symtab=whole.symbol_table)
     used = [leaves[i] for i in program.module_kept_var_idx]
-    return func.CallOp(results, ir.FlatSymbolRefAttr.get(name), used).results
+    return func.CallOp(main.type.results, ir.FlatSymbolRefAttr.get(name), used).results
 
 
 def _kept(lanes: Lanes, leaves) -> tuple[jax.export.Exported, list[str]] | None:
