@@ -150,7 +150,6 @@ def in_place(motion: AbstractMotion) -> Stretch:
 
     (chosen,) = filter(is_chosen, jax.tree.leaves(motion, is_leaf=is_chosen))
     many, record = chosen.together, chosen.record
-    whole = jax.tree.map(
-        lambda part: _InPlace(together=many, record=record) if is_chosen(part) else part, motion, is_leaf=is_chosen
-    )
+    place = _InPlace(together=many, record=record)  # type: ignore[call-arg]
+    whole = jax.tree.map(lambda part: place if is_chosen(part) else part, motion, is_leaf=is_chosen)
     return Stretch(whole, many.first[record], many.first[record] + many.count[record] - 1, many.longest - 1)
