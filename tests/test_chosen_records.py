@@ -132,7 +132,7 @@ MIXED = rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
     "choose, error, message",
     [
         (lambda: SUITE[4], IndexError, "out of range"),
-        (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(4), Exception, r"must be in \[0, 3\]"),
+        (lambda: float(jax.jit(lambda k: outcome(SUITE[k]).margin)(4)), Exception, r"must be in \[0, 3\]"),
         (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(1.5), ValueError, "has a whole number"),
         (lambda: jax.jit(lambda k: outcome(MIXED[k]).margin)(1), ValueError, "must be records, or"),
     ],

@@ -88,7 +88,10 @@ class Runner:
             parts = [x[numbers] for x in points]
             if numbers.size < batch:
                 parts = [np.pad(x, (0, batch - numbers.size), mode="edge") for x in parts]
-            results = self._call([deal(x, self._layout) for x in parts], self._scene)
+            dealt = [deal(x, self._layout) for x in parts]
+            if self._mesh.size > 1:
+                dealt = jax.device_put(dealt, NamedSharding(self._mesh, _DEALT))
+            results = self._call(dealt, self._scene)
             waiting.append((numbers, jax.tree.leaves(results)))
             if len(waiting) > 1:
                 yield waiting.popleft()
@@ -144,5 +147,4 @@ def _call_of(function: Callable, mesh: Mesh) -> Callable:
     if mesh.size == 1:
         return jax.jit(on_one, compiler_options=options)
     spread = jax.shard_map(on_one, mesh=mesh, in_specs=(_DEALT, _EVERYWHERE), out_specs=_DEALT, check_vma=False)
-    dealt, everywhere = (NamedSharding(mesh, spec) for spec in (_DEALT, _EVERYWHERE))
-    return jax.jit(spread, in_shardings=(dealt, everywhere), compiler_options=options)
+    return jax.jit(spread, compiler_options=options)

@@ -195,7 +195,8 @@ class Diffrax(AbstractEngine):
 
         def left(time):
             value, slope = jax.jvp(guard, (time,), (jnp.ones_like(time),))
-            return jnp.where(slope == 0, 0.0, value / jnp.where(slope == 0, 1.0, slope))
+            clear = jnp.abs(value) < jnp.abs(slope) / jnp.finfo(slope.dtype).eps  # no arc of no length
+            return jnp.where(clear, value / jnp.where(clear, slope, 1.0), 0.0)
 
         time = jnp.where(solution.event_mask, carried(end, left), length + (end - jax.lax.stop_gradient(length)))
         return solution, time, at(time)

@@ -29,7 +29,7 @@ from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
-from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.engines.taylor.policy import POLICY, exact
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
@@ -51,11 +51,6 @@ from jaxrock.transforms.differentiation import differentiable, with_derivatives_
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
-
-
-def _exact(dtype) -> float:
-    """The tolerance with which rounding is all that is left."""
-    return float(jnp.finfo(dtype).eps) / 2
 
 
 class Series(AbstractEngine):
@@ -89,7 +84,7 @@ class Series(AbstractEngine):
             stop=stop,
             engine=self,
             order=self.order or POLICY.order(scene.most_pieces, self.tolerance),
-            tolerance=self.tolerance or _exact(scene.p.dtype),
+            tolerance=self.tolerance or exact(scene.p.dtype),
             history=history,
             taped=taped,
         )
@@ -127,7 +122,7 @@ class TaylorStepper(AbstractStepper):
     @property
     def rounding(self) -> float:
         """What a step adds to the error, over the slenderness, however small its last terms are."""
-        return min(self.tolerance, _exact(self.scene.p.dtype))
+        return min(self.tolerance, exact(self.scene.p.dtype))
 
     def advance(self, state: State) -> State:
         """One step of a lane."""

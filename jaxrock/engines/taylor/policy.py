@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 
 class Policy(NamedTuple):
     """How the series engine goes about it.
@@ -39,3 +41,8 @@ class Policy(NamedTuple):
 
 
 POLICY = Policy()
+
+
+def exact(dtype) -> float:
+    """The tolerance with which rounding is all that is left."""
+    return float(jnp.finfo(dtype).eps) / 2
