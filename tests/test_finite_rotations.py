@@ -204,7 +204,7 @@ def test_derivatives_and_differences(by_amplitude):
     """Of the peak by the amplitude, forward; by modulus and damping, reverse."""
     at, step = 0.5, 1e-5
     (peak, _), (slope, _), _ = by_amplitude(np.array([at - step, at, at + step]))
-    assert slope[1] == pytest.approx((peak[2] - peak[0]) / (2 * step), rel=1e-6)
+    assert float(slope[1]) == pytest.approx(float(peak[2] - peak[0]) / (2 * step), rel=1e-6)
 
     @jax.jit
     @jax.vmap

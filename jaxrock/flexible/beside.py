@@ -22,7 +22,7 @@ Scalar = Inexact[Array, ""]
 States = Inexact[Array, "points states"]
 
 POINTS = 11
-_ROUNDS = 7  # of taking what is beside the linear phase, and answering it
+_ROUNDS = 8  # of taking what is beside the linear phase, and answering it
 _PLACES = (1 - np.cos(np.pi * np.arange(POINTS) / (POINTS - 1))) / 2
 
 
@@ -211,13 +211,16 @@ def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " ord
     n = tangents.numbers.rotation.size
     force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)
 
-    def round_(_, carry):
-        force, shift, before, _ = carry
+    def round_(number, carry):
+        force, shift, before, change = carry
         found, modes = step.beside(*step.arc(force, shift), shift)
-        change = jnp.max(jnp.abs(modes - before))
-        return _POWERS @ found.force, _POWERS @ step.shift(found), modes, change
+        moved = jnp.max(jnp.abs(modes - before))
+        following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
+        # Where rounding is all that is left, stiff modes let it grow again.
+        better = (number < 3) | (moved < change)
+        return tuple(jnp.where(better, new, old) for new, old in zip(following, carry))
 
-    start = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.zeros(())
+    start = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.asarray(jnp.inf)
     force, shift, _, change = jax.lax.fori_loop(0, _ROUNDS, round_, start)
     amplitudes, coefficients = step.arc(force, shift)
     found, _ = step.beside(amplitudes, coefficients, shift)
