@@ -61,7 +61,7 @@ class Series(AbstractEngine):
     - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16, and
       fewer where a `tolerance` leaves room for it.
     - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
-      ones take less time: half of it at 1e-8, for peaks within 1e-6.
+      ones take less time where there are many scenes, and leave more of them undecided.
     - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
       (`simulate`, which stores every step).
 
