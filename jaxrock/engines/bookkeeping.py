@@ -22,7 +22,7 @@ _LOST = 1e-2  # standard error over the saddle's angle beyond which a state mean
 def checked(stepper: AbstractStepper, before: State, after: State) -> State:
     """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-    lost = (after.side != 0) & ~(after.spread.size <= _LOST * stepper.scene.moments.saddle)
+    lost = (after.side != 0) & ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
     if not stepper.history:
         # In the free stage only the next peak or passage counts, which `note` judges.
         lost = lost & (before.piece < stepper.scene.pieces)
@@ -75,7 +75,8 @@ def note(stepper: AbstractStepper, state: State, outward, turning, crossing, ope
     # The acceleration with or without the shaking, whichever is larger: a block that the ground holds for an
     # instant, far from its saddle, is not in balance.
     pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
-    stillness = keep((moments.stiffness * speed**2 + pull**2) / moments.restoring_at_rest**2, state.local)
+    per_rest = 1 / moments.restoring_at_rest**2  # the same at every step: computed once
+    stillness = keep((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
     turn = turning & (outward | state.beyond)
     closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
     closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
@@ -84,13 +85,14 @@ def note(stepper: AbstractStepper, state: State, outward, turning, crossing, ope
     higher = turning & outward
     first = higher & surpasses(opening, state.peak)
     # Turning back just above the ground, within the error of the angle: there may have been an impact.
-    off = jnp.abs(opening) + state.spread.angle
-    grazing = turning & ~outward & (off <= GRAZING * state.spread.angle)
-    graze = jnp.where(grazing, jnp.sqrt(8 * jnp.abs(acceleration) * off), 0.0)
+    angle = state.spread.angle
+    off = jnp.abs(opening) + angle
+    grazing = turning & ~outward & (off <= GRAZING * angle)
+    graze = jnp.where(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
     # Standing still in balance, within the error of the state along which it leaves.
-    balanced = (turning | crossing) & (jnp.hypot(speed, pull) <= stepper.doubt * state.spread.along(1.0, 1.0))
+    balanced = (turning | crossing) & (speed**2 + pull**2 <= stepper.doubt**2 * state.spread.variance(1.0, 1.0))
     if stepper.scene.falls_flat:
-        balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * state.spread.angle))
+        balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * angle))
     undecided = balanced & (state.status == Status.successful)
     highest = higher & (opening > state.peak)
     clearance = jnp.where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
@@ -101,9 +103,9 @@ def note(stepper: AbstractStepper, state: State, outward, turning, crossing, ope
         clearance=clearance,
         peak_clearance=jnp.where(highest, clearance, state.peak_clearance),
         peak_time=jnp.where(first, stepper.time(state), state.peak_time),
-        error=jnp.where(first, jax.lax.stop_gradient(state.spread.angle), state.error),
+        error=jnp.where(first, jax.lax.stop_gradient(angle), state.error),
         closeness=closeness,
         closeness_beyond=beyond,
-        spread=jax.lax.stop_gradient(state.spread.plus(0.0, graze)),
+        spread=jax.lax.stop_gradient(state.spread.plus_variance(0.0, graze)),
         status=Status.where(undecided, Status.undecided, state.status),
     )

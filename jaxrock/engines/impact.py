@@ -46,8 +46,10 @@ def impact(
     """
     rebound = _rebound(stepper, state, speed, ground)
     slowed = hit & (rebound.there < 0)  # by the forcing, before it hit the ground: else it would have turned back
-    depth = speed**2 / (2 * jnp.where(slowed, -rebound.there, 1.0))
-    rests, more, wait = _rests(stepper, state, hit, rebound, steepest, reach)
+    depth = jax.lax.cond(
+        slowed, lambda: speed**2 / (2 * jnp.where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
+    )
+    rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
     return replace(
         state,
         impacts=state.impacts + (hit & (speed < 0)) + more,
@@ -75,6 +77,18 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
     there = -moments.acceleration(rest, speed, state.side * ground[0], ground[1])
     spread = state.spread.after_impact(speed, -there, -here, ratio, scene.reset.slope(before))
     return _Rebound(rebound, here, there, jax.lax.stop_gradient(spread))
+
+
+def _rests_if_soon(stepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar) -> tuple:
+    """As `_rests`, which is not asked where the next hop alone takes too long for that."""
+    given = stepper, state, hit, after, steepest, reach
+    stepper, state, hit, after, steepest, reach = jax.lax.stop_gradient(given)
+    soon = hit & ((8 * after.speed <= reach * stepper.scene.p * after.here) | (after.speed == 0))
+
+    def never():
+        return jnp.zeros_like(hit), jnp.zeros_like(state.impacts), jnp.zeros_like(reach)
+
+    return jax.lax.cond(soon, lambda: _rests(stepper, state, soon, after, steepest, reach), never)
 
 
 def _rests(
@@ -105,4 +119,4 @@ def _rests(
     slower = e if scene.far is None else jnp.sqrt(e * back)  # from hop to hop, in the mean
     more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
     more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-    return rests, more, jax.lax.stop_gradient(jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0))
+    return rests, more, jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)

@@ -71,7 +71,7 @@ class Scene(eqx.Module):
     motion: AbstractMotion
     knots: Inexact[Array, " knots"]
     lengths: Inexact[Array, " knots"]
-    scales: Inexact[Array, " knots"]
+    scales: Inexact[Array, " knots"] | None  # None: straight lines
     count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
     outlook: Outlook
     falls_flat: bool = eqx.field(static=True)
@@ -116,7 +116,7 @@ class Scene(eqx.Module):
             motion=motion,
             knots=knots,
             lengths=_endless(lengths, None if stretch else count),
-            scales=_endless(motion.scales, None if stretch else count),
+            scales=None if motion.scales is None else _endless(motion.scales, None if stretch else count),
             count=count,
             outlook=Outlook.of(envelope, _least_threshold(moments, far)),
             falls_flat=model.falls_flat,
@@ -182,9 +182,13 @@ class Scene(eqx.Module):
         """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
         return jnp.minimum(self.outlook.after_quiet(piece), self.pieces)
 
+    def scale(self, piece: Int[Array, ""]) -> Scalar | float:
+        """Time in which the acceleration of a piece changes [s]."""
+        return jnp.inf if self.scales is None else pick(self.scales, piece)
+
     def shaking(self, piece: Int[Array, ""], local: Scalar, order: int) -> tuple[Shaking, Scalar]:
         """Taylor coefficients of the ground acceleration [g] in time/unit, and the unit [s]."""
-        unit = jnp.minimum(1 / self.p, pick(self.scales, piece))
+        unit = 1 / self.p if self.scales is None else jnp.minimum(1 / self.p, self.scale(piece))
         during = piece < self.pieces
         inner = jnp.minimum(piece, self.pieces - 1)
         shaking = Shaking(

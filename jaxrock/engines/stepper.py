@@ -38,8 +38,8 @@ class AbstractEngine(eqx.Module):
         return False
 
     @abc.abstractmethod
-    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "AbstractStepper":
-        """This engine at work on a scene, up to the time `stop` [s] (infinite: the end of the motion); `taped`: so that
+    def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "AbstractStepper":
+        """This engine at work on a scene, up to the time `stop` [s] (None: the end of the motion); `taped`: so that
         reverse mode goes through its steps."""
 
     @abc.abstractmethod
@@ -59,7 +59,7 @@ class AbstractStepper(eqx.Module):
         @property
         def scene(self) -> Scene: ...
         @property
-        def stop(self) -> Scalar: ...
+        def stop(self) -> Scalar | None: ...
         @property
         def engine(self) -> AbstractEngine: ...
         @property
@@ -68,7 +68,7 @@ class AbstractStepper(eqx.Module):
         def doubt(self) -> float: ...
     else:
         scene: AbstractVar[Scene]
-        stop: AbstractVar[Scalar]  # time at which to stop [s]; infinite: at the end of the motion
+        stop: AbstractVar[Scalar | None]  # time at which to stop [s]; None: at the end of the motion
         engine: AbstractVar[AbstractEngine]
         history: AbstractVar[bool]  # follow an overturning block down to the ground
         doubt: AbstractVar[float]  # standard errors from the boundary within which a verdict is not given
@@ -97,13 +97,16 @@ class AbstractStepper(eqx.Module):
 
     def room(self, state: State) -> Scalar:
         """Time to the next knot or the stop [s]."""
-        to_knot = pick(self.scene.lengths, state.piece) - state.local
-        return jnp.maximum(jnp.minimum(to_knot, self.stop - self.time(state)), 0.0)
+        room = self._to_knot(state)
+        room = room if self.stop is None else jnp.minimum(room, self.stop - self.time(state))
+        return jnp.maximum(room, 0.0)
+
+    def _to_knot(self, state: State) -> Scalar:
+        return pick(self.scene.lengths, state.piece) - state.local
 
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
         """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
-        to_knot = pick(self.scene.lengths, state.piece) - state.local
-        ends = full & (to_knot <= self.stop - self.time(state))
+        ends = full if self.stop is None else full & (self._to_knot(state) <= self.stop - self.time(state))
         piece = state.piece + ends
-        over = jnp.where(jnp.isfinite(self.stop), full & ~ends, piece >= self.scene.pieces)
+        over = piece >= self.scene.pieces if self.stop is None else full & ~ends
         return piece, jnp.where(ends, 0.0, state.local + elapsed), over

@@ -150,8 +150,10 @@ class FlexibleScene(eqx.Module):
         lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
         remaining = jnp.minimum(lasts, self.stop - self.knots[state.piece]) - state.local
         left = jax.lax.stop_gradient(jnp.maximum(remaining, 0.0))
-        scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
-        unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, 1.0))
+        unit = jnp.where(left > 0, left, 1.0)
+        if self.ground.scales is not None:
+            scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
+            unit = jnp.where(jnp.isfinite(scale), scale, unit)
         load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
         cap = jnp.minimum(left, self.longest(state)) / unit
         if len(load) > 4:

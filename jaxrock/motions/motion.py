@@ -49,8 +49,8 @@ class AbstractMotion(Owner):
 
     @property
     @abc.abstractmethod
-    def scales(self) -> Inexact[Array, " pieces"]:
-        """Time in which the acceleration of each piece changes [s]; infinite for a straight line."""
+    def scales(self) -> Inexact[Array, " pieces"] | None:
+        """Time in which the acceleration of each piece changes [s]; infinite for a straight line. None: all are."""
 
     @property
     @abc.abstractmethod
@@ -175,7 +175,7 @@ class Scaled(_Changed):
         return self.motion.lateness
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
+    def scales(self) -> Inexact[Array, " pieces"] | None:
         return self.motion.scales
 
     @property
@@ -216,9 +216,9 @@ class Shifted(_Changed):
         return self.motion.lateness
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
+    def scales(self) -> Inexact[Array, " pieces"] | None:
         scales = self.motion.scales
-        return jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
+        return None if scales is None else jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
 
     @property
     def envelope(self) -> Envelope:
@@ -267,6 +267,12 @@ class _Pieces(NamedTuple):
         return None if terms is None else [jnp.where(moving, u, 0.0) for u in terms]
 
 
+def _shortest_scales(parts: tuple[_Pieces, ...]) -> Inexact[Array, " finer"] | None:
+    """The scales of motions at once."""
+    found = [part.spread(part.motion.scales, jnp.inf) for part in parts if part.motion.scales is not None]
+    return functools.reduce(jnp.minimum, found) if found else None
+
+
 def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
     """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
 
@@ -301,8 +307,8 @@ class Summed(AbstractMotion):
         return _Pieces(self.first, self.knots), _Pieces(self.second, self.knots)
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
-        return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
+    def scales(self) -> Inexact[Array, " pieces"] | None:
+        return _shortest_scales(self._parts)
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
@@ -358,8 +364,8 @@ class WithVertical(_Changed):
         return _Pieces(self.horizontal, self.knots), _Pieces(self.vertical, self.knots)
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
-        return jnp.minimum(*(part.spread(part.motion.scales, jnp.inf) for part in self._parts))
+    def scales(self) -> Inexact[Array, " pieces"] | None:
+        return _shortest_scales(self._parts)
 
     @property
     def envelope(self) -> Envelope:

@@ -32,8 +32,8 @@ class Straight(AbstractMotion):
         return self.samples[:-1], self.samples[1:]
 
     @property
-    def scales(self) -> Inexact[Array, " pieces"]:
-        return jnp.full_like(self._ends[0], jnp.inf)
+    def scales(self) -> None:
+        return None
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
@@ -42,7 +42,7 @@ class Straight(AbstractMotion):
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         left, right = self._ends
-        slope = (right[piece] - left[piece]) / self.dt
+        slope = (right[piece] - left[piece]) * (1 / self.dt)
         return [left[piece] + slope * local, slope * unit][: order + 1]
 
 

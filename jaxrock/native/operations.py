@@ -76,15 +76,23 @@ def _compare(sign: str):
     return operation
 
 
+def _is_a_number(x) -> bool:
+    """Whether a vector is known to hold numbers only."""
+    return isinstance(x, ir.Constant) and not any(math.isnan(number.constant) for number in x.constant)
+
+
 def _extremum(sign: str):
     def operation(e, _, x, y):
         if _is_flag(x):
             return e.b.or_(x, y) if sign == ">" else e.b.and_(x, y)
         if not is_float(x):
             return e.b.select(e.b.icmp_signed(sign, x, y), x, y)
-        # What is not a number goes through, from either side.
-        first = e.b.or_(e.b.fcmp_ordered(sign, x, y), e.b.fcmp_unordered("uno", x, x))
-        return e.b.select(first, x, y)
+        # What is not a number goes through, from either side: of a comparison and a choice, which are one instruction,
+        # from the second.
+        if isinstance(y, ir.Constant):
+            x, y = y, x
+        first = e.b.select(e.b.fcmp_ordered(sign, x, y), x, y)
+        return first if _is_a_number(x) else e.b.select(e.b.fcmp_unordered("uno", x, x), x, first)
 
     return operation
 
@@ -107,11 +115,19 @@ def _sign(e, equation, x):
     return e.b.select(is_other, e.intrinsic("copysign", one, x), x)
 
 
+def _positive_power(e, x, exponent: int):
+    if exponent == 1:
+        return x
+    half = _positive_power(e, x, exponent // 2)
+    square = e.b.fmul(half, half)
+    return e.b.fmul(square, x) if exponent % 2 else square
+
+
 def _power(e, equation, x):
     exponent = equation.params["y"]
     if not is_float(x) or exponent == 0:
         raise Unsupported(f"power {exponent}")
-    power = functools.reduce(e.b.fmul, [x] * abs(exponent))
+    power = _positive_power(e, x, abs(exponent))
     return power if exponent > 0 else e.b.fdiv(e.constant(1, equation.invars[0].aval.dtype), power)
 
 

@@ -134,7 +134,7 @@ def root_of(value: Scalar, degree: int) -> Scalar:
     info = jnp.finfo(value.dtype)
     integer = jnp.int64 if info.bits == 64 else jnp.int32
     one, bias = 1 << info.nmant, info.maxexp - 1
-    logarithm = (jax.lax.bitcast_convert_type(value, integer).astype(value.dtype) / one - bias) / degree
+    logarithm = (jax.lax.bitcast_convert_type(value, integer).astype(value.dtype) / one - bias) * (1 / degree)
     whole = jnp.floor(logarithm)
     part = logarithm - whole
     power = jax.lax.bitcast_convert_type((whole.astype(integer) + bias) * one, value.dtype)

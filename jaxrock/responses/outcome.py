@@ -189,7 +189,7 @@ def _passes(rounds: bool) -> Passes:
     def begin(scene):
         block, motion, model, initial, engine = scene
         scene = Scene.of(block, motion, model, in_place=True)
-        stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False)
+        stepper = engine.stepper(scene, None, history=False)
         return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
 
     def result_of(stepper, state):
@@ -208,7 +208,7 @@ def _passes(rounds: bool) -> Passes:
 
 def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcome:
     scene = Scene.of(block, motion, model)
-    stepper = engine.stepper(scene, jnp.full_like(scene.p, jnp.inf), history=False, taped=taped)
+    stepper = engine.stepper(scene, None, history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
     if taped:
         # A tape holds all steps, as a history does.

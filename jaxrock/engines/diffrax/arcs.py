@@ -124,7 +124,7 @@ class Diffrax(AbstractEngine):
         """Whether reverse mode goes through this engine's own loops: as the adjoint tells."""
         return not isinstance(self.adjoint, diffrax.ForwardMode)
 
-    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "ArcStepper":
+    def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "ArcStepper":
         """This engine at work on a scene."""
         if taped:
             raise ValueError(
@@ -145,7 +145,7 @@ class Diffrax(AbstractEngine):
         """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
         atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
-        return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scales[piece])))
+        return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scale(piece))))
 
     def solve(self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event | None) -> Any:
         """The arc, for `length` (p t) at most."""
@@ -206,7 +206,7 @@ class ArcStepper(AbstractStepper):
     """One scene with the engine's settings, and how far to follow it."""
 
     scene: Scene
-    stop: Scalar
+    stop: Scalar | None
     history: bool = eqx.field(static=True)
     engine: Diffrax
     doubt: float = eqx.field(static=True, default=1.0)  # the estimate is generous
@@ -248,7 +248,7 @@ class ArcStepper(AbstractStepper):
         """Follow the free stage by the same arcs."""
         if not self.history:
             return state
-        stepper = ArcStepper(self.scene, jnp.full_like(self.stop, jnp.inf), False, self.engine)
+        stepper = ArcStepper(self.scene, None, False, self.engine)
         moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
         state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
         budget = self.engine.budget(self.scene, False)
@@ -291,7 +291,7 @@ class ArcStepper(AbstractStepper):
         scene, engine = self.scene, self.engine
         lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
-        share = POLICY.share * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scales[state.piece])
+        share = POLICY.share * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scale(state.piece))
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)

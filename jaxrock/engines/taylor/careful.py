@@ -75,7 +75,7 @@ class Series(AbstractEngine):
     def __check_init__(self):
         check_fields(self)
 
-    def stepper(self, scene: Scene, stop: Scalar, history: bool, taped: bool = False) -> "TaylorStepper":
+    def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "TaylorStepper":
         """This engine at work on a scene; short pieces of a record need few terms."""
         if not isinstance(scene.moments, Coefficients):
             raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
@@ -106,7 +106,7 @@ class TaylorStepper(AbstractStepper):
     """One scene with the engine's settings, and how far to follow it."""
 
     scene: Scene
-    stop: Scalar  # time at which to stop [s]; infinite: at the end of the motion
+    stop: Scalar | None  # time at which to stop [s]; None: at the end of the motion
     engine: Series
     order: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
@@ -189,7 +189,7 @@ class TaylorStepper(AbstractStepper):
 
     def start(self, state: State, shaking: Shaking, unit: Scalar) -> Start:
         """Where a step starts, with time in `unit`."""
-        stretch = keep(self.scene.p * unit, state.local)
+        stretch = jnp.ones_like(unit) if self.scene.scales is None else keep(self.scene.p * unit, state.local)
         moments: Any = self.scene.moments
         return Start(
             moments.bare,

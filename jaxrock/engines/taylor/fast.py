@@ -53,7 +53,8 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     jerks = _first_sign(jerk[0], jerk[1])
 
     def sure(share):
-        return (keeps_sign(acceleration, rises, share * length) > 0) | (keeps_sign(jerk, jerks, share * length) > 0)
+        kept = keeps_sign(acceleration, rises, share * length) > 0
+        return _if(~kept, lambda: kept | (keeps_sign(jerk, jerks, share * length) > 0), kept)
 
     def shorter():
         share = jnp.zeros_like(length)
@@ -87,13 +88,21 @@ def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slop
     The iterations take polynomials of these `degrees`: the first need not be exact.
     """
     width, order = end - start, len(terms) - 1
-    degrees = degrees if order > 10 else (degrees[0], order, order)  # the short steps of records
-    x = keep(start + width * _guess(values, (width * slopes[0], None if slopes[1] is None else width * slopes[1])), end)
-    for degree in degrees:
-        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
-        change = value / slope
-        x = jnp.clip(x - change, start, end)
-    return x, jnp.abs(change)
+    short = order <= 10  # the steps of records, in which nothing is far from a parabola
+    far_slope = None if short or slopes[1] is None else width * slopes[1]
+    x = keep(start + width * _guess(values, (width * slopes[0], far_slope)), end)
+
+    def nearer(x, degrees):
+        for degree in degrees:
+            value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
+            change = value / slope
+            x = jnp.clip(x - change, start, end)
+        return x, jnp.abs(change)
+
+    if not short:
+        return nearer(x, degrees)
+    x, change = nearer(x, (order, order))
+    return _if(~(change <= 1e-8 * x), lambda: nearer(x, (order, order)), (x, change))
 
 
 class _Part(NamedTuple):
@@ -113,7 +122,10 @@ class _Part(NamedTuple):
 def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Part:
     """As much of a step as is certain; `least`: what the last coefficients may contribute."""
     one, before, first = start.one, terms[1], 2 * terms[2]
-    longest = step_length(terms, least, jnp.minimum(room, 16.0))
+    cap = jnp.minimum(room, 16.0)
+    # Under records nearly all steps go as far as there is room: no root is taken for them.
+    short = ~(last_size(terms) * cap ** (len(terms) - 1) <= least)
+    longest = _if(short, lambda: step_length(terms, least, cap), cap)
     reaches = longest >= room * (1 - 1e-9)
     longest = keep_by(jnp.where(reaches, room, longest), one)
     rises = jnp.where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
@@ -123,9 +135,12 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
     def extremum(length):
         opening, speed, acceleration = (keep_by(x, one) for x in jet(terms, length, 2))
         has_extremum = rises * acceleration < 0
-        # Between the tangents at the ends.
-        between = (speed - before - acceleration * length) / jnp.where(has_extremum, first - acceleration, 1.0)
-        bound = before + first * between
+
+        def where_tangents_meet():
+            turn = jnp.where(has_extremum, first - acceleration, 1.0)
+            return before + first * ((speed - before - acceleration * length) / turn)
+
+        bound = _if(has_extremum, where_tangents_meet, before)
         return (
             (opening, speed, acceleration),
             has_extremum,
@@ -241,14 +256,15 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     terms = expand(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
     least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
-    part = _part(start, terms, jnp.minimum(stepper.room(state), 32 * unit) / unit, least)
+    rate = 1 / unit
+    part = _part(start, terms, jnp.minimum(stepper.room(state) * rate, 32.0), least)
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
     certain = keep_flag(meeting.certain & sure, state.local)
 
     opening, _ = landed(scene, hits, meeting.opening, meeting.speed)
-    velocity = keep_by(meeting.speed / stretch, one)
+    velocity = keep_by(meeting.speed * (1 / stretch), one)
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
@@ -287,7 +303,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         return impact(stepper, noted, hits.impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
 
     struck = _if(hits.impact, strike, noted)
-    lost = escaped(stepper, state, start.angle)
+    may_escape = state.beyond & (state.velocity >= 0)
+    lost = _if(may_escape, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(may_escape))
     postponed = ~certain & ~lost & (struck.status == Status.successful)
     after = replace(
         struck,
