@@ -64,7 +64,8 @@ def series(motion, piece, local, unit, order):
 
 @jax.jit
 def tables(motion):
-    return motion.knots, motion.scales, motion.bounds, motion.end
+    straight = jnp.full_like(motion.bounds, jnp.inf)
+    return motion.knots, straight if motion.scales is None else motion.scales, motion.bounds, motion.end
 
 
 @functools.cache

@@ -55,7 +55,8 @@ class End(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and the restoring moment."""
+    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and the restoring moment where
+    the ground moves vertically."""
 
     opening: list[Scalar]
     sine: list[Scalar]
@@ -85,7 +86,8 @@ def expand(start: Start, order: int) -> Expansion:
     x, slopes = [angle.value, start.speed], [start.speed]  # slopes: (k + 1) x_{k+1}
     sine, cosine, arms, restorings = [angle.sine], [angle.cosine], [], []
     scale = keep_by(-(start.stretch**2), one)
-    pushes = [start.side * u for u in start.shaking.horizontal]
+    pushes = [keep_by(scale * start.side, one) * u for u in start.shaking.horizontal]
+    scaled = moments.restoring_terms.each(lambda c: keep_by(scale * c, one))
     for k in range(order - 1):
         if moments.trigonometric and k > 0:
             sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
@@ -94,12 +96,12 @@ def expand(start: Start, order: int) -> Expansion:
         arm = moments.arm_terms.along(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
         moment = _product(pushes, arms, k)
-        restoring = moments.restoring_terms.along(basis, empty=None)
-        restorings.append(restoring)
+        restoring = scaled.along(basis, empty=None)
         moment = moment if restoring is None else moment + restoring
         if start.shaking.vertical is not None:
-            moment = moment + _product(start.shaking.vertical, restorings, k)
-        term = keep_by(scale * moment * (1 / ((k + 1) * (k + 2))), one)
+            restorings.append(moments.restoring_terms.along(basis, empty=None))
+            moment = moment + scale * _product(start.shaking.vertical, restorings, k)
+        term = keep_by(moment * (1 / ((k + 1) * (k + 2))), one)
         if k == 0:
             term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
         x.append(term)

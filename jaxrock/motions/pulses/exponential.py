@@ -1,5 +1,7 @@
 """Single-lobe pulses: rectangle, triangle, and the exponential family that holds both."""
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int
 
@@ -7,6 +9,7 @@ from jaxrock._checks import not_nan, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
 from jaxrock.numerics.lookup import pick
+from jaxrock.numerics.polynomial import horner
 
 
 class RectangularPulse(AbstractPulse):
@@ -78,7 +81,7 @@ def _growth_ratio(x: Real) -> Real:
     """(e^x - 1)/x for x <= 0, smooth through 0."""
     small = jnp.abs(x) < 1e-2
     far = jnp.where(small, -1.0, x)
-    near = 1 + x / 2 * (1 + x / 3 * (1 + x / 4 * (1 + x / 5 * (1 + x / 6 * (1 + x / 7)))))
+    near = horner([jnp.full_like(x, 1 / math.factorial(k + 1)) for k in range(7)], x)
     return jnp.where(small, near, jnp.expm1(far) / far)
 
 
@@ -142,26 +145,28 @@ class ExponentialPulse(AbstractPulse):
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         shape = jnp.clip(self.shape, -1e25, 1e25)
-        layer, y = self._layer, local / self.duration
+        rate = 1 / self.duration  # the same at every step: computed once
+        layer, y = self._layer, local * rate
         spiked = shape > 0
         down, up = jnp.where(spiked, 0.0, shape), jnp.where(spiked, shape, 0.0)
         # Distance from the nearer foot and from the peak, each without cancellation where it matters.
         foot = pick(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
         peak = pick(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
-        fall = jnp.exp(2 * down * foot) / _growth_ratio(down)
-        rise = jnp.exp(-2 * up * peak) / _growth_ratio(-up)
-        value_down = 2 * foot * _growth_ratio(2 * down * foot) / _growth_ratio(down)
+        per_down, per_up = 1 / _growth_ratio(down), 1 / _growth_ratio(-up)
+        fall = jnp.exp(2 * down * foot) * per_down
+        rise = jnp.exp(-2 * up * peak) * per_up
+        value_down = 2 * foot * _growth_ratio(2 * down * foot) * per_down
         value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
         # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
         flat, middle = layer < 0.5, (piece == 1) | (piece == 2)
         value_up = jnp.where(~middle & flat, 0.0, value_up)
         value_down = jnp.where(middle & flat, 1.0, value_down)
         direction = jnp.where(piece < 2, 1.0, -1.0)
-        step = direction * unit / self.duration
+        step = direction * unit * rate
         terms = [self.amplitude * jnp.where(spiked, value_up, value_down)]
         term = self.amplitude * 2 * jnp.where(spiked, rise, fall) * step
-        curved = self._curved(piece)
+        term, ratio = jnp.where(self._curved(piece), term, 0.0), 2 * shape * step
         for k in range(1, order + 1):
-            terms.append(jnp.where(curved, term, 0.0))
-            term = term * 2 * shape * step / (k + 1)
+            terms.append(term)
+            term = term * ratio * (1 / (k + 1))
         return terms
