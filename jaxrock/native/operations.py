@@ -3,7 +3,6 @@
 Each is a function of the emitter, the equation in JAX's program, and the operands.
 """
 
-import functools
 import math
 from collections.abc import Callable
 

@@ -55,8 +55,8 @@ class End(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and the restoring moment where
-    the ground moves vertically."""
+    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and, where the ground moves
+    vertically, the restoring moment."""
 
     opening: list[Scalar]
     sine: list[Scalar]

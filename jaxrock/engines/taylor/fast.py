@@ -29,9 +29,10 @@ from jaxrock.status import Status
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-# Degrees of the polynomials whose roots Newton's iterations take, if the whole is of degree 16 or less (else in
+# Degrees of the polynomials whose roots Newton's first iterations take, if the whole is of degree 16 or less (else in
 # proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
-_FLAT, _TURN, _MEET = (6, 10, 16), (5, 10, 16, 16), (5, 9, 13, 16)
+_FLAT, _TURN, _MEET = (6, 10), (5, 10), (5, 9)
+_SETTLED, _MORE = 1e-8, 6  # changes of a root, as a share of it, after which there are no more; and no more than these
 
 
 def _first_sign(value: Scalar, following: Scalar) -> Scalar:
@@ -85,24 +86,27 @@ def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
 def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
     """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
 
-    The iterations take polynomials of these `degrees`: the first need not be exact.
+    The first iterations take polynomials of these `degrees`: they need not be exact.
     """
     width, order = end - start, len(terms) - 1
-    short = order <= 10  # the steps of records, in which nothing is far from a parabola
-    far_slope = None if short or slopes[1] is None else width * slopes[1]
+    far_slope = None if slopes[1] is None else width * slopes[1]
     x = keep(start + width * _guess(values, (width * slopes[0], far_slope)), end)
 
-    def nearer(x, degrees):
-        for degree in degrees:
-            value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
-            change = value / slope
-            x = jnp.clip(x - change, start, end)
-        return x, jnp.abs(change)
+    def nearer(x, degree):
+        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
+        change = value / slope
+        return jnp.clip(x - change, start, end), jnp.abs(change)
 
-    if not short:
-        return nearer(x, degrees)
-    x, change = nearer(x, (order, order))
-    return _if(~(change <= 1e-8 * x), lambda: nearer(x, (order, order)), (x, change))
+    for degree in degrees if order > 10 else (order,):  # the short steps of records
+        x, change = nearer(x, degree)
+
+    def unsettled(carry):
+        x, change, count = carry
+        return ~(change <= _SETTLED * x) & (count < _MORE)
+
+    more = x, change, jnp.zeros_like(x, jnp.int32)
+    x, change, _ = jax.lax.while_loop(unsettled, lambda carry: (*nearer(carry[0], order), carry[2] + 1), more)
+    return x, change
 
 
 class _Part(NamedTuple):
