@@ -107,8 +107,9 @@ def _check(address: int) -> int | None:
     if frame.stage != EXECUTE:
         return None
     failed, found = (_first(each.buffers, Buffer).data for each in (frame.args, frame.rets))
-    if not ctypes.c_bool.from_address(failed):
-        ctypes.c_bool.from_address(found).value = False
+    has_failed = ctypes.c_bool.from_address(failed).value
+    ctypes.c_bool.from_address(found).value = has_failed  # first: where no error can be made, what failed is marked
+    if not has_failed:
         return None
     text = _first(frame.attributes.values, _Text)
     size = _Complaint.code.offset + _Complaint.code.size  # XLA counts no padding

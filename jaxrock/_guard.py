@@ -24,7 +24,10 @@ _guard_p.multiple_results = True
 
 
 def guarded(values: PyTree, failed: Bool[Array, ""], message: str) -> PyTree:
-    """`values`, with a check that raises `message` where it has `failed`."""
+    """`values`, with a check that raises `message` where it has `failed`.
+
+    Only real numbers can be marked, and what nobody uses is not computed: of whole numbers alone a check may be lost.
+    """
     leaves, structure = jax.tree.flatten(values)
     return jax.tree.unflatten(structure, _guard_p.bind(jnp.asarray(failed), *map(jnp.asarray, leaves), message=message))
 

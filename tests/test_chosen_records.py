@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock._checks import is_traced
 from jaxrock.engines.scene import Scene
 from jaxrock.motions.together import Chosen, Together
 
@@ -45,7 +46,7 @@ def test_an_axis_of_records_beside_one_after_the_other(grid, by_hand, name):
 @pytest.mark.parametrize("number", range(4))
 def test_bounds_of_what_is_to_come_end_with_a_record(number):
     """They are those of the record alone: what follows in the array is another motion."""
-    motion = Chosen(Together.of(RECORDS), jnp.int32(number))
+    motion = Chosen(Together.of(RECORDS), jnp.int32(number), jnp.ones(()))
     among = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=True)
     alone = Scene.of(BLOCK, 2.0 * RECORDS[number], rk.Linear())
     here = slice(int(among.first), int(among.pieces) + 1)
@@ -94,8 +95,43 @@ def test_lanes_share_the_samples_of_all_records():
     assert memory.temp_size_in_bytes < lanes / 2
 
 
+def test_what_is_known_stays_so():
+    """Else every call would put all records together again, and every suite be a program of its own."""
+    found = []
+    jax.jit(lambda number: found.append(SUITE[number].together) or number)(1)
+    assert not is_traced(found)
+
+
+def peak(number):
+    return rk.intensity.peak_acceleration(SUITE[number])
+
+
+def test_numbers_without_a_record_are_no_other_record():
+    """They raise also where XLA deals lanes to devices; an exported program finds nothing there."""
+    numbers, compiled = np.array([-1, 0, 3, 4]), jax.jit(jax.vmap(peak))
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:2]), ("devices",))
+    dealt = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    with pytest.raises(Exception, match=r"must be in \[0, 3\]"):
+        jax.block_until_ready(compiled(jax.device_put(numbers, dealt)))
+    exported = jax.export.export(compiled)(jax.ShapeDtypeStruct(numbers.shape, numbers.dtype))
+    expected = [np.nan, *SUITE.peak_acceleration[jnp.array([0, 3])], np.nan]
+    np.testing.assert_allclose(exported.call(numbers), expected, rtol=1e-12)
+    nothing = Chosen(Together.of(RECORDS), jnp.int32(0), jnp.asarray(jnp.nan))
+    scene = Scene.of(BLOCK, 2.0 * nothing, rk.Linear(), in_place=True)
+    shaking, _ = scene.shaking(jnp.int32(0), jnp.zeros(()), 8)
+    assert np.isnan([scene.outlook.strongest_drive, *shaking.horizontal[:2]]).all()
+
+
+@pytest.mark.slow
+def test_an_exported_outcome_without_a_record():
+    compiled = jax.jit(jax.vmap(lambda number: outcome(SUITE[number])))
+    found = jax.export.export(compiled)(jax.ShapeDtypeStruct((2,), int)).call(np.array([0, 9]))
+    assert np.isnan(found.margin).tolist() == [False, True]
+    assert (found.status == rk.Status.not_finite).tolist() == [False, True]
+
+
 def test_measures_of_a_chosen_record():
-    peaks = jax.jit(jax.vmap(lambda number: rk.intensity.peak_acceleration(SUITE[number])))(jnp.arange(4))
+    peaks = jax.jit(jax.vmap(peak))(jnp.arange(4))
     np.testing.assert_allclose(peaks, SUITE.peak_acceleration, rtol=1e-12)
 
 

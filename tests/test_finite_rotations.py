@@ -11,7 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.flexible.bent import BentScene
+from jaxrock.flexible.bent import BentScene, scene_of
 from jaxrock.flexible.beside import Tangents
 from jaxrock.flexible.column import Column
 from jaxrock.flexible.phases import rocking_phase
@@ -216,6 +216,18 @@ def test_derivatives_and_differences(by_amplitude):
     steps = 1e-5 * np.eye(2)
     differences = (peak_of(x + steps) - peak_of(x - steps)) / 2e-5
     np.testing.assert_allclose(jax.jacrev(lambda x: peak_of(x[None])[0])(x), differences, rtol=2e-6)
+
+
+@pytest.mark.parametrize("law", [{}, WHOLE], ids=["linear", "whole"])
+def test_numbers_of_single_precision_among_others(law):
+    """All is computed in the usual precision, whatever was given: steps keep it."""
+    shape = {name: np.float32(value) for name, value in TALL.items()}
+    block, pulse = rk.FlexibleBlock(**shape, damping_ratio=0.01, masses=2, **law), rk.SinePulse(np.float32(0.5), 1.6)
+    scene = scene_of(block, pulse, jnp.float32(4.0))
+    start = scene.start()
+    kinds = [jax.tree.map(lambda x: x.dtype, state) for state in (start, jax.eval_shape(scene.advance, start))]
+    assert kinds[0] == kinds[1]
+    assert not {x.dtype for x in jax.tree.leaves((scene, start))} & {np.dtype(np.float32), np.dtype(np.complex64)}
 
 
 @pytest.mark.parametrize(

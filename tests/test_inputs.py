@@ -1,5 +1,6 @@
 """Bad input raises at once and says what is wrong; so it does under jit. What is allowed is allowed."""
 
+import ctypes
 import functools
 import os
 import re
@@ -14,7 +15,7 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
-from jaxrock import _guard
+from jaxrock import _foreign, _guard
 from jaxrock._foreign import CHECK
 
 NAN, INF, HALF_PI = np.nan, np.inf, np.pi / 2
@@ -457,6 +458,22 @@ def test_checks_where_xla_has_no_function_for_them(monkeypatch):
     assert compiled(0.2) == area(0.2)
     with pytest.raises(Exception, match="Argument `alpha` must be in"):
         jax.block_until_ready(compiled(-0.2))
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_what_failed_is_marked_where_no_error_can_be_made(failed):
+    """As XLA calls it, which answers nothing when it is asked for an error."""
+    flags = np.array([failed, not failed])
+    buffers = [_foreign.Buffer(data=flags[i:].ctypes.data) for i in range(2)]
+    tables = [(ctypes.c_void_p * 1)(ctypes.addressof(each)) for each in buffers]
+    args, rets = (_foreign.Buffers(size=1, buffers=ctypes.addressof(table)) for table in tables)
+    message = b"a message"
+    text = _foreign._Text(ctypes.cast(message, ctypes.c_void_p), len(message))
+    texts = (ctypes.c_void_p * 1)(ctypes.addressof(text))
+    interface = _foreign.Interface(create_error=_foreign._Complain(lambda complaint: 0))
+    frame = _foreign.Frame(api=ctypes.addressof(interface), stage=_foreign.EXECUTE, args=args, rets=rets)
+    frame.attributes.values = ctypes.addressof(texts)
+    assert not _foreign._check(ctypes.addressof(frame)) and flags[1] == failed
 
 
 @pytest.mark.parametrize("time", [-0.1, 4.1, NAN])

@@ -4,6 +4,7 @@ allows.
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
@@ -99,5 +100,8 @@ class BentScene(FlexibleScene):
 
 
 def scene_of(block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> FlexibleScene:
-    """The scene of a block, linear or not."""
+    """The scene of a block, linear or not, in one precision: the usual."""
+    usual = jnp.result_type(float)
+    given = block, ground, stop
+    block, ground, stop = jax.tree.map(lambda x: x.astype(usual) if eqx.is_inexact_array(x) else x, given)
     return (FlexibleScene if block.is_linear else BentScene).of(block, ground, stop)

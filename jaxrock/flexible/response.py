@@ -116,7 +116,8 @@ class FlexibleResponse(AbstractTable):
 
     @property
     def impact_modes(self) -> Inexact[Array, "impacts modes"]:
-        """Share of each clamped mode of the column in the energy just after each impact [-]."""
+        """Share of each clamped mode of the column in the energy just after each impact [-]; with P-Delta the modes are
+        those of the column under its weight, about the balance."""
         path = self.trajectory
         path.check_single()
         q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)

@@ -1,5 +1,6 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, finite, is_traced, shown, watched
 from jaxrock._named import AbstractNamed
-from jaxrock._parameters import broadcast, leaves_of, one_of_many
+from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.motion import AbstractMotion
@@ -98,14 +99,17 @@ class Suite(AbstractNamed):
             return one_of_many(self.groups[group], place - int(ends[group]) + size_of(self.groups[group]))
         if jnp.ndim(number) or not jnp.issubdtype(number.dtype, jnp.integer):
             raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.")
-        failed = (number < 0) | (number >= len(self))
-        number = watched(number, f"The number of a motion must be in [0, {len(self) - 1}]", failed)
-        return self._chosen(number.astype(jnp.int32))
+        motion, failed = self._chosen(number.astype(jnp.int32)), (number < 0) | (number >= len(self))
+        whole, own = eqx.partition(motion, shared(motion))  # what all share is not copied for each
+        message = f"The number of a motion must be in [0, {len(self) - 1}]"
+        return eqx.combine(watched(own, message, failed), whole)
 
     def _chosen(self, number) -> AbstractMotion:
         """The motion of a traced number."""
         if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
-            return Chosen(Together.of([record for record in self.motions() if isinstance(record, Record)]), number)
+            with contextlib.nullcontext() if is_traced(self.groups) else jax.ensure_compile_time_eval():
+                together = Together.of([record for record in self.motions() if isinstance(record, Record)])
+            return Chosen(together, number, jnp.ones((), together.samples.dtype))
         kinds = {jax.tree.structure(group) for group in self.groups}
         if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
             raise ValueError(

@@ -63,6 +63,7 @@ class _InPlace(Straight):
 
     together: Together
     record: Int[Array, ""]
+    sure: Scalar
 
     @property  # type: ignore[misc]
     def samples(self) -> Inexact[Array, " places"]:  # type: ignore[override]
@@ -70,7 +71,7 @@ class _InPlace(Straight):
 
     @property  # type: ignore[misc]
     def dt(self) -> Scalar:  # type: ignore[override]
-        return self.together.dt[self.record]
+        return self.sure * self.together.dt[self.record]  # which makes slopes no numbers, at no cost in a step
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -93,7 +94,7 @@ class _InPlace(Straight):
         many, values = self.together, self.bounds
         values = jnp.where(self._left[:-1] > 0, values, 0.0)
         peaks = jax.ops.segment_max(values, many.owner[:-1], many.dt.size, indices_are_sorted=True)
-        return Envelope(Bounds(values, left=self._left[:-1], peak=peaks[self.record]), None)
+        return Envelope(Bounds(values, self.sure, left=self._left[:-1], peak=peaks[self.record]), None)
 
 
 class Chosen(AbstractChosen):
@@ -101,6 +102,7 @@ class Chosen(AbstractChosen):
 
     together: Together
     record: Int[Array, "..."] = parameter("-", is_free=False)
+    sure: Inexact[Array, "..."] = parameter("-", is_free=False)  # 1; what is not a number where there is no such record
 
     @property
     def alone(self) -> Padded:
@@ -108,7 +110,7 @@ class Chosen(AbstractChosen):
         many, places = self.together, jnp.arange(self.together.longest)
         first, count, dt = (x[self.record] for x in (many.first, many.count, many.dt))
         samples = many.samples[jnp.minimum(first + places, many.samples.size - 1)]
-        return Padded(jnp.where(places < count, samples, 0.0), dt, dt * (count - 1))
+        return Padded(self.sure * jnp.where(places < count, samples, 0.0), dt, dt * (count - 1))
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -150,6 +152,6 @@ def in_place(motion: AbstractMotion) -> Stretch:
 
     (chosen,) = filter(is_chosen, jax.tree.leaves(motion, is_leaf=is_chosen))
     many, record = chosen.together, chosen.record
-    place = _InPlace(together=many, record=record)  # type: ignore[call-arg]
+    place = _InPlace(together=many, record=record, sure=chosen.sure)  # type: ignore[call-arg]
     whole = jax.tree.map(lambda part: place if is_chosen(part) else part, motion, is_leaf=is_chosen)
     return Stretch(whole, many.first[record], many.first[record] + many.count[record] - 1, many.longest - 1)

@@ -22,9 +22,7 @@ from jaxrock.transforms.recipe import Recipe
 
 _LOG = logging.getLogger("jaxrock")
 # Names of machine code that what is lowered now calls.
-_called: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar(
-    "called", default=None
-)  # names of machine code that what is lowered now calls
+_called: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar("called", default=None)
 
 
 @not_collected()
