@@ -11,10 +11,10 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.flexible.bent import BentScene, scene_of
-from jaxrock.flexible.beside import Tangents
 from jaxrock.flexible.column import Column
+from jaxrock.flexible.nonlinear import NonlinearScene, scene_of
 from jaxrock.flexible.phases import rocking_phase
+from jaxrock.flexible.remainder import Tangents
 from references.flexible_column import PULSE, SHORT, TALL, Chain
 
 WHOLE = dict(base="sine", rotations="finite", p_delta=True)
@@ -99,7 +99,7 @@ def test_the_rigid_limit(base, p_delta):
 def test_what_is_linear_stays_so(base, damping):
     """The same steps with nothing beside the linear phase: the linear block's own answer."""
     block = rk.FlexibleBlock(**TALL, damping_ratio=damping, base=base)
-    scene = BentScene.of(block, PULSE, jnp.asarray(20.0))
+    scene = NonlinearScene.of(block, PULSE, jnp.asarray(20.0))
 
     @jax.jit
     def run(scene):
@@ -228,6 +228,14 @@ def test_numbers_of_single_precision_among_others(law):
     kinds = [jax.tree.map(lambda x: x.dtype, state) for state in (start, jax.eval_shape(scene.advance, start))]
     assert kinds[0] == kinds[1]
     assert not {x.dtype for x in jax.tree.leaves((scene, start))} & {np.dtype(np.float32), np.dtype(np.complex64)}
+
+
+@pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
+def test_single_precision_is_refused():
+    """Which would be wrong in the third digit, and not say so."""
+    with jax.enable_x64(False), pytest.raises(ValueError, match="must be linear in single precision"):
+        block = rk.FlexibleBlock(**TALL, damping_ratio=0.01, masses=2, **WHOLE)
+        rk.outcome(block, rk.SinePulse(0.5, 1.6))
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ class Column(eqx.Module):
         bent, bends = q - numbers.rotation * rotation, v - numbers.rotation * speed
         return numbers.squares * bent + numbers.damping * bends
 
-    def further(self, q: Modal, v: Modal, a: Modal, ground: Scalar) -> Modal:
+    def remaining_force(self, q: Modal, v: Modal, a: Modal, ground: Scalar) -> Modal:
         """Forces on the modes that small rotations without P-Delta leave out; `ground`: its acceleration [g]."""
         unit, numbers = self._unit, self.numbers
         lean, force = unit.chords @ q, jnp.zeros_like(q)
@@ -123,7 +123,7 @@ class Column(eqx.Module):
         def lack(column, x):
             numbers, q, rotation = column.numbers, x[:-1], x[-1]
             elastic = column.elastic(q, none, rotation, 0 * rotation)
-            weighed = (elastic - column.further(q, none, none, 0 * rotation)) / numbers.squares
+            weighed = (elastic - column.remaining_force(q, none, none, 0 * rotation)) / numbers.squares
             moment = jnp.sum(numbers.rotation * elastic) - column.spring(rotation, one)
             return jnp.append(weighed, moment / numbers.spring_rate)
 

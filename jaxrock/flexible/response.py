@@ -14,7 +14,7 @@ from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, along_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
-from jaxrock.flexible.bent import scene_of
+from jaxrock.flexible.nonlinear import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status, marked_result

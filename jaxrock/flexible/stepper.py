@@ -145,15 +145,13 @@ class FlexibleScene(eqx.Module):
 
     def load(self, state: FlexibleState) -> tuple[Inexact[Array, " order"], Scalar, Scalar, Bool[Array, ""]]:
         """The ground's acceleration [g] along the arc from here, and the rest that `arc` returns."""
-        last = self.knots.size - 1
-        quiet, inner = state.piece >= last, jnp.minimum(state.piece, last - 1)
+        quiet, inner = state.piece >= self.knots.size - 1, jnp.minimum(state.piece, self.knots.size - 2)
         lasts = jnp.where(quiet, jnp.inf, self.ground.lengths[inner])
         remaining = jnp.minimum(lasts, self.stop - self.knots[state.piece]) - state.local
         left = jax.lax.stop_gradient(jnp.maximum(remaining, 0.0))
-        unit = jnp.where(left > 0, left, 1.0)
-        if self.ground.scales is not None:
-            scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, self.ground.scales[inner]))
-            unit = jnp.where(jnp.isfinite(scale), scale, unit)
+        scales = self.ground.scales
+        scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, jnp.inf if scales is None else scales[inner]))
+        unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, 1.0))
         load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
         cap = jnp.minimum(left, self.longest(state)) / unit
         if len(load) > 4:

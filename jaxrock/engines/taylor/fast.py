@@ -8,7 +8,7 @@ care, does it afterwards.
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,8 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length, tangent
+from jaxrock.numerics.newton import root_between
+from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
 
@@ -32,7 +33,6 @@ Flag = Bool[Array, ""]
 # Degrees of the polynomials whose roots Newton's first iterations take, if the whole is of degree 16 or less (else in
 # proportion): for a value that is stationary there, for the time of a turning point, and for what meets a level.
 _FLAT, _TURN, _MEET = (6, 10), (5, 10), (5, 9)
-_SETTLED, _MORE = 1e-8, 6  # changes of a root, as a share of it, after which there are no more; and no more than these
 
 
 def _first_sign(value: Scalar, following: Scalar) -> Scalar:
@@ -64,49 +64,6 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
         return share
 
     return _if(~sure(1.0), shorter, jnp.ones_like(length))
-
-
-def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
-    """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
-    sign = jnp.where(values[0] > 0, 1.0, -1.0)
-    value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
-    curvature = fall - value - slope
-    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * curvature, 0.0))
-    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * curvature, root - slope)
-    share = jnp.clip(share, 0.0, 1.0)
-    if slopes[1] is None:
-        return share
-    cubic = slope + sign * slopes[1] - 2 * (fall - value)
-    for _ in range(2):
-        off, rate = jet([value, slope, curvature - cubic, cubic], share, 1)
-        share = jnp.clip(share - off / rate, 0.0, 1.0)
-    return share
-
-
-def _root(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
-    """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
-
-    The first iterations take polynomials of these `degrees`: they need not be exact.
-    """
-    width, order = end - start, len(terms) - 1
-    far_slope = None if slopes[1] is None else width * slopes[1]
-    x = keep(start + width * _guess(values, (width * slopes[0], far_slope)), end)
-
-    def nearer(x, degree):
-        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
-        change = value / slope
-        return jnp.clip(x - change, start, end), jnp.abs(change)
-
-    for degree in degrees if order > 10 else (order,):  # the short steps of records
-        x, change = nearer(x, degree)
-
-    def unsettled(carry):
-        x, change, count = carry
-        return ~(change <= _SETTLED * x) & (count < _MORE)
-
-    more = x, change, jnp.zeros_like(x, jnp.int32)
-    x, change, _ = jax.lax.while_loop(unsettled, lambda carry: (*nearer(carry[0], order), carry[2] + 1), more)
-    return x, change
 
 
 class _Part(NamedTuple):
@@ -188,7 +145,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
-        x, last = _root(
+        x, last = root_between(
             _TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.acceleration)
         )
         x = keep_by(x, one)
@@ -213,7 +170,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     slopes = jnp.where(early, terms[1], 0.0), jnp.where(early & turns, 0.0, part.speed)
 
     def meet():
-        x, last = _root(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
+        x, last = root_between(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
         x = keep_by(x, one)
         return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
 
@@ -234,7 +191,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     velocity, zero = derivative(terms), jnp.zeros_like(at)
 
     def extremum():
-        x, last = _root(
+        x, last = root_between(
             _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
         )
         return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
@@ -260,8 +217,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     terms = expand(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
     least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
-    rate = 1 / unit
-    part = _part(start, terms, jnp.minimum(stepper.room(state) * rate, 32.0), least)
+    part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least)
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
@@ -307,8 +263,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         return impact(stepper, noted, hits.impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
 
     struck = _if(hits.impact, strike, noted)
-    may_escape = state.beyond & (state.velocity >= 0)
-    lost = _if(may_escape, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(may_escape))
+    away = state.beyond & (state.velocity >= 0)
+    lost = _if(away, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(away))
     postponed = ~certain & ~lost & (struck.status == Status.successful)
     after = replace(
         struck,
@@ -346,7 +302,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     missing[0] = jnp.where(second, drive2[0] - level2, drive[0] - level)
     slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
     ending = jnp.where(second, end2 - level2, end - level)
-    x, last = _root(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
+    x, last = root_between(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
     both = (lifts | meets) & second
     lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
     elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit

@@ -1,9 +1,9 @@
-"""The motion of a column that is not linear: the linear phase about its balance, and a polynomial of what is beside it.
+"""The motion of a column that is not linear: the linear phase about its balance, and a polynomial of the remainder.
 
 The linear phase is that of the tangents at the unstable equilibrium, so that it is exact near there and knows how fast
-every mode turns and fades. What is beside it is small or slow: it is taken at Chebyshev points of a step, made a
-polynomial, and the modes answer it exactly; that is repeated until it stays. So steps are as long as the polynomial
-holds, however stiff the column is.
+every mode turns and fades. The remainder, what the column has beside it, is small or slow: it is taken at Chebyshev
+points of a step, made a polynomial, and the modes answer it exactly; that is repeated until it stays. So steps are as
+long as the polynomial holds, however stiff the column is.
 """
 
 from typing import NamedTuple
@@ -65,11 +65,11 @@ class Tangents(eqx.Module):
         force, eye = jnp.zeros(n), jnp.eye(n)
         if not column.p_delta:
             return cls(column, numbers, eye, 0 * eye, force, moment, slope)
-        force = column.further(q, none, none, 0 * rotation)
-        pull = jax.jacfwd(lambda q: column.further(q, none, none, 0 * rotation))(q)
+        force = column.remaining_force(q, none, none, 0 * rotation)
+        pull = jax.jacfwd(lambda q: column.remaining_force(q, none, none, 0 * rotation))(q)
         pull = (pull + pull.T) / 2
         squares, turn = jnp.linalg.eigh(jnp.diag(numbers.squares) - pull)
-        turn = turn * jnp.sign(jnp.diag(turn))
+        turn = turn * jnp.where(jnp.diag(turn) < 0, -1, 1)
         lever = (numbers.squares * numbers.rotation) @ turn / squares
         tip = numbers.tip @ turn
         place = q @ turn
@@ -92,12 +92,12 @@ class Tangents(eqx.Module):
         )
         return cls(column, about, turn, turn.T @ pull @ turn, force, moment, slope)
 
-    def beside(self, state, rate, ground: Scalar, side: Scalar) -> "Beside":
+    def remainder(self, state, rate, ground: Scalar, side: Scalar) -> "Remainder":
         """What is beside the linear phase, at a state (q, q', theta) and its rate of change."""
         column, about, n = self.column, self.numbers, self.numbers.rotation.size
         q, v, rotation = state[:n], state[n:-1], state[-1]
         amplitudes, speeds, rates = (self.turn @ x for x in (q, v, rate[n:-1]))
-        force = (column.further(amplitudes, speeds, rates, ground) - side * self.force) @ self.turn
+        force = (column.remaining_force(amplitudes, speeds, rates, ground) - side * self.force) @ self.turn
         force = force - self.pull @ (q - side * about.center[:n])
         away = rotation - side * about.center[-1]
         moment = column.spring(rotation, side) - side * self.moment - self.slope * away
@@ -110,10 +110,10 @@ class Tangents(eqx.Module):
         displaced = column.displacements(self.turn @ q)[-1]
         straight = jnp.sum(about.tip * q)
         bending = (displaced - column.sine(rotation)) - (straight - rotation)
-        return Beside(force, moment + lost, displaced - straight, bending, -lost)
+        return Remainder(force, moment + lost, displaced - straight, bending, -lost)
 
 
-class Beside(NamedTuple):
+class Remainder(NamedTuple):
     """What is beside the linear phase: forces on modes, moment at the base; and beside its outputs."""
 
     force: Inexact[Array, "*points modes"]
@@ -123,11 +123,11 @@ class Beside(NamedTuple):
     locked_moment: Inexact[Array, "*points"]
 
 
-class BentArc(Arc):
+class NonlinearArc(Arc):
     """The motion from a state on, with what is beside the linear phase."""
 
     shift: Inexact[Array, " terms"]  # of the rotation
-    further: Inexact[Array, "outputs terms"]  # of the outputs
+    remainder: Inexact[Array, "outputs terms"]  # of the outputs
     doubts: Inexact[Array, " outputs"]  # how far polynomials may be off
     error: Scalar  # of the whole step [rad]
 
@@ -146,7 +146,7 @@ class BentArc(Arc):
     def outputs(self, x: Scalar) -> Inexact[Array, " outputs"]:
         """Rotation, top displacement over L cos(alpha), its bending part, base moment over m L^2, at x."""
         linear = self.offsets + (self.phase.outputs @ super().mode_amplitudes(x)).real
-        return linear + self.further @ powers(x, self.shift.size)
+        return linear + self.remainder @ powers(x, self.shift.size)
 
     def curves(self) -> Curve:
         """The outputs as curves; the errors of polynomials are those of a mode that is not there, and turns fast."""
@@ -154,7 +154,7 @@ class BentArc(Arc):
         return Curve(
             jnp.concatenate([linear.amplitudes, none], 1),
             jnp.concatenate([linear.rates, none + 1j * POINTS**2], 1),
-            linear.coefficients + self.further,
+            linear.coefficients + self.remainder,
             jnp.concatenate([linear.errors, self.doubts[:, None]], 1),
         )
 
@@ -181,7 +181,7 @@ class _Step(eqx.Module):
         amplitudes = path.amplitudes + jnp.where(slow, 0.0, start - answer[0])
         return amplitudes, path.coefficients + answer + jnp.where(slow, start * self.rising, 0.0)
 
-    def beside(self, amplitudes, coefficients, shift) -> tuple[Beside, Inexact[Array, "points modes"]]:
+    def remainder(self, amplitudes, coefficients, shift) -> tuple[Remainder, Inexact[Array, "points modes"]]:
         """What is beside the linear phase at the points, and its modes there."""
         path, x = self.path, jnp.asarray(_PLACES)
         terms = np.arange(len(coefficients))
@@ -193,17 +193,19 @@ class _Step(eqx.Module):
         rate = ((waves * path.exponents + slopes @ coefficients) @ path.phase.modes.T).real
         state = state.at[:, -1].add(table[:, :POINTS] @ shift)
         rate = rate.at[:, -1].add(table[:, :POINTS] @ (_SLOPE @ shift))
-        found = jax.vmap(self.tangents.beside, (0, 0, 0, None))(state, rate / self.length, self.ground, self.side)
+        found = jax.vmap(self.tangents.remainder, (0, 0, 0, None))(state, rate / self.length, self.ground, self.side)
         return found, modes
 
-    def shift(self, found: Beside) -> Inexact[Array, " points"]:
+    def shift(self, found: Remainder) -> Inexact[Array, " points"]:
         """By how much the moment beside the linear phase turns the base against the column."""
         numbers = self.tangents.numbers
         stiffness = jnp.sum(numbers.rotation**2 * numbers.squares) - numbers.spring_rate
         return jnp.where(self.side == 0, 0.0, -found.moment / stiffness)
 
 
-def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " order"], length: Scalar) -> BentArc:
+def nonlinear_arc(
+    tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " order"], length: Scalar
+) -> NonlinearArc:
     """The arc with what is beside its linear phase; `load`: the ground's acceleration [g] by powers of x."""
     terms = len(path.coefficients)
     ground = powers(jnp.asarray(_PLACES), load.size).T @ load
@@ -213,7 +215,7 @@ def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " ord
 
     def round_(number, carry):
         force, shift, before, change = carry
-        found, modes = step.beside(*step.arc(force, shift), shift)
+        found, modes = step.remainder(*step.arc(force, shift), shift)
         moved = jnp.max(jnp.abs(modes - before))
         following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
         # Where rounding is all that is left, stiff modes let it grow again.
@@ -223,7 +225,7 @@ def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " ord
     start = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.asarray(jnp.inf)
     force, shift, _, change = jax.lax.fori_loop(0, _ROUNDS, round_, start)
     amplitudes, coefficients = step.arc(force, shift)
-    found, _ = step.beside(amplitudes, coefficients, shift)
+    found, _ = step.remainder(amplitudes, coefficients, shift)
     turned = step.shift(found)
     locked = jnp.where(side == 0, found.locked_moment, 0.0)
     outputs = jnp.stack([turned, found.displacement, found.bending - turned, locked], 1)
@@ -235,10 +237,11 @@ def bent(tangents: Tangents, path: Arc, side: Scalar, load: Inexact[Array, " ord
     forced = jnp.max(forced * length / (1 + jnp.abs(path.exponents)))
     change = jnp.maximum(change - 8 * jnp.max(path.errors), 0.0)
     error = jax.lax.stop_gradient(forced + change + jnp.max(tails[:3]))
-    further = jnp.pad((_POWERS @ outputs).T, ((0, 0), (0, terms - POINTS)))
-    return BentArc(
+    remainder = jnp.pad((_POWERS @ outputs).T, ((0, 0), (0, terms - POINTS)))
+    return NonlinearArc(
         path.phase, path.center, path.offsets, amplitudes, path.exponents, coefficients, path.errors,
-        shift=jnp.pad(shift, (0, terms - POINTS)), further=further, doubts=jax.lax.stop_gradient(tails), error=error,
+        shift=jnp.pad(shift, (0, terms - POINTS)), remainder=remainder, doubts=jax.lax.stop_gradient(tails),
+        error=error,
     )  # fmt: skip
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Reset
-from jaxrock.flexible.beside import BentArc, Tangents, bent
 from jaxrock.flexible.column import Column
 from jaxrock.flexible.phases import Phase, arc, locked_phase, rocking_phase
+from jaxrock.flexible.remainder import NonlinearArc, Tangents, nonlinear_arc
 from jaxrock.flexible.stepper import FlexibleScene, FlexibleState
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
@@ -23,13 +23,13 @@ _PRECISION = 10_000  # of a step, in units of the last digit
 _SHORTEST = 1e-12  # step over duration
 
 
-class BentScene(FlexibleScene):
+class NonlinearScene(FlexibleScene):
     """A flexible block with a law of its base, with rotations or with a weight that are not linear, under a motion."""
 
     tangents: Tangents
 
     @classmethod
-    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "BentScene":
+    def of(cls, block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> "NonlinearScene":
         """Build the scene from scalars."""
         tangents = Tangents.of(Column.of(block))
         numbers = tangents.numbers
@@ -44,12 +44,12 @@ class BentScene(FlexibleScene):
         """How long a step may be [s]."""
         return jnp.minimum(super().longest(state), state.stride)
 
-    def arc(self, state: FlexibleState) -> tuple[BentArc, Scalar, Scalar, Bool[Array, ""]]:
+    def arc(self, state: FlexibleState) -> tuple[NonlinearArc, Scalar, Scalar, Bool[Array, ""]]:
         """The motion from here, as of a linear block, with what is beside that."""
         load, length, share, whole = self.load(state)
         phase = Phase.where(state.side == 0, self.locked, self.rocking)
         path = arc(self.numbers, phase, state.side, state.motion, load, length)
-        return bent(self.tangents, path, state.side, load, length), length, share, whole
+        return nonlinear_arc(self.tangents, path, state.side, load, length), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
         """One step, or none but a shorter stride."""
@@ -104,4 +104,11 @@ def scene_of(block: FlexibleBlock, ground: AbstractMotion, stop: Scalar) -> Flex
     usual = jnp.result_type(float)
     given = block, ground, stop
     block, ground, stop = jax.tree.map(lambda x: x.astype(usual) if eqx.is_inexact_array(x) else x, given)
-    return (FlexibleScene if block.is_linear else BentScene).of(block, ground, stop)
+    if block.is_linear:
+        return FlexibleScene.of(block, ground, stop)
+    if jnp.finfo(usual).bits < 64:  # the powers of its polynomials leave three digits, or fewer
+        raise ValueError(
+            "Argument `block` must be linear in single precision. Put "
+            '`jax.config.update("jax_enable_x64", True)` before the first computation for one that is not.'
+        )
+    return NonlinearScene.of(block, ground, stop)

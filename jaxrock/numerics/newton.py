@@ -1,0 +1,59 @@
+"""The one root of a polynomial between two points, by Newton's iterations: in lanes, where a division takes as long as
+ten products.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+from jaxrock.numerics.polynomial import jet, tangent
+from jaxrock.numerics.xla_cpu import keep
+
+Scalar = Inexact[Array, ""]
+
+_SETTLED, _MORE = 1e-8, 6  # changes of a root, as a share of it, after which there are no more; and no more than these
+
+
+def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
+    """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
+    sign = jnp.where(values[0] > 0, 1.0, -1.0)
+    value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
+    curvature = fall - value - slope
+    root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * curvature, 0.0))
+    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * curvature, root - slope)
+    share = jnp.clip(share, 0.0, 1.0)
+    if slopes[1] is None:
+        return share
+    cubic = slope + sign * slopes[1] - 2 * (fall - value)
+    for _ in range(2):
+        off, rate = jet([value, slope, curvature - cubic, cubic], share, 1)
+        share = jnp.clip(share - off / rate, 0.0, 1.0)
+    return share
+
+
+def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, values, slopes):
+    """The one root of a polynomial in [start, end], and Newton's last change of it; `values`, `slopes`: at both ends.
+
+    The first iterations take polynomials of these `degrees`: they need not be exact.
+    """
+    width, order = end - start, len(terms) - 1
+    far_slope = None if slopes[1] is None else width * slopes[1]
+    x = keep(start + width * _guess(values, (width * slopes[0], far_slope)), end)
+
+    def nearer(x, degree):
+        value, slope = tangent(terms[: max(degree, order * degree // 16) + 1], x)
+        change = value / slope
+        return jnp.clip(x - change, start, end), jnp.abs(change)
+
+    for degree in degrees if order > 10 else (order,):  # the short steps of records
+        x, change = nearer(x, degree)
+
+    def unsettled(carry):
+        x, change, count = carry
+        return ~(change <= _SETTLED * x) & (count < _MORE)
+
+    more = x, change, jnp.zeros_like(x, jnp.int32)
+    x, change, _ = jax.lax.while_loop(unsettled, lambda carry: (*nearer(carry[0], order), carry[2] + 1), more)
+    return x, change
