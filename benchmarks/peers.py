@@ -2,7 +2,7 @@
 
     python benchmarks/peers.py [--problems P1 P4 ...] [--peers taylor scipy ...] [--quick] [--repeat 3]
 
-Five problems (`references/peer_problems.py`), every peer with settings for errors of about 1e-6, 1e-10 and 1e-12 where
+Seven problems (`references/peer_problems.py`), every peer with settings for errors of about 1e-6, 1e-10 and 1e-12 where
 it can, all on all cores, timed after compilation. Errors are against references of 30 digits (`references/peers.json`).
 And one block at a time under a record, on one core (`--problems one`).
 Writes `peers.md`, `peers.png` and `peers.json` beside this file. `--quick`: fewer scenes, once each; `--draw`: table
@@ -107,7 +107,7 @@ def rows_of(name, problem, known, options):
 def arguments():
     """What the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--problems", nargs="+", default=["P1", "P2", "P3", "P4", "P5", "one"])
+    parser.add_argument("--problems", nargs="+", default=["P1", "P2", "P3", "P4", "P5", "P6", "P7", "one"])
     parser.add_argument("--peers", nargs="+", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--quick", action="store_true", help="fewer scenes, once each")
     parser.add_argument("--repeat", type=int, default=3)

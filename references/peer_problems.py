@@ -8,7 +8,7 @@ Asked for is peak |theta|/alpha over the motion and the free rocking after it; i
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class Problem:
     def points(self) -> np.ndarray:
         """Indices of the scenes with a reference."""
         count = RECORD_POINTS if self.motion == "record" else POINTS
-        return np.sort(np.random.default_rng(SEED).choice(self.size, count, replace=False))
+        return np.sort(np.random.default_rng(SEED).choice(self.size, min(count, self.size), replace=False))
 
     def columns(self, chosen=slice(None)) -> tuple[np.ndarray, ...]:
         """alpha, p, restitution, amplitude and rate of the chosen scenes, contiguous."""
@@ -77,7 +77,7 @@ def sines(name, title, model, side, drawn):
     return surface(name, title, model, "sine", np.linspace(1.05, 10, side), np.linspace(0.3, 8, side), drawn=drawn)
 
 
-def record_blocks(size=1000):
+def record_blocks(name, model, size=1000):
     """Blocks under the built-in record."""
     import jax
 
@@ -89,9 +89,21 @@ def record_blocks(size=1000):
     random = np.random.default_rng(SEED)
     alpha, p = random.uniform(0.08, 0.3, size), random.uniform(0.8, 4.0, size)
     full = np.full(size, RESTITUTION)
-    title = f"{size:,} blocks under a record of {samples.size:,} samples, nonlinear"
+    title = f"{size:,} blocks under a record of {samples.size:,} samples, {model}"
     one = np.full(size, 1.0)
-    return Problem("P4", title, "nonlinear", "record", alpha, p, full, one, one, samples=samples, dt=dt)
+    return Problem(name, title, model, "record", alpha, p, full, one, one, samples=samples, dt=dt)
+
+
+def record_scales(size=200):
+    """One block under the built-in record at many scales, between the first that lifts it and the first that is sure to
+    overturn it."""
+    blocks, full = record_blocks("P7", "nonlinear", 1), np.full(size, 1.0)
+    scale = np.linspace(0.4, 2.4, size)
+    alpha, p, restitution = ALPHA * full, 2.0 * full, RESTITUTION * full
+    title = f"One block under {size} scales of a record of {blocks.samples.size:,} samples, nonlinear"
+    return replace(
+        blocks, title=title, alpha=alpha, p=p, restitution=restitution, intensity=scale, rate=full
+    )  # fmt: skip
 
 
 def load(name: str, quick: bool = False) -> list[Problem]:
@@ -105,8 +117,10 @@ def load(name: str, quick: bool = False) -> list[Problem]:
         durations = np.linspace(0.5, 8, 128)
         title = f"Exponential pulses of shape {SHAPE:g}, nonlinear, 128 x 128"
         return [surface(name, title, "nonlinear", "exponential", np.linspace(1.05, 6, 128), 2 * math.pi / durations)]
-    if name == "P4":
-        return [record_blocks()]
+    if name in ("P4", "P6"):
+        return [record_blocks(name, "linear" if name == "P6" else "nonlinear")]
+    if name == "P7":
+        return [record_scales()]
     if name == "P5":
         title = "Chattering to rest, sine pulses, nonlinear, 4 x 64 x 64"
         intensities, rates = np.linspace(1.0005, 1.3, 64), np.linspace(0.1, 0.5, 64)

@@ -34,7 +34,7 @@ def path_of(a, problem, index, factors=(0, 0, 0, 0)):
     )
     linear = problem.model == "linear"
     if problem.motion == "record":
-        motion, p = Lines(a, problem.samples.tolist(), problem.dt, by_amplitude), p * by_frequency
+        motion, p = Lines(a, problem.samples.tolist(), problem.dt, by_amplitude * intensity), p * by_frequency
         block = Block(a, base * by_alpha, p, e * by_restitution, linear, RECORD_ORDER)
         return block, respond(block, motion)
     amplitude, rate = intensity * (base if linear else a.tan(base)) * by_amplitude, rate * by_frequency
@@ -70,7 +70,7 @@ def main(names):
     jax.config.update("jax_enable_x64", True)
     known = json.loads(FILE.read_text()) if FILE.exists() else {}
     known = {"about": ABOUT} | {name: part for name, part in known.items() if name != "about"}
-    for name in names or ("P1", "P2", "P3", "P5", "P4"):
+    for name in names or ("P1", "P2", "P3", "P5", "P4", "P6", "P7"):
         problem = peer_problems.load(name)[0]
         start, answers = time.perf_counter(), []
         for count, index in enumerate(problem.points, 1):

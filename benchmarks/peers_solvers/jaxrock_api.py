@@ -27,13 +27,20 @@ def surface(problem, engine):
 
 
 def blocks(problem, engine, chosen):
-    """The blocks under the record."""
-    record = rk.Record(problem.samples, problem.dt)
+    """The blocks under the record, or one block under it at many scales."""
+    record, model = rk.Record(problem.samples, problem.dt), MODELS[problem.model]
 
     def one(alpha, p):
-        return rk.outcome(rk.Block(alpha, p, problems.RESTITUTION), record, engine=engine)
+        return rk.outcome(rk.Block(alpha, p, problems.RESTITUTION), record, model, engine=engine)
 
-    alpha, p, *_ = problem.columns(chosen)
+    def of_scale(scale):
+        block = rk.Block(problem.alpha[0], problem.p[0], problems.RESTITUTION)
+        return rk.outcome(block, scale * record, model, engine=engine)
+
+    alpha, p, _, scale, _ = problem.columns(chosen)
+    if problem.name == "P7":
+        found = rk.sweep(of_scale, outer=False, progress=False, scale=scale).values
+        return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / problem.alpha[0]
     if hasattr(rk, "sweep"):
         found = rk.sweep(one, outer=False, progress=False, alpha=alpha, p=p).values
     else:

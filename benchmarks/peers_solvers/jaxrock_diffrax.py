@@ -4,7 +4,7 @@ import jaxrock as rk
 
 from . import jaxrock_api
 
-FEW = {"P4": 16}  # scenes; else 200
+FEW = {"P4": 16, "P6": 16, "P7": 16}  # scenes; else 200
 SETTINGS = ((1e-6, 1e-7), (1e-12, 1e-12))
 
 

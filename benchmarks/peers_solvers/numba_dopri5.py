@@ -24,7 +24,7 @@ ACCELERATION = {"nonlinear": "-(math.sin(alpha - {x}) + {f} * math.cos(alpha - {
 FORCE = {
     "sine": "(s * A * math.sin(w * {t}))",
     "exponential": "(s * K - s * K * math.exp(growth * (2.0 * half - {t} if t >= half else {t})))",
-    "record": "(s * (samples[i] + slope * {t}))",
+    "record": "(s * scale * (samples[i] + slope * {t}))",
 }
 
 
@@ -123,7 +123,9 @@ def kernel(model, motion):
     """The compiled function over arrays."""
     parts = dopri5_parts(model, motion)
     if motion == "record":
-        return numba_taylor.over_blocks(numba_taylor.compiled(numba_taylor.record_source(parts), "record dopri5"))
+        return numba_taylor.over_blocks(
+            numba_taylor.compiled(numba_taylor.record_source(model, parts), "record dopri5")
+        )
     source = numba_taylor.pulse_source(model, motion, parts)
     source = source.replace("    fresh = True\n", "    fresh = True\n    step = 0.2 * longest\n", 1)
     return numba_taylor.over_pulses(numba_taylor.compiled(source, f"{motion} dopri5"))

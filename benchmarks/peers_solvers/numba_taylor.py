@@ -94,10 +94,10 @@ def pulse_source(model, motion, step):
     return filled(PULSE, parts | {"free": FREE_LINEAR if model == "linear" else FREE_NONLINEAR} | step)
 
 
-def record_source(step):
-    """Source of `one(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces)` (nonlinear)."""
-    parts = {"rest": filled(REST, RECORD_WORDS), "escape": ESCAPE["nonlinear"], "flat": FLAT["nonlinear"]}
-    parts |= {"free": FREE_NONLINEAR, "levers": LEVERS["nonlinear"]}
+def record_source(model, step):
+    """Source of `one(alpha, p, restitution, scale, samples, dt, rightward, leftward, precise, pieces)`."""
+    parts = {"rest": filled(REST, RECORD_WORDS), "escape": ESCAPE[model], "flat": FLAT[model]}
+    parts |= {"free": FREE_LINEAR if model == "linear" else FREE_NONLINEAR, "levers": LEVERS[model]}
     return filled(RECORD, parts | step)
 
 
@@ -115,10 +115,10 @@ def pulse_map(model, motion, order):
 
 
 @functools.cache
-def record_map(order):
-    """`peaks(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces)` over arrays, on all cores."""
-    step = taylor_parts(order, "nonlinear", "record") | {"middle": "pass"}
-    return over_blocks(compiled(record_source(step), f"record {order}"))
+def record_map(model, order):
+    """`peaks(alpha, p, restitution, scale, samples, ...)` over arrays, on all cores; the rest as `record_source`."""
+    step = taylor_parts(order, model, "record") | {"middle": "pass"}
+    return over_blocks(compiled(record_source(model, step), f"record {order}"))
 
 
 def over_pulses(one):
@@ -138,10 +138,10 @@ def over_blocks(one):
     """A function of one block under a record over arrays, on all cores."""
 
     @numba.njit(parallel=True, fastmath=FAST, error_model="numpy")
-    def peaks(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces):
+    def peaks(alpha, p, restitution, scale, samples, dt, rightward, leftward, precise, pieces):
         found = np.empty(alpha.size)
         for i in numba.prange(alpha.size):
-            found[i] = one(alpha[i], p[i], restitution[i], samples, dt, rightward, leftward, precise, pieces)
+            found[i] = one(alpha[i], p[i], restitution[i], scale[i], samples, dt, rightward, leftward, precise, pieces)
         return found
 
     return peaks
@@ -154,7 +154,7 @@ def run(problem, kernel, setting, chosen=slice(None)):
     if problem.motion == "record":
         numba.set_parallel_chunksize(4)
         ahead = [np.maximum.accumulate(np.maximum(side * problem.samples, 0)[::-1])[::-1].copy() for side in (1, -1)]
-        return kernel(alpha, p, restitution, problem.samples, problem.dt, *ahead, precise, accuracy)
+        return kernel(alpha, p, restitution, amplitude, problem.samples, problem.dt, *ahead, precise, accuracy)
     numba.set_parallel_chunksize(THREADS_CHUNK)
     return kernel(alpha, restitution, amplitude, rate, problems.SHAPE, accuracy, precise)
 
@@ -171,7 +171,7 @@ def ways(problem):
     found = []
     for goal, order, setting in SETTINGS["record" if problem.motion == "record" else "pulse"]:
         if problem.motion == "record":
-            kernel = functools.partial(record_map, order)
+            kernel = functools.partial(record_map, problem.model, order)
         else:
             kernel = functools.partial(pulse_map, problem.model, problem.motion, order)
         solve = lambda chosen=slice(None), kernel=kernel, s=setting: run(problem, kernel(), s, chosen)  # noqa: E731

@@ -51,8 +51,9 @@ def one(alpha, restitution, A, rate, shape, tolerance, precise):
 
 # rightward, leftward: the largest u and -u from each sample on.
 RECORD = """
-def one(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces):
+def one(alpha, p, restitution, scale, samples, dt, rightward, leftward, precise, pieces):
     {levers}
+    lifting = threshold / scale
     near = 1e-8 if precise else 1e-4
     tight = 4e-16 if precise else 1e-10
     end = p * dt
@@ -67,19 +68,19 @@ def one(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces
     fresh = False
     while i < last:
         if s == 0.0:
-            while i < last and abs(samples[i + 1]) <= threshold:
+            while i < last and abs(samples[i + 1]) <= lifting:
                 i += 1
                 t = 0.0
             if i == last:
                 return peak / alpha
             s = -1.0 if samples[i + 1] > 0.0 else 1.0
-            t = max(t, (-s * threshold - samples[i]) / (samples[i + 1] - samples[i]) * end)
+            t = max(t, (-s * lifting - samples[i]) / (samples[i + 1] - samples[i]) * end)
             x = 0.0
             v = 0.0
             fresh = True
         slope = (samples[i + 1] - samples[i]) / end
-        f0 = s * (samples[i] + slope * t)
-        f1 = s * slope
+        f0 = s * scale * (samples[i] + slope * t)
+        f1 = s * scale * slope
         {series}
         whole = part * 1.000001 >= end - t
         h = end - t if whole else part
@@ -100,7 +101,7 @@ def one(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces
             i += 1
             t = 0.0
         if v > alpha - x:
-            U = rightward[i] if s > 0.0 else leftward[i]
+            U = scale * (rightward[i] if s > 0.0 else leftward[i])
             if {escape}:
                 return math.inf
         {flat}
@@ -108,7 +109,7 @@ def one(alpha, p, restitution, samples, dt, rightward, leftward, precise, pieces
         return peak / alpha
     {free}
 """
-RECORD_WORDS = {"u_now": "samples[i] + slope * t", "steady": "abs(slope) * window * lever1 <= least"}
+RECORD_WORDS = {"u_now": "scale * (samples[i] + slope * t)", "steady": "scale * abs(slope) * window * lever1 <= least"}
 
 FREE_NONLINEAR = """
 away = 2.0 * math.sin(0.5 * (alpha - x))

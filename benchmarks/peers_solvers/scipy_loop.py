@@ -182,7 +182,7 @@ def solve_one(name, settings, index):
     problem = loaded(name)
     alpha, p, restitution, amplitude, rate = (float(c[index]) for c in problem.columns())
     if problem.motion == "record":
-        motion = Record(samples_of(name), problem.dt)
+        motion = Record(samples_of(name, amplitude), problem.dt)
     else:
         motion = (Sine if problem.motion == "sine" else Exponential)(amplitude, rate)
     return follow(alpha, p, restitution, motion, problem.model == "linear", settings)
@@ -195,9 +195,9 @@ def loaded(name):
 
 
 @functools.cache
-def samples_of(name):
-    """Samples of a record as plain numbers."""
-    return loaded(name).samples.tolist()
+def samples_of(name, scale):
+    """Samples of a record times a factor, as plain numbers."""
+    return (scale * loaded(name).samples).tolist()
 
 
 @functools.cache
@@ -207,7 +207,7 @@ def pool():
 
 
 SETTINGS = ((1e-6, settings_of(1e-7, 1e-9)), (1e-10, settings_of(1e-11, 1e-13)), (1e-12, settings_of(1e-13, 1e-15)))
-FEW = {"P4": 40}  # scenes; else 200
+FEW = {"P4": 40, "P6": 40, "P7": 40}  # scenes; else 200
 
 
 def ways(problem):
