@@ -33,6 +33,17 @@ from jaxrock.closed_form.sine_limits import (
 )
 from jaxrock.numerics.roots import bracketed_root
 
+__all__ = [
+    "Constants", "OverturningIntervals", "after_pulse_limits", "approximate_during_pulse_limit",
+    "approximate_impact_time", "constants", "during_pulse_limit", "first_peak", "impact_time",
+    "impact_time_limit", "impact_velocity", "no_impact_limit", "overturning_intervals", "peak_after_pulse",
+    "restitution_scale_law", "rotation", "velocity",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 class Constants(eqx.Module):
     """The constants of D&D 3.9 (A0*, B0*, C0*, D0*), the phase psi at uplift, and the end p T_ex of the pulse."""

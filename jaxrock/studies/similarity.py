@@ -25,6 +25,13 @@ from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.history import Response
 from jaxrock.studies import orientations as orientations
 
+__all__ = ["Groups", "Scales", "block", "groups", "groups_of", "master_curve", "motion", "orientations", "scales"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
 
