@@ -1,6 +1,7 @@
 """What the documentation says runs, and its links lead somewhere."""
 
 import ast
+import importlib
 import re
 import types
 from pathlib import Path
@@ -40,6 +41,20 @@ def test_every_snippet_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(snippets(page), page, "exec"), {"__name__": "__main__"})
     plt.close("all")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("other", ["heyoka", "openseespy.opensees"])
+def test_what_is_said_of_others_runs_where_they_are(other):
+    """Their code on the page of comparisons, after the first of jaxrock's."""
+    try:
+        importlib.import_module(other)
+    except (ImportError, RuntimeError) as error:  # OpenSees needs libraries of the system
+        pytest.skip(str(error))
+    page = (ROOT / "docs/comparison.md").read_text()
+    ours = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (theirs,) = (code for code in re.findall(r"```py\n(.*?)```", page, re.DOTALL) if f"import {other} " in code)
+    exec(compile(ours[0] + theirs, other, "exec"), {"__name__": "__main__"})
 
 
 def anchors(text):
