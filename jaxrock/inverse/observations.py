@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, as_real, checked, put_down, shown
+from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -37,6 +38,8 @@ class OtherSide(eqx.Module):
     - `ways`: (ways, rocks) signs of the motion that each rock may have felt, all equally likely: one row, or two where
       that is not known of some rocks.
     """
+
+    __repr__ = described
 
     alpha_ratio: Rocks
     radius_ratio: Rocks
@@ -65,6 +68,8 @@ class Observations(eqx.Module):
 
     **Raises:** ValueError for values outside their ranges, or of different lengths.
     """
+
+    __repr__ = described
 
     alpha: Rocks
     p: Rocks
