@@ -12,5 +12,7 @@ def meant(word: object, known: Iterable[str]) -> str:
     - `word`: as it was written. `known`: words that would do, upper or lower case.
     """
     by_form = {each.lower(): each for each in known}
-    near = difflib.get_close_matches(word.strip().lower(), by_form, n=1) if isinstance(word, str) else []
+    form = word.strip().lower() if isinstance(word, str) else ""
+    # A short word that shares most of its letters with another often means something else: SAC is not SMC.
+    near = difflib.get_close_matches(form, by_form, n=1, cutoff=0.6 if len(form) > 3 else 0.7)
     return f" Did you mean {by_form[near[0]]!r}?" if near else ""
