@@ -21,6 +21,7 @@ from jaxrock import (
 )
 from jaxrock._moved import moved as _moved
 from jaxrock._parameters import parameter as parameter
+from jaxrock._surface import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
@@ -95,5 +96,10 @@ if not _typing.TYPE_CHECKING:  # checkers know these names from above, and are t
         return _moved(name)
 
 
+_NAMESPACES = """
+    blocks closed_form hazard intensity inverse models motions plot processing responses restitution similarity studies
+"""
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER, "Diffrax"})
+    return sorted({*_shown(globals(), *_NAMESPACES.split()), *_LATER, "Diffrax"})

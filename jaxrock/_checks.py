@@ -13,6 +13,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._guard import guarded
+from jaxrock._words import meant
 
 Making = TypeVar("Making", bound=Callable)
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
@@ -265,5 +266,5 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return `value` if it is one of the allowed words."""
     if not isinstance(value, str) or value not in allowed:
         words = ", ".join(repr(word) for word in allowed)
-        raise ValueError(f"Argument `{name}` must be one of {words}, but is {shown(value)}.")
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {shown(value)}.{meant(value, allowed)}")
     return value

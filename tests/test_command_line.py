@@ -373,11 +373,15 @@ def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
     [
         ([], "the following arguments are required: COMMAND"),
         (["rock"], "invalid choice: 'rock'"),
+        (["sepctrum"], "Did you mean 'spectrum'?"),
         (["map", "--points", "many"], "argument --points: invalid int value: 'many'"),
         (["map", "--pulse", "wave"], "argument --pulse: invalid choice: 'wave'"),
+        (["map", "--pulse", "cosin"], "Did you mean 'cosine'?"),
         (["map", "--intensity", "2"], "argument --intensity: expected 2 arguments"),
         (["run", "--width", "wide"], "argument --width: invalid number value: 'wide'"),
         (["run", "--colour", "red"], "unrecognized arguments: --colour"),
+        (["run", "--widht", "2"], "unrecognized arguments: --widht. Did you mean '--width'?"),
+        (["run", "a.csv", "b.csv"], "unrecognized arguments: b.csv"),
     ],
 )
 def test_bad_words(capsys, words, error):

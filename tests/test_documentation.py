@@ -1,5 +1,7 @@
 """What the documentation says runs, and its links lead somewhere."""
 
+import ast
+import importlib
 import re
 import types
 from pathlib import Path
@@ -11,8 +13,8 @@ import jaxrock as rk
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
-# Recipes are tried by tests/test_log_density.py, and many processes by tests/test_distributed.py.
-ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md"}
+# Recipes are tried by tests/test_log_density.py, many processes by tests/test_distributed.py, examples below.
+ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md", "docs/examples.md"}
 
 
 def snippets(page):
@@ -41,6 +43,20 @@ def test_every_snippet_of_a_page_runs(page, tmp_path, monkeypatch):
     plt.close("all")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("other", ["heyoka", "openseespy.opensees"])
+def test_what_is_said_of_others_runs_where_they_are(other):
+    """Their code on the page of comparisons, after the first of jaxrock's."""
+    try:
+        importlib.import_module(other)
+    except (ImportError, RuntimeError) as error:  # OpenSees needs libraries of the system
+        pytest.skip(str(error))
+    page = (ROOT / "docs/comparison.md").read_text()
+    ours = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (theirs,) = (code for code in re.findall(r"```py\n(.*?)```", page, re.DOTALL) if f"import {other} " in code)
+    exec(compile(ours[0] + theirs, other, "exec"), {"__name__": "__main__"})
+
+
 def anchors(text):
     """Names of the headings of a page, as readers of Markdown make them."""
     told = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
@@ -60,19 +76,127 @@ def test_every_link_of_a_page_leads_somewhere(page):
         assert not anchor or anchor in anchors(target.read_text()), link
 
 
-SPACES = ("blocks", "hazard", "inverse", "models", "motions", "responses", "studies")
+def namespaces():
+    """Every public module by the shortest name that users write."""
+    found = {"rk": rk}
+    for path, space in (left := list(found.items())):
+        for name, value in shown(space):
+            if isinstance(value, types.ModuleType) and not any(value is known for known in found.values()):
+                found[f"{path}.{name}"] = value
+                left.append((f"{path}.{name}", value))
+    return found
 
 
-def is_public(space, name):
-    return name[0] != "_" and not isinstance(getattr(space, name), types.ModuleType)
+def shown(space):
+    return [(name, getattr(space, name)) for name in dir(space) if name[0] != "_"]
 
 
-def test_every_public_name_has_its_place():
-    text = "".join((ROOT / "docs" / page).read_text() for page in ("names.md", "api.md"))
-    homes = {f"{home}.": getattr(rk, home) for home in SPACES} | {"": rk}  # the top last: its names need no home
-    public = {name: home for home, space in homes.items() for name in dir(space) if is_public(space, name)}
-    assert len(public) > 100
-    assert not [home + name for name, home in public.items() if not re.search(rf"\b{re.escape(home)}{name}\b", text)]
+def public_things():
+    """Everything public that is no module, and all names under which users find it."""
+    found = {}
+    for path, space in namespaces().items():
+        for name, value in shown(space):
+            if not isinstance(value, types.ModuleType):
+                found.setdefault(id(value), (value, []))[1].append(f"{path}.{name}")
+    assert len(found) > 200
+    return found.values()
+
+
+def test_completion_shows_what_is_public_and_no_more():
+    """Not what files import for themselves, nor the packages of which the public ones are made."""
+    assert {path.split(".")[1] for path in namespaces() if path != "rk"} == {
+        "blocks", "closed_form", "hazard", "intensity", "inverse", "models", "motions", "plot", "processing",
+        "responses", "restitution", "similarity", "studies",
+    }  # fmt: skip
+    for thing, (path, *_) in public_things():
+        if not isinstance(thing, (dict, tuple)):
+            assert thing.__module__.startswith("jaxrock."), path
+            assert (thing.__doc__ or "").strip(), path
+    assert "law_of" in vars(rk.restitution) and "law_of" not in dir(rk.restitution)
+
+
+# Whose functions the table of names does not tell one by one.
+WHOLE = {"closed_form", "intensity", "processing", "restitution", "similarity"}
+
+
+@pytest.mark.parametrize("page", ["names.md", "api.md"])
+def test_every_public_name_has_its_place(page):
+    """By itself, or with its whole module."""
+    text = (ROOT / "docs" / page).read_text()
+    entries = set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
+
+    def written(thing, path):
+        space, _, name = path.removeprefix("rk.").rpartition(".")
+        module = namespaces().get(f"rk.{space}", rk).__name__
+        if page == "api.md":
+            return place(thing) in entries or module in entries
+        by_itself = re.search(rf"\b{re.escape(path.removeprefix('rk.'))}\b", text)
+        return by_itself or (space.split(".")[0] in WHOLE and f"`{space}`" in text)
+
+    assert not [paths for thing, paths in public_things() if not any(written(thing, path) for path in paths)]
+
+
+def place(thing):
+    """Where something is defined; nothing for a constant."""
+    return f"{getattr(thing, '__module__', '')}.{getattr(thing, '__qualname__', '')}"
+
+
+EXAMPLES = "docs/examples.md"
+# Parts that compile little: all together some 30 s. The others are slow.
+FEW_PROGRAMS = {
+    "One scene", "Many scenes", "`rk.models`", "`rk.motions`", "Files, components", "What lies in other places",
+    "`rk.processing`, `rk.intensity`", "`rk.similarity`", "Static strength, free rocking", "`rk.hazard`",
+    "Hazard, and rocks that still stand",
+}  # fmt: skip
+
+
+def parts_of_examples():
+    """Code by heading, at the lines where it stands; what all begin with has none."""
+    lines, found, heading = (ROOT / EXAMPLES).read_text().splitlines(), {}, ""
+    for number, (line, code) in enumerate(zip(lines, snippets(EXAMPLES).splitlines())):
+        heading = line.removeprefix("## ") if line.startswith("## ") and not code else heading
+        found.setdefault(heading, [""] * len(lines))[number] = code
+    return {heading: "\n".join(code) for heading, code in found.items()}
+
+
+PARTS = parts_of_examples()
+
+
+@pytest.mark.parametrize(
+    "heading", [pytest.param(h, marks=[] if h in FEW_PROGRAMS else pytest.mark.slow) for h in PARTS if h]
+)
+def test_every_part_of_the_examples_runs_by_itself_and_gives_the_types_it_says(heading, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scope = {"__name__": "__main__"}
+    for code in (PARTS[""], PARTS[heading]):
+        exec(compile(code, EXAMPLES, "exec"), scope)
+    for name, kind in scope.get("__annotations__", {}).items():
+        assert name not in scope or isinstance(scope[name], kind), name
+    plt.close("all")
+
+
+def named_in(code):
+    """What of the package is written in a program, also by a short name of a namespace."""
+    tree, known = ast.parse(code), {"rk": rk}
+
+    def value(node):
+        if isinstance(node, ast.Name):
+            return known.get(node.id)
+        space = value(node.value) if isinstance(node, ast.Attribute) else None
+        return getattr(space, node.attr, None) if isinstance(space, types.ModuleType) else None
+
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign):
+            target, given = node.targets[0], node.value
+            pairs = zip(target.elts, given.elts) if isinstance(given, ast.Tuple) else [(target, given)]
+            known |= {str(t.id): value(v) for t, v in pairs if isinstance(value(v), types.ModuleType)}
+    return {id(value(node)) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+
+
+def test_every_public_name_has_an_example():
+    assert set(PARTS) > FEW_PROGRAMS
+    named = set().union(*map(named_in, PARTS.values()))
+    assert not [paths for thing, paths in public_things() if id(thing) not in named]
 
 
 def test_who_cites_names_this_version():

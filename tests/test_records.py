@@ -306,6 +306,30 @@ def test_two_columns(file, content):
     assert record.dt == 0.02
 
 
+@pytest.mark.parametrize(
+    "title, per_g",
+    [
+        ("time,acceleration [g]", 1.0),
+        ("t (s),a (m/s^2)", 9.80665),
+        ("# time [s], acceleration [cm/s2]", 980.665),
+        ("Station A (upper)\nt [s], a [Gal]\n", 980.665),
+    ],
+)
+def test_unit_of_a_column_is_in_its_title(file, title, per_g):
+    path = file(f"{title}\n{PAIRS}")
+    np.testing.assert_allclose(read_record(path).samples, SAMPLES / per_g)
+    with pytest.raises(ValueError, match="Argument `unit` must agree with file `motion.txt`"):
+        read_record(path, unit="m/s2" if per_g != 9.80665 else "g")
+
+
+@pytest.mark.parametrize("title", ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a", "[g],a"])
+def test_other_titles_state_no_unit(file, title):
+    path = file(f"{title}\n{PAIRS}")
+    with pytest.raises(ValueError, match="which states none"):
+        read_record(path)
+    np.testing.assert_allclose(read_record(path, unit="g").samples, SAMPLES)
+
+
 @pytest.mark.parametrize("unit, per_g", [("g", 1.0), ("m/s2", 9.80665), ("cm/s2", 980.665)])
 def test_unit_of_text(file, unit, per_g):
     np.testing.assert_allclose(read_record(file(PAIRS), unit=unit).samples, SAMPLES / per_g)

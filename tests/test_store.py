@@ -126,6 +126,14 @@ def test_what_is_no_store_is_refused(tmp_path):
         run(store=tmp_path / "a.zarr")
 
 
+def test_every_process_says_what_a_store_needs(tmp_path, monkeypatch):
+    """Not that the store which the first one could not make is none."""
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    monkeypatch.setattr("jaxrock.sweeps.sweep.process", lambda: (1, 4))
+    with pytest.raises(ImportError, match=r'pip install "jaxrock\[store\]"'):
+        run(store=tmp_path / "a.zarr")
+
+
 def test_results_may_stay_in_the_store(tmp_path, straight):
     assert run(store=tmp_path / "a.zarr", load=False) is None
     same(straight, rk.Grid.load(tmp_path / "a.zarr"))

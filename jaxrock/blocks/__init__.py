@@ -3,6 +3,7 @@
 Imports `numerics`. Start with `rigid`; another law of restitution is a class like those in `restitution`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.edge import Edge as Edge
@@ -17,3 +18,7 @@ from jaxrock.blocks.random import (
     draw_rocks as draw_rocks,
 )
 from jaxrock.blocks.rigid import Block as Block
+
+
+def __dir__() -> list[str]:
+    return _shown(globals(), "restitution")

@@ -28,6 +28,13 @@ from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
 
+__all__ = ["AbstractRestitution", "AngularMomentum", "Constant", "Corners", "Housner", "PerSide", "SpeedDependent"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Real = Inexact[Array, "..."]
 
 # m R^2/I about a corner

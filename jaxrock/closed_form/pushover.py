@@ -11,6 +11,16 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 from jaxrock._checks import acute, checked, finite, one_of, share
 from jaxrock.transforms.elementwise import elementwise
 
+__all__ = [
+    "amplitude_after", "energy", "force", "overturning_moment_ratio", "period", "spring_force",
+    "toppling_velocity",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
 

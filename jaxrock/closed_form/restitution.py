@@ -6,6 +6,12 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 from jaxrock._checks import acute, positive
 from jaxrock.transforms.elementwise import elementwise
 
+__all__ = ["housner"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 @elementwise(alpha=acute, inertia=positive)
 def housner(alpha: Inexact[ArrayLike, "..."], inertia: Inexact[ArrayLike, "..."] = 4 / 3) -> Float[Array, "..."]:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxrock._arguments import arguments, at_least, known
 from jaxrock._checks import Range, share
+from jaxrock._described import described
 from jaxrock.closed_form import _sine_arcs as arcs
 from jaxrock.closed_form.sine_limits import after_pulse_limits, impact_time_limit, no_impact_limit
 
@@ -23,6 +24,8 @@ class OverturningIntervals(eqx.Module):
     Without loss (restitution 1) the safe gap below the last interval closes, and it touches the one before.
     - `searched_from`: below this intensity nothing was searched.
     """
+
+    __repr__ = described
 
     lower: Float[np.ndarray, " n"]
     upper: Float[np.ndarray, " n"]

@@ -13,6 +13,7 @@ and, at frequency ratios below about 1, in further islands of intensity, after 3
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxrock._described import described
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
 from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
 from jaxrock.closed_form.sine_histories import (
@@ -33,9 +34,22 @@ from jaxrock.closed_form.sine_limits import (
 )
 from jaxrock.numerics.roots import bracketed_root
 
+__all__ = [
+    "Constants", "OverturningIntervals", "after_pulse_limits", "approximate_during_pulse_limit",
+    "approximate_impact_time", "constants", "during_pulse_limit", "first_peak", "impact_time",
+    "impact_time_limit", "impact_velocity", "no_impact_limit", "overturning_intervals", "peak_after_pulse",
+    "restitution_scale_law", "rotation", "velocity",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 class Constants(eqx.Module):
     """The constants of D&D 3.9 (A0*, B0*, C0*, D0*), the phase psi at uplift, and the end p T_ex of the pulse."""
+
+    __repr__ = described
 
     A0: Result
     B0: Result

@@ -21,6 +21,16 @@ from jaxrock.numerics.divided_differences import exponential_difference, growth_
 from jaxrock.numerics.roots import bracketed_root
 from jaxrock.transforms.elementwise import elementwise
 
+__all__ = [
+    "Region", "critical_duration", "critical_shape", "falling_wall", "peak_border", "peak_rotation",
+    "peak_time", "pulse", "region", "rising_wall", "rotation", "safety_wall", "uplift_time", "velocity",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
 

@@ -14,6 +14,7 @@ from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
 from jaxrock.command_line.options import as_typed
 from jaxrock.command_line.output import Report, heard
+from jaxrock.command_line.parser import Parser
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
 from jaxrock.keeping.compiled import keep_compiled
@@ -46,7 +47,7 @@ def _epilog(command: str = "") -> str:
 def _parser() -> argparse.ArgumentParser:
     shared = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     description = "Rocking and overturning of free-standing blocks under earthquakes."
-    parser = argparse.ArgumentParser(prog="jaxrock", description=description, epilog=_epilog(), **shared)
+    parser = Parser(prog="jaxrock", description=description, epilog=_epilog(), **shared)
     parser.add_argument("--version", action="version", version=f"jaxrock {version('jaxrock')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():

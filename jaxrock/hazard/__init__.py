@@ -3,6 +3,7 @@
 Imports `studies`, `responses`, `sweeps`. Start with `fragility`, then `curves`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.hazard.curves import (
     HazardCurve as HazardCurve,
     allowed_scale as allowed_scale,
@@ -44,3 +45,7 @@ from jaxrock.hazard.surfaces import (
     simulated_surface as simulated_surface,
     surface_of as surface_of,
 )
+
+
+def __dir__() -> list[str]:
+    return _shown(globals())

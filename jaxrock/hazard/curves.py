@@ -30,6 +30,7 @@ from jaxrock._checks import (
     scalar,
     share,
 )
+from jaxrock._described import described
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, alike, beside, rising
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.roots import search_root
@@ -69,6 +70,8 @@ class HazardCurve(eqx.Module):
 
     **Raises:** ValueError for values outside their ranges, or of different shapes.
     """
+
+    __repr__ = described
 
     levels: Inexact[Array, "*batch n"]
     rates: Inexact[Array, "*batch n"]

@@ -21,6 +21,7 @@ from jaxrock._checks import (
     share,
     together,
 )
+from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.status import Enumeration, item
@@ -33,6 +34,8 @@ class AbstractFragility(Owner):
 
     One of your own needs `__call__`, and `knots` if it is not smooth.
     """
+
+    __repr__ = described
 
     @abc.abstractmethod
     def __call__(self, level: Values) -> Real:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Inexact
 
 from jaxrock._arguments import arguments, list_of, path_of
 from jaxrock._checks import whole
+from jaxrock._described import described
 from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.hazard.curves import HazardCurve
 
@@ -42,6 +43,8 @@ class HazardCurves(eqx.Module):
     - `kinds`: what the files say of each branch, such as "mean", "rlz-000", "quantile-0.5".
     - `names`: of the sites, or empty strings where they have none.
     """
+
+    __repr__ = described
 
     curves: HazardCurve
     longitude: Inexact[Array, " sites"]

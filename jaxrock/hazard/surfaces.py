@@ -26,6 +26,7 @@ from jaxrock._checks import (
     scalar,
     together,
 )
+from jaxrock._described import described
 from jaxrock._parameters import one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
@@ -60,6 +61,8 @@ class SurfaceFragility(eqx.Module):
     - `median` [g] at a ratio of 1 s; `exponent` [-], negative as a rule; `dispersion` [-].
     """
 
+    __repr__ = described
+
     median: Float[Array, ""]
     exponent: Float[Array, ""]
     dispersion: Float[Array, ""]
@@ -92,6 +95,8 @@ class SurfaceFit(eqx.Module):
     - `covariance`: (3, 3) of (ln median, exponent, ln dispersion); of outcomes in clusters, a sandwich.
     - `status`: a `FitStatus`.
     """
+
+    __repr__ = described
 
     fragility: SurfaceFragility
     covariance: Float[Array, "3 3"]
@@ -193,6 +198,8 @@ class SimulatedSurface(eqx.Module):
     - `acceleration`: (rows,) [g]; `ratio`: (columns,) PGV/PGA [s].
     - `verdict`: (pulses, rows, columns, draws) 1 toppled, 0 stood, -1 undecided.
     """
+
+    __repr__ = described
 
     acceleration: Float[Array, " rows"]
     ratio: Float[Array, " columns"]

@@ -3,6 +3,7 @@
 Imports `studies` and `responses`. Start with `likelihood`, then `estimate`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.inverse.block_calibration import (
     BlockCalibration as BlockCalibration,
     CalibrationStatus as CalibrationStatus,
@@ -42,3 +43,7 @@ from jaxrock.inverse.posterior import (
     sample_motion as sample_motion,
 )
 from jaxrock.inverse.unknowns import Unknown as Unknown
+
+
+def __dir__() -> list[str]:
+    return _shown(globals())

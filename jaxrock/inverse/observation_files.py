@@ -27,10 +27,11 @@ import numpy as np
 from jaxrock._arguments import path_of
 from jaxrock._checks import Range, size
 from jaxrock._text import check_end, file_error, text_lines
+from jaxrock._words import meant
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY
-from jaxrock.inverse.observations import SEEN, Observations, called
+from jaxrock.inverse.observations import CALLED, SEEN, Observations, called
 
 EXAMPLE = """\
 # angles in degrees, sizes in metres; _sd: standard deviations; an empty field is not known
@@ -179,7 +180,8 @@ def _rock(fields: dict[str, str]) -> dict:
         return empty, 0.0
 
     if called(fields["observed"]) is None:
-        raise ValueError(f"`observed` must be {', '.join(SEEN)}, but is {fields['observed']!r}.")
+        said = fields["observed"]
+        raise ValueError(f"`observed` must be one of {', '.join(SEEN)}, but is {said!r}.{meant(said, CALLED)}")
     rock: dict[str, Any] = {"name": fields.get("name", ""), "observed": called(fields["observed"])}
     if "width_m" in fields:
         rock |= _rectangle(*(_given(name, get(name, None)) for name in ("width_m", "height_m")))

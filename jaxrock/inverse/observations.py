@@ -11,7 +11,9 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, as_real, checked, put_down, shown
+from jaxrock._described import described
 from jaxrock._label import Label
+from jaxrock._words import meant
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Corners, Housner, PerSide
 from jaxrock.blocks.rigid import Block
@@ -22,7 +24,7 @@ _ALSO = {  # what people write, too
     "toppled": ("fell", "fallen", "falls", "overturned", "overturns", "topples"),
     "rotation": ("rocked", "measured"),
 }
-_CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
+CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
 SURVIVED, TOPPLED, ROTATION = range(3)
 Rocks = Inexact[Array, " rocks"]
 
@@ -36,6 +38,8 @@ class OtherSide(eqx.Module):
     - `ways`: (ways, rocks) signs of the motion that each rock may have felt, all equally likely: one row, or two where
       that is not known of some rocks.
     """
+
+    __repr__ = described
 
     alpha_ratio: Rocks
     radius_ratio: Rocks
@@ -64,6 +68,8 @@ class Observations(eqx.Module):
 
     **Raises:** ValueError for values outside their ranges, or of different lengths.
     """
+
+    __repr__ = described
 
     alpha: Rocks
     p: Rocks
@@ -263,13 +269,14 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
         raise ValueError(f"Argument `seen` must have a word for each of {count} rocks, but is {seen!r}.")
     for word in seen:
         if called(word) is None:
-            raise ValueError(f"Argument `seen` must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.")
+            told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{meant(word, CALLED)}"
+            raise ValueError(f"Argument `seen` {told}")
     return jnp.asarray([SEEN.index(called(word)) for word in seen])
 
 
 def called(word: str) -> str | None:
     """What has been seen of a rock, by the name that it has here; None for a word that is not known."""
-    return _CALLED.get(word.strip().lower()) if isinstance(word, str) else None
+    return CALLED.get(word.strip().lower()) if isinstance(word, str) else None
 
 
 def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import finite, positive, scalar, shown
+from jaxrock._described import described
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
@@ -31,6 +32,8 @@ class Unknown(eqx.Module):
     **Raises:** ValueError for values outside their ranges, and for a prior more than five standard deviations away from
     the range.
     """
+
+    __repr__ = described
 
     low: Real
     high: Real

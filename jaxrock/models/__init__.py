@@ -3,6 +3,7 @@
 Imports `blocks` and `numerics`. Start with `equation`, what every model must tell, then `rigid`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.models.coefficients import (
     Coefficients as Coefficients,
     Terms as Terms,
@@ -15,3 +16,7 @@ from jaxrock.models.rigid import (
 from jaxrock.models.rolling import Rolling as Rolling
 from jaxrock.models.spring import Spring as Spring
 from jaxrock.models.user_equation import Equation as Equation
+
+
+def __dir__() -> list[str]:
+    return _shown(globals())

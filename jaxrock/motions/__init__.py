@@ -4,6 +4,7 @@ Imports `numerics` and `blocks`. Start with `motion`; another pulse is a file in
 one in `files`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.motions import intensity as intensity
 from jaxrock.motions.components import (
     Components as Components,
@@ -49,3 +50,7 @@ from jaxrock.motions.record import (
     Record as Record,
 )
 from jaxrock.motions.suite import Suite as Suite
+
+
+def __dir__() -> list[str]:
+    return _shown(globals(), "intensity")

@@ -12,6 +12,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import finite, scalar, shown
+from jaxrock._described import described
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import read_record
 from jaxrock.motions.files.traces import record_of_trace
@@ -32,6 +33,8 @@ class Components(eqx.Module):
 
     **Raises:** ValueError for components of different time steps, or that say that they began at different times.
     """
+
+    __repr__ = described
 
     first: Record
     second: Record

@@ -21,6 +21,17 @@ from jaxrock.motions.record import Record, with_room
 from jaxrock.motions.straight import Straight, straight
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
+__all__ = [
+    "arias", "average_spectral_acceleration", "cumulative_absolute_velocity", "mean_period",
+    "peak_acceleration", "peak_displacement", "peak_velocity", "significant_duration", "spectral_acceleration",
+    "spectral_velocity", "uplift_ratio", "velocity_ratio", "velocity_to_acceleration",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 _NODES, _WEIGHTS = gauss_legendre(6)
 _PARTS = 256  # of every smooth piece, where there are few
 _FEW = 32

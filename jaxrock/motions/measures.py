@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxrock._checks import shown
+from jaxrock._words import meant
 from jaxrock.motions import intensity
 from jaxrock.motions.files.parsing import NUMBER
 from jaxrock.motions.motion import AbstractMotion
@@ -55,7 +56,8 @@ def measure_of(name: str, value: str | Callable) -> Measure:
     if callable(value) and not isinstance(value, type):
         return Measure(getattr(value, "__name__", type(value).__name__), value)
     words = ", ".join(repr(word) for word in NAMES)
-    raise ValueError(f"Argument `{name}` must be one of {words}, or a function of a motion, but is {shown(value)}.")
+    told = f"must be one of {words}, or a function of a motion, but is {shown(value)}.{meant(value, NAMES)}"
+    raise ValueError(f"Argument `{name}` {told}")
 
 
 def strengths(name: str, measure: Measure, suite: Suite) -> np.ndarray:

@@ -19,6 +19,16 @@ from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.record import Record
 
+__all__ = [
+    "baseline_corrected", "cut", "filtered", "from_displacement", "from_velocity", "fused", "resampled",
+    "scaled", "tapered",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 

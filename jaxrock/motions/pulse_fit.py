@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, at_least, pair, word_of
 from jaxrock._checks import finite, scalar, shown
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
@@ -51,6 +52,8 @@ class PulseFit(eqx.Module):
     - `residual`: the record without the pulse: fit another one to it.
     - `status`: a `PulseStatus`.
     """
+
+    __repr__ = described
 
     pulse: AbstractMotion
     values: dict[str, float]

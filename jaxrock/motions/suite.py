@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, finite, is_traced, shown, watched
+from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
@@ -48,6 +49,8 @@ class Suite(AbstractNamed):
     **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move; for
     components without azimuths, and azimuths without components.
     """
+
+    __repr__ = described
 
     groups: tuple[AbstractMotion, ...]  # each of many motions; of samples that all of it share, there is one set
     names: tuple[str, ...] = eqx.field(static=True)

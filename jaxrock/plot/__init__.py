@@ -3,6 +3,7 @@
 Imports everything but `command_line`. One module for each kind of result; another figure is a function in one of them.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.plot.animations import animate as animate, save_animation as save_animation
 from jaxrock.plot.closed_forms import safety_regions as safety_regions, sine_regions as sine_regions
 from jaxrock.plot.drawings import scene as scene
@@ -14,3 +15,7 @@ from jaxrock.plot.rocks import righting as righting, slenderness as slenderness
 from jaxrock.plot.sensitivities import critical as critical, sensitivity_map as sensitivity_map, tornado as tornado
 from jaxrock.plot.style import broken_curve as broken_curve, log_ticks as log_ticks
 from jaxrock.plot.surfaces import borders as borders, overturning as overturning, spectrum as spectrum
+
+
+def __dir__() -> list[str]:
+    return _shown(globals())

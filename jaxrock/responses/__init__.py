@@ -3,6 +3,7 @@
 Imports `engines` and `flexible`. Start with `outcome`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.flexible.response import (
     FlexibleResponse as FlexibleResponse,
     outcome_flexible as outcome_flexible,
@@ -15,3 +16,7 @@ from jaxrock.responses.contact import (
 )
 from jaxrock.responses.history import Response as Response
 from jaxrock.responses.outcome import Outcome as Outcome
+
+
+def __dir__() -> list[str]:
+    return _shown(globals())

@@ -3,6 +3,7 @@
 Imports `responses` and `sweeps`. Start with `spectra`.
 """
 
+from jaxrock._surface import shown as _shown
 from jaxrock.studies.azimuths import (
     AzimuthOutcomes as AzimuthOutcomes,
     azimuth_outcomes as azimuth_outcomes,
@@ -30,3 +31,7 @@ from jaxrock.studies.spectra import (
     rocking_spectrum as rocking_spectrum,
     self_similar_spectrum as self_similar_spectrum,
 )
+
+
+def __dir__() -> list[str]:
+    return _shown(globals(), "similarity")

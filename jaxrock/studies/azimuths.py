@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, finite, scalar, shown, size
+from jaxrock._described import described
 from jaxrock._parameters import broadcast, check_single, one_of_many
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -36,6 +37,8 @@ class AzimuthOutcomes(eqx.Module):
     - `blocks`: the rock in them, with parameters of shape (azimuths,).
     - `verdict`, `rotation`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
     """
+
+    __repr__ = described
 
     azimuth: Float[np.ndarray, " azimuths"]
     scale: Float[np.ndarray, " scales"]

@@ -15,6 +15,13 @@ from typing import NamedTuple
 
 from jaxrock._checks import one_of
 
+__all__ = ["ORIENTATIONS", "QUANTITIES", "Quantity", "combined", "of_series", "power", "product"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 ORIENTATIONS = ("0", "x", "y", "z")
 
 

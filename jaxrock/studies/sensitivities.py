@@ -7,6 +7,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan, scalar
+from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -34,6 +35,8 @@ class Slopes(eqx.Module):
     - `derivative`: (..., parameters) partial derivatives, in the units of the result over those of the parameters.
     - `elasticity`: (..., parameters) per cent of the result per cent of the parameter, d ln y/d ln x.
     """
+
+    __repr__ = described
 
     value: Scalar
     derivative: Inexact[Array, "... parameters"]

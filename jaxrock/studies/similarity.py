@@ -19,11 +19,19 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import as_real, not_nan, one_of, positive, share, size
+from jaxrock._described import described
 from jaxrock._parameters import declared
 from jaxrock.blocks.rigid import Block
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.history import Response
 from jaxrock.studies import orientations as orientations
+
+__all__ = ["Groups", "Scales", "block", "groups", "groups_of", "master_curve", "motion", "orientations", "scales"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 Real = Inexact[Array, "..."]
 KINDS = ("slender", "rigid")
@@ -38,6 +46,8 @@ class Groups(eqx.Module):
     - `cos_alpha`: None for slender blocks, for which it plays no part.
     - `others`: further parameters of a pulse by their names, times of them times p [-].
     """
+
+    __repr__ = described
 
     frequency_ratio: Real
     strength: Real
@@ -83,6 +93,8 @@ class Scales(eqx.Module):
 
     - `time`: [s]; `rotation`: [rad]; `velocity`: [rad/s].
     """
+
+    __repr__ = described
 
     time: Real
     rotation: Real

@@ -22,6 +22,7 @@ from jaxrock._aside import uninterrupted
 from jaxrock._checks import is_traced
 from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
+from jaxrock._tables import needed
 from jaxrock.sweeps.description import fingerprint
 from jaxrock.sweeps.devices import exchange, meet, process, shared_out
 from jaxrock.sweeps.grid import Grid
@@ -146,6 +147,7 @@ def _keeper(
     version: str | None,
 ) -> Store:
     """The store at a path: made or mended by the first process; a sweep's own, in every process."""
+    needed("zarr")  # said by every process, before the first of them makes anything
     made_by = fingerprint(axes, plan.outer, program, words)
     if version is not None:
         made_by["argument `version`"] = str(version)

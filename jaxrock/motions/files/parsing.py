@@ -36,6 +36,15 @@ def agreed_step(name: str, given: float | None, stated: float) -> float:
     return given
 
 
+def _spelling(written: str) -> str:
+    return re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s")
+
+
+def is_unit(written: str) -> bool:
+    """Whether a word is a unit of acceleration."""
+    return _spelling(written) in _SPELLINGS
+
+
 def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
     """The unit, after a comparison of what the user and the header say (`written`, perhaps nothing)."""
     if not written:
@@ -43,8 +52,7 @@ def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
             told = f"Argument `unit` must be given for file `{name}`, whose header states none, but is None."
             raise ValueError(told)
         return given
-    spelling = re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s")
-    stated = _SPELLINGS.get(spelling)
+    stated = _SPELLINGS.get(_spelling(written))
     if stated is None:
         known = "g, m/s2, cm/s2 or gal"
         raise file_error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")

@@ -1,0 +1,32 @@
+"""Words and options of the command, read by argparse; what is nearly one is named."""
+
+import argparse
+import re
+from typing import NoReturn
+
+from jaxrock._words import meant
+
+
+class Parser(argparse.ArgumentParser):
+    """Argparse's parser, whose errors ask whether the nearest word was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        option = re.search(r"unrecognized arguments: (--[^\s=]+)", message)
+        hint = ""
+        if choice:
+            hint = meant(choice[1], re.findall(r"[\w-]+", choice[2]))
+        elif option:
+            hint = meant(option[1], [word for word in self._option_string_actions if word.startswith("--")])
+        super().error(f"{message}.{hint}" if hint else message)
+
+    def parse_args(self, args=None, namespace=None):  # type: ignore[override]  # of overloads
+        """As argparse's, but what a command does not know is said with the command's own options."""
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            self._of(found.command).error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found
+
+    def _of(self, command: str) -> argparse.ArgumentParser:
+        (commands,) = (each for each in self._actions if isinstance(each, argparse._SubParsersAction))
+        return commands.choices[command]
