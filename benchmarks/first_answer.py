@@ -23,7 +23,7 @@ def spent():
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(u.ru_utime + u.ru_stime for u in used), time.perf_counter()
 begun = spent()
-import jax, numpy as np, jax.numpy as jnp
+import jax, numpy as np, jax.numpy as jnp, equinox
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_enable_x64", True)
 of_jax = spent()
@@ -44,7 +44,7 @@ print(json.dumps(found))
 
 # Question: (the table's words, code, bars cold and warm [s], whether llvmlite is there).
 QUESTIONS = {
-    "import": ("import beyond JAX", "answer = 0", None, 0.3),
+    "import": ("import beyond JAX and Equinox", "answer = 0", None, 0.3),
     "pulse": ("`outcome`, sine pulse", "answer = rk.outcome(block, pulse)", 2.5, 0.4),
     "record": ("`outcome`, record", "answer = rk.outcome(block, 1.5 * rk.example_record())", 2.5, 0.4),
     "simulate": (

@@ -37,19 +37,28 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     if _holds_no_number(value):
         raise _no_number(name, value)
+    usual = jnp.result_type(float)
     try:
         # A number of Python leaves a weak type behind, which would recompile every function it meets; NumPy's do not.
-        array = jnp.asarray(np.asarray(value) if isinstance(value, (float, int)) else value)
+        known = value if isinstance(value, jax.Array) or is_traced(value) else np.array(value)
+        if isinstance(known, np.ndarray) and known.dtype.kind in "fiu":
+            is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
+            return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
+        array = jnp.asarray(known)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise ValueError(f"Argument `{name}` must be real, but is {shown(value)}.")
     if array.dtype == bool:
         raise _no_number(name, value)
-    usual = jnp.result_type(float)
     if not jnp.issubdtype(array.dtype, jnp.floating) or array.dtype.itemsize < usual.itemsize // 2:
-        array = array.astype(usual)  # of integers, and of half precision
+        array = array.astype(usual)
     return jax.lax.convert_element_type(array, array.dtype) if array.weak_type else array
+
+
+def placed(known: Any) -> Any:
+    """Arrays of NumPy, in a tree, as JAX's: as they are, where `jnp.asarray` compiles a program for every shape."""
+    return jax.device_put(known)
 
 
 def _no_number(name: str, value: Any) -> ValueError:

@@ -15,7 +15,7 @@ from jaxrock.flexible.column import Column
 from jaxrock.flexible.nonlinear import NonlinearScene, scene_of
 from jaxrock.flexible.phases import rocking_phase
 from jaxrock.flexible.remainder import Tangents
-from references.flexible_column import PULSE, SHORT, TALL, Chain
+from references.flexible_column import PULSE, SHORT, TALL, Chain, largest_survived
 
 WHOLE = dict(base="sine", rotations="finite", p_delta=True)
 STRONG = rk.SinePulse(5.2974 / 9.81, 1.6)  # Diamantopoulos & Fragiadakis, figure 23
@@ -185,13 +185,7 @@ def by_amplitude():
 @pytest.mark.slow
 def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
     """It passes through zero with a slope, which is its derivative, where the verdict changes."""
-    low, high = 0.7, 0.8
-    for _ in range(10):
-        tried = np.linspace(low, high, 9)
-        lost = np.asarray(by_amplitude(tried)[2].overturned)
-        assert lost[-1] and not lost[0]
-        first = int(np.argmax(lost))
-        low, high = tried[first - 1], tried[first]
+    low = largest_survived(lambda amplitudes: by_amplitude(amplitudes)[2].overturned, 0.7, 0.8)
     away = np.array([-1e-3, -1e-4, -1e-5, 1e-5, 1e-4, 1e-3])
     (_, margin), (_, slope), found = by_amplitude(low * (1 + away))
     np.testing.assert_array_equal(margin < 0, found.overturned)

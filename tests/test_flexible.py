@@ -9,7 +9,7 @@ import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.flexible.closeness import still_to_come
 from jaxrock.flexible.phases import Numbers, locked_phase, rocking_phase
-from references.flexible_column import PULSE, SHORT, TALL, beam, independent
+from references.flexible_column import PULSE, SHORT, TALL, beam, independent, largest_survived
 
 # ---------------------------------------------------------------- the column
 
@@ -267,13 +267,7 @@ def test_the_margin_of_a_rigid_column(by_amplitude):
 @pytest.mark.slow
 def test_the_margin_is_zero_where_a_column_balances(by_amplitude):
     """It passes through zero with a slope, which is its derivative; on either side of every verdict that changes."""
-    low, high = 0.7, 0.8
-    for _ in range(10):
-        tried = np.linspace(low, high, 9)
-        lost = np.asarray(by_amplitude(tried)[2].overturned)
-        assert lost[-1] and not lost[0]
-        first = int(np.argmax(lost))
-        low, high = tried[first - 1], tried[first]
+    low = largest_survived(lambda amplitudes: by_amplitude(amplitudes)[2].overturned, 0.7, 0.8)
     away = np.array([-1e-3, -1e-4, -1e-5, -1e-6, 1e-6, 1e-5, 1e-4, 1e-3, 0.02])
     margin, slope, found = by_amplitude(low * (1 + away))
     np.testing.assert_array_equal(margin < 0, found.overturned)

@@ -1,5 +1,6 @@
 """What is kept between sessions: found again, refused when it is damaged, made anew when anything changed."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -27,6 +28,16 @@ def test_what_is_written_is_read(place):
     folder.write("kind", "name", b"content")
     assert folder.read("kind", "name") == b"content"
     assert [path.name for path in folder.kept()] == ["name"]
+
+
+def test_known_numbers_are_not_compiled(caplog):
+    """A block and a motion of arrays of a length that nobody has had: `jnp.asarray` would compile a program for each."""
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        blocks = rk.Block(np.linspace(0.1, 0.3, 37), 2, np.full(37, 0.9, np.float32))
+        pulses = rk.SinePulse(np.linspace(0.2, 0.4, 37), np.arange(1, 38))
+        assert "Finished XLA" not in caplog.text
+        blocks.alpha[::5] + pulses.amplitude[::5]
+    assert "Finished XLA" in caplog.text  # of what is computed
 
 
 @pytest.mark.parametrize("damage", ["a flipped bit", "cut short", "empty", "longer"])

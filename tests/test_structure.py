@@ -340,7 +340,8 @@ def test_import_draws_nothing_and_configures_nothing():
 
 def test_figures_come_when_they_are_asked_for():
     code = "import sys, jaxrock; before = 'jaxrock.plot' in sys.modules; jaxrock.plot.history; "
-    assert fresh(code + "print(before, 'jaxrock.plot' in sys.modules)") == "False True"
+    code += "print(before, *(name in sys.modules for name in ('jaxrock.plot', 'scipy', 'optax')))"
+    assert fresh(code) == "False True False False"
 
 
 def test_unknown_names_raise():

@@ -1,11 +1,11 @@
 """The command `jaxrock invert`: from a table of rocks to the pulse that they allow, with figures and tables."""
 
 import argparse
+from collections.abc import Iterator
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 import jaxrock as rk
@@ -97,7 +97,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     likelihood = rk.inverse.Likelihood(observations, pulse, scatter, model, lapse=lapse)
     region = rk.inverse.feasible_region(likelihood, axes, fixed)
     wall = None
-    if bool(jnp.any(observations.seen != TOPPLED)):
+    if np.any(np.asarray(observations.seen) != TOPPLED):
         wall = rk.inverse.unexceeded_motion(observations, lambda a, t: pulse(a, t, **fixed), axes[extent], model=model)
     files = _write(arguments.out, observations, estimate, region, wall)
     report.say(_text(observations, estimate, ", with the priors" if priors else ""))
@@ -157,14 +157,15 @@ def _write(
     files = [folder / name for name in ("estimate.csv", "probabilities.csv", "region.csv", "region.png")]
     with files[0].open("w") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
-        for name, value, interval, open_ in zip(estimate.names, estimate.values, estimate.interval, estimate.open):
+        for name, value, interval, open_ in _rows(estimate):
             ends = ",".join(f"{float(x):.6g}" for x in interval)
             flags = ",".join(str(int(x)) for x in open_)
             print(f"{name},{UNITS.get(name, '')},{float(value):.6g},{ends},{flags}", file=file)
     with files[1].open("w") as file:
         shapes = _shapes(observations)
         print(f"name,{','.join(shapes)},observed,probability", file=file)
-        rows = zip(observations.names, zip(*shapes.values()), observations.seen, estimate.probability)
+        known = np.asarray(observations.seen), np.asarray(estimate.probability)
+        rows = zip(observations.names, zip(*shapes.values()), *known)
         for name, shape, seen, probability in rows:
             numbers = ",".join(f"{float(x):.6g}" for x in shape)
             print(f"{_quoted(name)},{numbers},{SEEN[int(seen)]},{float(probability):.4g}", file=file)
@@ -176,12 +177,18 @@ def _write(
         files.append(folder / "unexceeded.csv")
         with files[-1].open("w") as file:
             print("duration_s,amplitude_g,rock,complete", file=file)
-            for duration, amplitude, rock, complete in zip(wall.durations, wall.amplitude, wall.weakest, wall.complete):
+            columns = map(np.asarray, (wall.durations, wall.amplitude, wall.weakest, wall.complete))
+            for duration, amplitude, rock, complete in zip(*columns):
                 name = _quoted(observations.names[int(rock)]) if rock >= 0 else ""
                 print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
     figure: Any = rk.plot.feasible_region(region, estimate, wall).figure
     figure.savefig(files[3], dpi=150)
     return files
+
+
+def _rows(estimate: rk.inverse.Estimate) -> Iterator[tuple]:
+    """Name, value, interval and whether its ends are open, of every parameter."""
+    return zip(estimate.names, *map(np.asarray, (estimate.values, estimate.interval, estimate.open)))
 
 
 def _shapes(observations: rk.inverse.Observations) -> dict[str, np.ndarray]:
@@ -200,11 +207,11 @@ def _quoted(name: str) -> str:
 def _text(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate, more: str) -> str:
     seen = np.asarray(observations.seen)
     lines = [f"{seen.size} rocks: " + ", ".join(f"{int(np.sum(seen == k))} {word}" for k, word in enumerate(SEEN))]
-    unknown = int(np.sum(observations.ways[0] != observations.ways[-1]))
+    ways = np.asarray(observations.ways)
+    unknown = int(np.sum(ways[0] != ways[-1]))
     if unknown:
         lines.append(f"  {unknown} of them may stand either way round in the direction of the shaking")
-    rows = zip(estimate.names, estimate.values, estimate.interval, estimate.open)
-    for name, value, (low, high), (below, above) in rows:
+    for name, value, (low, high), (below, above) in _rows(estimate):
         ends = f"{'<' if below else ''}{float(low):.4g} to {'>' if above else ''}{float(high):.4g}"
         ends = ends if np.isfinite(float(low)) else "no interval"
         lines.append(f"  {name:<10} {float(value):10.4g} {UNITS.get(name, ''):<2}  95 %: {ends}")
@@ -215,10 +222,9 @@ def _text(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate, 
 def _results(observations: rk.inverse.Observations, estimate: rk.inverse.Estimate) -> dict:
     """The same for programs."""
     seen = np.asarray(observations.seen)
-    rows = zip(estimate.names, estimate.values, estimate.interval, estimate.open)
     parameters = {
         name: {"value": value, "unit": UNITS.get(name, ""), "interval_95": interval, "open": open_}
-        for name, value, interval, open_ in rows
+        for name, value, interval, open_ in _rows(estimate)
     }
     return plain({
         "rocks": {word: int(np.sum(seen == k)) for k, word in enumerate(SEEN)},

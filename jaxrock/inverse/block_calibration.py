@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, known, list_of
@@ -341,6 +340,8 @@ def _starts(problem: _Problem) -> list[np.ndarray]:
 
 def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[np.ndarray, bool]:
     """The highest place that is reached from some, within the ranges."""
+    from scipy.optimize import minimize
+
     ends = np.asarray(problem.ends)
 
     def down(place):
@@ -348,7 +349,7 @@ def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[
         return -float(value), -np.asarray(slope)
 
     settings = {"jac": True, "method": "L-BFGS-B", "bounds": ends, "options": {"ftol": 1e-13, "gtol": 1e-7}}
-    found = [scipy.optimize.minimize(down, start, **settings) for start in starts]
+    found = [minimize(down, start, **settings) for start in starts]
     best = min(found, key=lambda each: each.fun)
     return best.x, bool(best.success) or float(np.abs(best.jac).max()) < 1e-3
 

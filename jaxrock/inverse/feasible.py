@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Values, finite, scalar, size
+from jaxrock._checks import Values, finite, placed, scalar, size
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
@@ -72,20 +72,20 @@ def feasible_region(
     if len(over) != 2:
         raise ValueError(f"Argument `over` must name two parameters, but names {len(over)}.")
     lists = {name: axis(f"over[{name!r}]", values, finite) for name, values in over.items()}
-    rows, columns = (x.ravel() for x in jnp.meshgrid(*lists.values(), indexing="ij"))
+    rows, columns = (x.ravel() for x in np.meshgrid(*lists.values(), indexing="ij"))
     rest = {name: scalar(f"fixed[{name!r}]", finite(f"fixed[{name!r}]", x)) for name, x in (fixed or {}).items()}
     likelihood = likelihood.current((*lists, *rest))
     bar, terms = Progress(rows.size, "region", progress), []
     for begin in range(0, rows.size, _LANES):
         parts = (x[begin : begin + _LANES] for x in (rows, columns))
         count = min(_LANES, rows.size - begin)
-        parts = (jnp.pad(x, (0, _LANES - count), mode="edge") for x in parts)
+        parts = (np.pad(x, (0, _LANES - count), mode="edge") for x in parts)
         terms.append(np.asarray(_log_likelihood(likelihood, dict(zip(lists, parts)) | rest))[:count])
         bar.add(count)
-    total = jnp.asarray(np.concatenate(terms)).reshape(*(x.size for x in lists.values()))
+    total = np.concatenate(terms).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
     (first, second), (along, across) = lists, lists.values()
-    return FeasibleRegion((first, second), (along, across), total, total > total.max() + np.log(0.05))
+    return FeasibleRegion((first, second), (along, across), *placed((total, total > total.max() + np.log(0.05))))
 
 
 @eqx.filter_jit
@@ -153,19 +153,19 @@ def unexceeded_motion(
     if standing.size == 0:
         raise ValueError("Argument `observations` must hold a rock that stands.")
     seen = observations.of(standing)
-    ways, count = seen.ways, durations.size
-    blocks = jax.tree.map(lambda x: jnp.tile(jnp.repeat(x, count), len(ways)), seen.blocks)
+    ways, count = np.asarray(seen.ways), durations.size
+    blocks = placed(jax.tree.map(lambda x: np.tile(np.repeat(x, count), len(ways)), seen.blocks))
     critical = critical_amplitudes(
         blocks,
-        jax.vmap(motion)(jnp.repeat(ways.ravel(), count), jnp.tile(durations, ways.size)),
+        jax.vmap(motion)(*placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size)))),
         model,
         intensity=intensity,
         derivatives=False,
         engine=engine,
         progress=progress,
     )
-    by_rock = critical.lowest.reshape(*ways.shape, count).max(axis=0)
+    by_rock = np.asarray(critical.lowest).reshape(*ways.shape, count).max(axis=0)
     amplitude = by_rock.min(axis=0)
-    weakest = jnp.where(jnp.isfinite(amplitude), jnp.asarray(standing)[jnp.argmin(by_rock, axis=0)], -1)
-    complete = critical.complete.reshape(-1, count).all(axis=0)
-    return Unexceeded(durations, amplitude, by_rock, weakest, complete)
+    weakest = np.where(np.isfinite(amplitude), standing[np.argmin(by_rock, axis=0)], -1)
+    complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0)
+    return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))

@@ -104,18 +104,23 @@ class Likelihood(eqx.Module):
         [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has derivatives
         if `slopes`, and is computed faster without. Many motions at once take less time than `jax.vmap` of one.
         """
-        return self._terms(*self._possible(values, slopes))
+        possible, impossible = self._possible(values, slopes)
+        return self._terms(self._log_probabilities(possible), impossible)
 
-    def _terms(self, possible: Possible, impossible: Bool[Array, "..."]) -> Real:
+    def _log_probabilities(self, possible: Possible) -> Real:
+        """Of standing and toppling, and of standing as it was measured; without the possibility of a lapse."""
         seen = self.observations
         variance = possible.rotation_width**2 + seen.rotation_sd**2
         density = -((seen.rotation - possible.rotation) ** 2) / (2 * variance) - jnp.log(2 * jnp.pi * variance) / 2
         # Of a rotation in a scene that was not computed nothing is known.
         density = jnp.where(possible.known, density, _FLAT)
         ends = jnp.full_like(density[:1], _FLAT)
-        density = jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0)
-        stands, topples = possible.log_probability(True, density), possible.log_probability(False)
-        terms = jnp.where(seen.seen == TOPPLED, topples, stands)
+        return possible.log_probabilities(jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0))
+
+    def _terms(self, logarithms: Real, impossible: Bool[Array, "..."]) -> Real:
+        seen = self.observations
+        _, topples, measured = logarithms
+        terms = jnp.where(seen.seen == TOPPLED, topples, measured)
         terms = self._or_lapse(terms, jnp.where(seen.seen == ROTATION, _FLAT, 0.0))
         return jnp.where(impossible[..., None], -jnp.inf, terms)
 
@@ -125,7 +130,7 @@ class Likelihood(eqx.Module):
 
     def survival(self, values: Mapping[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks), without derivatives."""
-        return jnp.exp(self._possible(values)[0].log_probability(True))
+        return jnp.exp(self._possible(values)[0].log_probabilities()[0])
 
     def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
         """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
@@ -133,19 +138,20 @@ class Likelihood(eqx.Module):
         The badness is minus the log-probability; for a measured rotation half its squared distance from what is
         expected, in standard deviations, and minus the log-probability that it stands. Without derivatives.
         """
-        return self._surprise(self._possible(values)[0])
+        possible = self._possible(values)[0]
+        return self._surprise(possible, possible.log_probabilities())
 
     def terms_and_facts(self, values: Mapping[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
         """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
         of the first."""
         possible, impossible = self._possible(values, slopes=True)
-        stands = jnp.exp(possible.log_probability(True))
-        return self._terms(possible, impossible), (stands, possible.share_known, *self._surprise(possible))
+        logarithms = self._log_probabilities(possible)
+        facts = jnp.exp(logarithms[0]), possible.share_known, *self._surprise(possible, logarithms)
+        return self._terms(logarithms, impossible), facts
 
-    def _surprise(self, possible: Possible) -> tuple[Real, Real, Real]:
+    def _surprise(self, possible: Possible, logarithms: Real) -> tuple[Real, Real, Real]:
         seen = self.observations
-        both = (self._or_lapse(possible.log_probability(which)) for which in (True, False))
-        stands, topples = (jnp.maximum(x, -1e3) for x in both)
+        stands, topples = jnp.maximum(self._or_lapse(logarithms[:2]), -1e3)
         share, lost = jnp.exp(stands), jnp.exp(topples)
         badness = jnp.where(seen.seen == TOPPLED, -topples, -stands)
         mean, variance = -(share * stands + lost * topples), share * lost * (stands - topples) ** 2

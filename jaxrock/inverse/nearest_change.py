@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
-from scipy.optimize import nnls
 
 from jaxrock._parameters import one_of_many, shared
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -176,6 +175,8 @@ def least_change(slopes: np.ndarray, bound: np.ndarray) -> np.ndarray | None:
 
     **Source:** Lawson & Hanson (1974), 23.4: least distance programming.
     """
+    from scipy.optimize import nnls
+
     scale = np.linalg.norm(slopes, axis=1)
     if not (scale > 0).all():
         return None

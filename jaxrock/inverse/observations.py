@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, as_real, checked, put_down, shown
+from jaxrock._checks import Values, as_real, checked, is_traced, placed, put_down, shown
 from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
@@ -27,6 +27,7 @@ _ALSO = {  # what people write, too
 CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
 SURVIVED, TOPPLED, ROTATION = range(3)
 Rocks = Inexact[Array, " rocks"]
+Real = Inexact[Array, "..."]
 
 
 class OtherSide(eqx.Module):
@@ -106,15 +107,15 @@ class Observations(eqx.Module):
         count = alpha.size
         self.seen = _words(seen, count)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
-        self.follows, self.other = jnp.isnan(restitution), other
-        given = checked("restitution", jnp.where(self.follows, 0.5, restitution), "be in [0, 1]", _in_share)
+        self.follows, self.other = _where(restitution != restitution, True, False), other
+        given = checked("restitution", _where(self.follows, 0.5, restitution), "be in [0, 1]", _in_share)
         block = Block(alpha, _list("p", p, count), given)
         self.alpha, self.p = block.alpha, block.p
         if other is None:
             own = np.asarray(alpha)[np.asarray(self.follows)]
             if own.size:
                 Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
-        self.restitution = jnp.where(self.follows, self.by_momentum(self.alpha), given)
+        self.restitution = _where(self.follows, self.by_momentum(self.alpha), given)
         deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
         self.alpha_sd, self.p_sd, self.restitution_sd = (
             checked(name, _list(name, value, count), "be 0 or more and finite", lambda x: (x >= 0) & (x < np.inf))
@@ -198,22 +199,12 @@ class Observations(eqx.Module):
 
     def by_momentum(self, alpha: Inexact[Array, "*shape rocks"]) -> Inexact[Array, "*shape rocks"]:
         """Restitution by angular momentum: Housner's, or the root of the product of both."""
-        if self.other is None:
-            return Housner().ratio(Corners(alpha, alpha, self.p), jnp.zeros_like(alpha))
-        block = self.blocks_at(alpha, self.p, None)
-        assert isinstance(block, AsymmetricBlock)
-        return jnp.sqrt(block.restitution1 * block.restitution2)
+        return _by_momentum(self.other, alpha, self.p)
 
     def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
         """The rocks, were these their values on side 1, (..., rocks): one block of arrays; they are not checked."""
         with put_down():
-            if self.other is None:
-                return Block(alpha, p, restitution)
-            root, there = jnp.sqrt(self.other.restitution_ratio), self.other
-            pair = None if restitution is None else (restitution * root, restitution / root)
-            values = (alpha, there.alpha_ratio * alpha, p, there.inertia_ratio, there.radius_ratio)
-            alpha1, alpha2, p1, inertia, radii = (jnp.broadcast_to(x, jnp.shape(alpha)) for x in values)
-            return AsymmetricBlock(alpha1, alpha2, p1, inertia, radii, pair)
+            return Block(alpha, p, restitution) if self.other is None else _two_sided(self.other, alpha, p, restitution)
 
     @property
     def blocks(self) -> Block | AsymmetricBlock:
@@ -227,11 +218,36 @@ class Observations(eqx.Module):
             name: getattr(self, name)[index]
             for name in ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
         }
-        restitution = jnp.where(self.follows, jnp.nan, self.restitution)[index]
+        restitution = _where(self.follows, np.nan, self.restitution)[index]
         words = [SEEN[k] for k in np.asarray(self.seen)[index]]
         names = [self.names[i] for i in index]
         other = jax.tree.map(lambda x: x[..., index], self.other)
         return Observations(self.alpha[index], self.p[index], words, restitution, **known, names=names, other=other)
+
+
+def _two_sided(other: OtherSide, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> AsymmetricBlock:
+    root = jnp.sqrt(other.restitution_ratio)
+    pair = None if restitution is None else (restitution * root, restitution / root)
+    values = (alpha, other.alpha_ratio * alpha, p, other.inertia_ratio, other.radius_ratio)
+    alpha1, alpha2, p1, inertia, radii = (jnp.broadcast_to(x, jnp.shape(alpha)) for x in values)
+    return AsymmetricBlock(alpha1, alpha2, p1, inertia, radii, pair)
+
+
+@eqx.filter_jit
+def _by_momentum(other: OtherSide | None, alpha: Real, p: Rocks) -> Real:
+    """Compiled as one: outside of other programs every operation would be one of its own."""
+    if other is None:
+        return Housner().ratio(Corners(alpha, alpha, p), jnp.zeros_like(alpha))
+    with put_down():
+        block = _two_sided(other, alpha, p, None)
+    return jnp.sqrt(block.restitution1 * block.restitution2)
+
+
+def _where(which: ArrayLike, this: ArrayLike, that: ArrayLike) -> Array:
+    """`jnp.where`; by NumPy where all is known, for which nothing is compiled."""
+    if is_traced((which, this, that)):
+        return jnp.where(which, this, that)
+    return placed(np.where(which, this, that))
 
 
 def _chosen(which: ArrayLike, count: int) -> np.ndarray:
@@ -261,7 +277,7 @@ def _list(name: str, value: Values, count: int) -> Rocks:
     array = as_real(name, value)
     if array.shape not in ((), (count,)):
         raise ValueError(f"Argument `{name}` must have a value for each of {count} rocks, but has shape {array.shape}.")
-    return jnp.broadcast_to(array, (count,))
+    return array if array.ndim else placed(np.full(count, array))
 
 
 def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
@@ -271,7 +287,7 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
         if called(word) is None:
             told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{meant(word, CALLED)}"
             raise ValueError(f"Argument `seen` {told}")
-    return jnp.asarray([SEEN.index(called(word)) for word in seen])
+    return placed(np.array([SEEN.index(called(word)) for word in seen]))
 
 
 def called(word: str) -> str | None:
@@ -284,4 +300,4 @@ def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
     if value is None and measured.any():
         raise ValueError(f'Argument `{name}` must be given where `seen` is "rotation".')
     array = _list(name, 1.0 if value is None else value, measured.size)
-    return checked(name, jnp.where(measured, array, 1.0), "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
+    return checked(name, _where(measured, array, 1.0), "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))

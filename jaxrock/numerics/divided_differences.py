@@ -45,13 +45,14 @@ def _difference(*nodes: Array) -> Array:
 
 @functools.partial(_difference.defjvp, symbolic_zeros=True)
 def _difference_jvp(nodes, tangents):
-    # A derivative with respect to a node repeats it: no formula is differentiated, so none loses digits.
-    value = _difference(*nodes)
-    total = jnp.zeros_like(value)
-    for node, tangent in zip(nodes, tangents):
-        if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
-            total += tangent * _difference(*nodes, node)
-    return value, total
+    # A derivative with respect to a node repeats it: no formula is differentiated, so none loses digits. All of them
+    # side by side are one formula of small arrays, and not one each.
+    value, nodes = _difference(*nodes), jnp.broadcast_arrays(*nodes)
+    moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, jax.custom_derivatives.SymbolicZero)]
+    if not moving:
+        return value, jnp.zeros_like(value)
+    changes = jnp.stack([jnp.broadcast_to(tangents[i], value.shape) for i in moving])
+    return value, jnp.sum(changes * _difference(*nodes, jnp.stack([nodes[i] for i in moving])), axis=0)
 
 
 def _sorted(nodes: tuple[Array, ...]) -> list[Array]:

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 
 _MOST_STEPS, _FEW_STEPS = 100, 12  # of the last window, and of one on the way; one that is refused counts
@@ -113,6 +112,7 @@ def _inside(problem: Problem, points: np.ndarray, steps: np.ndarray) -> np.ndarr
 
 def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, most: int, enough: float) -> End:
     """The minimum that SciPy finds from one start in a window. `hold`: by how much it is held where it began."""
+    from scipy.optimize import least_squares
 
     @functools.lru_cache(maxsize=2)  # residuals and derivatives come together and are asked for apart
     def at(place: tuple[float, ...]):
@@ -132,7 +132,7 @@ def _descend(problem: Problem, begun: np.ndarray, samples: int, hold: float, mos
     if not has_result or not np.any(first @ first_slopes):
         return End(begun, first, first_slopes, has_result)  # given up, or there is nowhere to go
     bounds = problem.lower, problem.upper
-    found = scipy.optimize.least_squares(
+    found = least_squares(
         residuals, begun, slopes, bounds, x_scale=problem.scale, ftol=enough, xtol=_STILL, gtol=None, max_nfev=most
     )
     left, last_slopes = at(tuple(found.x))

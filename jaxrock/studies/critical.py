@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import is_traced, ratio, scalar, watched
+from jaxrock._checks import is_traced, placed, ratio, scalar, watched
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -31,7 +31,7 @@ from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.lowest_ends import lowest_ends
 from jaxrock.studies.parameters import named
 from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, on_border
-from jaxrock.sweeps.sweep import surface
+from jaxrock.sweeps.sweep import known_surface, surface
 
 _FIRST = 256  # intervals of the first sampling
 _LEAST = 1e-12  # [g]; amplitudes are factors on a motion
@@ -181,17 +181,24 @@ class _Scenes(eqx.Module):
         size = shape[0] if shape else 1
         both = broadcast(both, (size,))
 
-        def facts(index):
-            block, motion = one_of_many(both, index)
-            return uplift_threshold(block, model), peak_bound(motion), jnp.abs(named(block, motion)["amplitude"])
-
-        threshold, peak, amplitude = jax.vmap(facts)(jnp.arange(size))
+        threshold, peak, amplitude = _facts(both, model, size)
         message = "Argument `motion` must move the ground"
         if is_traced(peak):
             peak = watched(peak, message, ~(peak > _LEAST).all())
         elif not (peak > _LEAST).all():
             raise ValueError(f"{message}, but its peak is {peak.min():g} g.")
         return cls(both, threshold, peak, amplitude, single=not shape)
+
+
+@eqx.filter_jit
+def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array]:
+    """Threshold, peak and amplitude of so many scenes."""
+
+    def one(index):
+        block, motion = one_of_many(both, index)
+        return uplift_threshold(block, model), peak_bound(motion), jnp.abs(named(block, motion)["amplitude"])
+
+    return jax.vmap(one)(jnp.arange(size))
 
 
 # Of many scenes: what is asked of one point.
@@ -244,10 +251,10 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
     """Search, find, differentiate, and sort by scenes."""
 
     def run(function, z, index):
-        return surface(function, (z, index), (kind, scenes.both), "critical", progress, outer=False)
+        return known_surface(function, (z, index), (kind, scenes.both), "critical", progress, outer=False)
 
     def at(z, index):
-        return tuple(map(np.asarray, run(_at, z, index)))
+        return run(_at, z, index)
 
     brackets, complete = brackets_of(at, np.asarray(grid))
     ends = roots_of(at, brackets)
@@ -262,7 +269,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
         derivative = np.zeros((0, len(names)))
         if order.size:
             slopes = run(_slopes, ends["safe"], ends["index"])
-            derivative = np.stack([np.asarray(slopes[name]) for name in names], axis=-1) * value[:, None]
+            derivative = np.stack([slopes[name] for name in names], axis=-1) * value[:, None]
         rows["derivative"] = np.where(ends["balanced"][:, None], derivative, np.nan)
     count = np.bincount(ends["index"], minlength=grid.shape[0])
     place = np.arange(order.size) - np.repeat(np.cumsum(count) - count, count)
@@ -270,10 +277,10 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
     def filled(name, values):
         table = np.full((grid.shape[0], int(count.max(initial=0)), *values.shape[1:]), _REST[name], values.dtype)
         table[ends["index"], place] = values
-        return jnp.asarray(table)
+        return table
 
     told = {name: filled(name, values) for name, values in rows.items()}
-    return told | {"count": jnp.asarray(count), "complete": jnp.asarray(complete)}
+    return placed(told | {"count": count, "complete": complete})
 
 
 class _Wanted(eqx.Module):

@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
-from jaxrock._checks import is_traced
+from jaxrock._checks import is_traced, placed
 from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
 from jaxrock._tables import needed
@@ -212,9 +212,15 @@ def surface(
     """
     if is_traced((axes, scene)):
         return _traced_surface(function, tuple(map(jnp.asarray, axes)), scene, outer)
+    return placed(known_surface(function, axes, scene, label, progress, outer, columns))
+
+
+def known_surface(
+    function: Callable, axes: tuple, scene, label: str, progress: bool | None, outer: bool = True, columns: bool = False
+):
+    """The same where nothing is traced: arrays of NumPy."""
     plan = Plan.of(tuple(np.asarray(values) for values in axes), outer)
-    results = compute(function, plan, scene, label, progress, columns=columns)[0]
-    return jax.tree.map(jnp.asarray, results)
+    return compute(function, plan, scene, label, progress, columns=columns)[0]
 
 
 def _traced_surface(function: Callable, axes: tuple, scene, outer: bool):
