@@ -31,7 +31,7 @@ def test_what_is_written_is_read(place):
 
 
 def test_known_numbers_are_not_compiled(caplog):
-    """A block and a motion of arrays of a length that nobody has had: `jnp.asarray` would compile a program for each."""
+    """Arrays of a length that nobody has had: `jnp.asarray` would compile a program for each."""
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         blocks = rk.Block(np.linspace(0.1, 0.3, 37), 2, np.full(37, 0.9, np.float32))
         pulses = rk.SinePulse(np.linspace(0.2, 0.4, 37), np.arange(1, 38))
