@@ -36,6 +36,9 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
 def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     if _holds_no_number(value):
         raise _no_number(name, value)
+    if isinstance(value, np.ndarray) and value.ndim and value.dtype in (np.float32, np.float64):
+        # `jnp.asarray` would compile a program for every shape; the copy is so that nobody changes it afterwards.
+        return jax.device_put(np.array(value))
     try:
         # A number of Python leaves a weak type behind, which would recompile every function it meets; NumPy's do not.
         array = jnp.asarray(np.asarray(value) if isinstance(value, (float, int)) else value)
