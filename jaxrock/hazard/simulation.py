@@ -144,8 +144,8 @@ class SimulatedFragility(AbstractTable):
         - `confidence`: in (0, 1).
 
         **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, or of one motion only.
-        They take the capacities under motions as lognormal, as the fit does. Of 2,000 made suites of 5, 10, 20 and 40
-        motions, intervals of 95 % held the truth as benchmarks/few_motions.md says.
+        They take the capacities under motions as lognormal, as the fit does. How often intervals of 95 % held the truth
+        of made suites of 5 to 40 motions stands in benchmarks/few_motions.md.
 
         **Raises:** ValueError if a bound is needed, or for a confidence outside its range.
 
