@@ -61,8 +61,8 @@ def fragility_intervals(
 
     **Returns:** a `FragilityIntervals`, always with ends: of the profile of the likelihood with Jeffreys' penalty.
     How often intervals of 95 % held the truth of made samples of 5 to 40 outcomes stands in benchmarks/few_motions.md;
-    of 5 and 10 they are rather too wide than too narrow. The most probable fragility itself is that of `fit_fragility`. For
-    a suite at many levels, whose outcomes are not independent, `SimulatedFragility.intervals`.
+    of 5 and 10 they are rather too wide than too narrow. The most probable fragility itself is that of `fit_fragility`.
+    For a suite at many levels, whose outcomes are not independent, there is `SimulatedFragility.intervals`.
 
     **Raises:** ValueError for arguments outside their ranges, or of other shapes.
 
