@@ -75,7 +75,8 @@ def fragility_intervals(
     logarithms = np.log(levels[tried])
     if np.unique(np.round(logarithms, 9)).size < 2:
         # One level tells how many topple there, and nothing of how that changes.
-        return FragilityIntervals(confidence, *map(jnp.asarray, ([0.0, np.inf], [0.0, np.inf])), FitStatus.successful)
+        anything = jnp.array([0.0, jnp.inf])
+        return FragilityIntervals(confidence, anything, anything, FitStatus.successful)
     centre, spread = logarithms.mean(), logarithms.std()
     height = _Height((logarithms - centre) / spread, toppled[tried], survived[tried])
     median, slope = _ends(height, chdtri(1, 1 - confidence) / 2)
