@@ -382,6 +382,11 @@ CALLS: dict[str, Call] = {
         {"levels": [0.1, 0.2, 0.3, 0.4], "toppled": [0, 2, 1, 3], "trials": 3},
         may_be="lowest_toppled",
     ),
+    "fragility_intervals": Call(
+        rk.hazard.fragility_intervals,
+        {"levels": [0.1, 0.2, 0.3, 0.4], "toppled": [0, 2, 1, 3], "trials": 3, "confidence": 0.9},
+        may_be="median|dispersion",
+    ),
     "HazardCurve": Call(rk.hazard.HazardCurve, {"levels": LEVELS, "rates": RATES, "measure": "PGA"}, may_be="rates"),
     "HazardCurve.from_probabilities": Call(
         rk.hazard.HazardCurve.from_probabilities,
@@ -718,7 +723,7 @@ NOT_CALLED = {
     "OverturningMap", "Posterior", "PosteriorStatus", "RecordStatus", "Response", "Sensitivity", "SensitivityMap",
     "SimulatedFragility", "SimulatedSurface", "Spectrum", "Status", "SurfaceFit", "SurfaceFragility", "Terms",
     "Unexceeded", "example_record", "keep_compiled", "closed_form", "restitution", "similarity", "plot",
-    "Borders", "Region", "overturning_borders", "WeakPlane",
+    "FragilityIntervals", "Slopes", "SlopeStatus", "Borders", "Region", "overturning_borders", "WeakPlane",
     "Origin", "AzimuthOutcomes", "PulseFit", "PulseStatus", "ResponseSpectra",
 }  # fmt: skip
 

@@ -160,6 +160,7 @@ def test_fragility(command, at2, column, tmp_path):
         (status == 0) == (fit.status == rk.hazard.FitStatus.successful) == (tmp_path / "out" / "fragility.xml").exists()
     )
     assert status == 0 and f"{float(fit.fragility.median):.4f}" in table["median PGA"]
+    assert " to ".join(f"{end:.3f}" for end in found.intervals().dispersion) == table["95 % interval of the dispersion"]
 
 
 def test_spectrum(command, column, tmp_path):

@@ -282,6 +282,8 @@ def test_an_overturned_block_has_no_peak_to_differentiate():
     found = rk.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.5, 1.4))
     assert bool(found.outcome.overturned) and not bool(found.valid)
     assert np.all(np.isnan(found.max_rotation.elasticity)) and np.all(np.isfinite(found.margin.derivative))
+    assert found.max_rotation.status == rk.studies.SlopeStatus.missing and np.isnan(found.max_rotation.reach)
+    assert found.margin.status == rk.studies.SlopeStatus.useful
 
 
 def test_a_planted_graze():
@@ -363,6 +365,51 @@ def test_distances_tell_how_far_is_too_far():
     assert 0 < float(found.boundary_distance) < 0.05
     assert abs(float(there.margin)) < 0.1 * float(found.margin.value)
     assert float(found.condition) > 1 and float(found.graze_distance) > 0
+
+
+def a_minute_of_shaking():
+    """Thirty sines of random frequencies and phases, 0.2 g at their largest."""
+    time, random = np.arange(0, 60, 0.02), np.random.default_rng(3)
+    angle = 2 * np.pi * random.uniform(0.3, 3, (30, 1)) * time + random.uniform(0, 2 * np.pi, (30, 1))
+    acceleration = np.sin(angle).sum(axis=0)
+    return rk.Record(0.2 * acceleration / np.abs(acceleration).max(), 0.02)
+
+
+USES = {
+    "a pulse": (rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.2465, 1.4), "useful"),
+    "a minute of shaking": (rk.Block(0.12, 1.2608695652173914, 0.95), a_minute_of_shaking(), "useless"),
+}
+
+
+@pytest.mark.parametrize("case", USES)
+def test_whether_a_slope_can_be_followed(case):
+    """Steps along the steepest way: a thousandth of the reach does what the slopes say, within a hundredth of it; and
+    where they are useless, steps of 1e-6 do something else altogether."""
+    block, motion, status = USES[case]
+    found = rk.sensitivity(block, motion)
+    assert found.outcome.status == rk.Status.successful and not bool(found.outcome.overturned)
+    assert found.margin.status == getattr(rk.studies.SlopeStatus, status)
+    way = np.asarray(found.margin.elasticity)[:-1]
+    way = way / np.linalg.norm(way)
+    here, reach = float(found.margin.value), float(found.margin.reach)
+    assert reach == pytest.approx(1 / (here * np.linalg.norm(np.asarray(found.margin.elasticity)[:-1])), rel=1e-9)
+
+    def margin(step):
+        values = dict(zip(found.names, np.asarray(found.values)[:-1] * (1 + step * way)))
+        block = rk.Block(values["alpha"], values["p"], values["restitution"])
+        if case == "a pulse":
+            return float(rk.outcome(block, rk.SinePulse(values["amplitude"], values["period"])).margin)
+        factor = values["amplitude"] / float(found.values[found.names.index("amplitude")])
+        return float(rk.outcome(block, factor * motion).margin)
+
+    if status == "useful":
+        assert 0.01 < reach < 1
+        assert margin(1e-3 * reach) - here == pytest.approx(1e-3, rel=1e-2)
+    else:
+        assert reach < 1e-10
+        foretold = 1e-6 / reach
+        assert foretold > 1e3 and abs(margin(1e-6) - here) < 3
+        assert "blocks with scatter" in rk.studies.SlopeStatus[found.margin.status]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import jaxrock as rk
 from jaxrock.closed_form import sine_pulse, single_lobe
 from jaxrock.motions.pulses import PULSES, UNITS
 from jaxrock.studies.saved_outcomes import an_outcome
-from jaxrock.studies.sensitivities import Slopes
+from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +22,7 @@ def sensitivity_of(elasticity):
     """A sensitivity with these elasticities by two parameters."""
     elasticity = jnp.asarray(elasticity)
     number = elasticity[..., 0]
-    slopes = Slopes(number, elasticity, elasticity)
+    slopes = Slopes(number, elasticity, elasticity, number, SlopeStatus.useful)
     good = jnp.ones_like(number, bool)
     return rk.studies.Sensitivity(
         ("alpha", "amplitude"), elasticity, slopes, slopes, slopes, an_outcome(), good, number, number, number

@@ -75,6 +75,11 @@ def test_knet_takes_the_offset_off(file, name):
         (KNET.replace("3920", "39200"), "a.NS", "line 9 states a peak of"),
         (KNET.replace("100Hz", "0Hz"), "a.NS", "must state a positive frequency"),
         ("RESPONSE AND FOURIER AMPLITUDE SPECTRA\n 1 2 3\n", "a.V3", r"holds response spectra \(V3\)"),
+        (
+            "Response spectra  (Format v01.20 with 13 text lines)\n 1 2 3\n",
+            "a.V3c",
+            r"holds response spectra \(COSMOS V3\)",
+        ),
         (V1.replace(" 23 Acc", " 22 Acc"), "a.V1", "announces 22 samples, but 23 follow"),
         (V1.replace("units of g .", "units of g/10"), "a.V1", "line 12 states a peak of 0.[0-9]+ g, but the largest"),
         (V1.replace("units of g .", "units of counts ."), "a.V1", "line 28 states the unit 'counts'"),
@@ -185,6 +190,7 @@ def block_of(share):
         (V3.replace("     0.200     0.500", "     0.300     0.500"), "its pseudo-velocity at 0.3 s is not that of"),
         (V3.replace(" 9.804E-02", " 9.80XE-02"), "should hold samples, but is"),
         (V1, "no line begins with 'Response and Fourier amplitude spectra'"),
+        ("Response spectra  (Format v01.20 with 13 text lines)\n 1 2 3\n", "is a V3 file of COSMOS"),
     ],
 )
 def test_spectra_that_are_refused(file, text, message):

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
+import scipy.stats
 from scipy.special import ndtr
 
 import jaxrock as rk
@@ -155,6 +157,84 @@ def test_fits_of_stripes_and_their_errors():
     rows = found.table()
     same = rk.hazard.fit_fragility(rows["level"], rows["toppled"], rows["trials"])
     np.testing.assert_allclose(same.fragility.dispersion, independent.fragility.dispersion, rtol=1e-9)
+
+
+def test_intervals_of_one_block_are_those_of_a_sample():
+    """Many fine levels show every capacity: Student's t and chi-squared of their logarithms, by SciPy."""
+    levels = np.geomspace(0.05, 3.0, 400)
+    capacity = np.log(0.4) + 0.35 * np.random.default_rng(5).normal(size=6)
+    found = table((levels > np.exp(capacity)[:, None])[:, :, None], levels).intervals(confidence=0.9)
+    sample = scipy.stats.t.interval(0.9, 5, capacity.mean(), scipy.stats.sem(capacity))
+    np.testing.assert_allclose(np.log(found.median), sample, atol=0.015)
+    scatter = capacity.std(ddof=1) * np.sqrt(5 / scipy.stats.chi2(5).ppf([0.95, 0.05]))
+    np.testing.assert_allclose(found.dispersion, scatter, rtol=0.05)
+
+
+def test_intervals_that_cannot_be_told():
+    for verdict, status in (([[[0], [1]]], "separable"), ([[[0], [1]], [[1], [0]]], "not_growing")):
+        found = table(verdict).intervals()
+        assert found.status == getattr(rk.hazard.FitStatus, status)
+        assert np.isnan(found.median).all() and np.isnan(found.dispersion).all()
+
+
+def test_intervals_hold_for_few_motions():
+    """Of 300 suites of 10: standard errors hold the dispersion's truth far less often."""
+    fits = [(found.fit(), found.intervals()) for found in (stripes(seed, 10) for seed in range(300))]
+    off = [np.abs(np.log(f.fragility.dispersion / 0.35)) / np.sqrt(f.covariance[1, 1]) for f, _ in fits]
+    assert np.mean(np.array(off) < 1.96) < 0.85
+    for name, truth in (("median", 0.4), ("dispersion", 0.35)):
+        low, high = np.array([getattr(intervals, name) for _, intervals in fits]).T
+        assert 0.91 < np.mean((low < truth) & (truth < high)) < 0.985
+
+
+INDEPENDENT = {
+    "overlap": ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], [0, 0, 1, 0, 1, 0, 1, 1], 1),
+    "counts": ([0.2, 0.3, 0.45, 0.6], [1, 4, 9, 11], 12),
+    "parted": ([0.2, 0.3, 0.45, 0.6], [0, 0, 12, 12], 12),
+}
+
+
+@pytest.mark.parametrize("case", INDEPENDENT)
+def test_ends_of_independent_outcomes(case):
+    """At every finite end the profile is 1.92 below the top, by a search over a fine grid."""
+    levels, toppled, trials = INDEPENDENT[case]
+    found = rk.hazard.fragility_intervals(levels, toppled, trials)
+    x, k = np.log(levels), np.array(toppled, float)
+
+    def heights(slope, median):
+        z = slope[..., None] * (x - median[..., None])
+        above, below = scipy.special.log_ndtr(z), scipy.special.log_ndtr(-z)
+        weights = trials * np.exp(-(z**2) - above - below)
+        sums = [np.sum(weights * x**power, axis=-1) for power in range(3)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            penalty = np.log(sums[0] * sums[2] - sums[1] ** 2) / 2
+        return above @ k + below @ (trials - k) + np.nan_to_num(penalty, nan=-np.inf)
+
+    slopes, medians = np.exp(np.linspace(-9, 6, 601)), np.linspace(-6, 4, 801)
+    top, ends = heights(*np.meshgrid(slopes, medians)).max(), 0
+    if case == "parted":  # any median in the gap, whatever the penalty says
+        np.testing.assert_allclose(found.median, [0.3, 0.45])
+    for end in np.asarray(found.median):
+        if np.isfinite(end) and end > 0 and case != "parted":
+            assert top - heights(slopes, np.full(601, np.log(end))).max() == pytest.approx(1.9207, abs=5e-3)
+            ends += 1
+    for end in np.asarray(found.dispersion):
+        if np.isfinite(end) and end > 0:
+            assert top - heights(np.full(801, 1 / end), medians).max() == pytest.approx(1.9207, abs=5e-3)
+            ends += 1
+    assert ends == {"overlap": 1, "counts": 4, "parted": 1}[case]
+
+
+def test_what_can_be_parted_leaves_the_gap_open():
+    """A thousand of each: any dispersion down to none, any median in the gap, and hardly another."""
+    found = rk.hazard.fragility_intervals([0.3, 0.45], [0, 1000], 1000)
+    assert found.dispersion[0] == 0 and 0.05 < found.dispersion[1] < 0.1
+    np.testing.assert_allclose(found.median, [0.3, 0.45])
+
+
+def test_one_level_says_nothing_of_the_slope():
+    found = rk.hazard.fragility_intervals([0.3, 0.3], [1, 0])
+    np.testing.assert_array_equal([found.median, found.dispersion], [[0, np.inf]] * 2)
 
 
 def test_fit_of_a_surface():

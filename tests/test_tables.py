@@ -7,7 +7,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock._tables import AbstractTable, items_of
-from jaxrock.studies.sensitivities import Slopes
+from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 
 pytest.importorskip("xarray")
 pytest.importorskip("pandas")
@@ -25,7 +25,7 @@ def made(kind, **fields):
     return result
 
 
-_SLOPES = made(Slopes, value=ONE, derivative=jnp.ones(2), elasticity=jnp.ones(2))
+_SLOPES = made(Slopes, value=ONE, derivative=jnp.ones(2), elasticity=jnp.ones(2), reach=ONE, status=SlopeStatus.useful)
 SENSITIVITY = made(
     rk.studies.Sensitivity, names=("alpha", "p"), values=jnp.array([0.2, 2.5]), max_rotation=_SLOPES,
     max_velocity=_SLOPES, margin=_SLOPES, valid=ONE, condition=ONE, graze_distance=ONE, boundary_distance=ONE,
@@ -55,6 +55,7 @@ TABLES = {
         rising=jnp.ones((1, 2)), impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
         complete=jnp.array([True]), names=("alpha",),
     ),
+    "fragility intervals": rk.hazard.fragility_intervals([0.2, 0.3, 0.4, 0.5], [0, 1, 0, 1]),
     "estimate": made(
         rk.inverse.Estimate, names=("amplitude", "period"), values=jnp.array([0.3, 0.8]), interval=jnp.ones((2, 2)),
         open=jnp.zeros((2, 2), bool), log_likelihood=ONE, surprise=ONE, scatter=ONE,

@@ -70,6 +70,11 @@ def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
             Entry(f"dispersion{key}", f"dispersion{words}", float(fit.fragility.dispersion), ".4f"),
             Entry(f"standard_errors{key}", f"{said}{words}", errors, shown=f"{errors[0]:.3f}, {errors[1]:.3f}"),
         ]
+        intervals = found.intervals(bound)
+        for name, ends in (("median", intervals.median), ("dispersion", intervals.dispersion)):
+            if intervals.status == rk.hazard.FitStatus.successful:
+                shown = f"{float(ends[0]):.3f} to {float(ends[1]):.3f}"
+                entries.append(Entry(f"{name}_interval{key}", f"95 % interval of the {name}{words}", ends, shown=shown))
     return entries
 
 

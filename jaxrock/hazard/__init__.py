@@ -20,6 +20,10 @@ from jaxrock.hazard.fragility import (
     TabulatedFragility as TabulatedFragility,
     fit_fragility as fit_fragility,
 )
+from jaxrock.hazard.intervals import (
+    FragilityIntervals as FragilityIntervals,
+    fragility_intervals as fragility_intervals,
+)
 from jaxrock.hazard.nrml import write_nrml as write_nrml
 from jaxrock.hazard.openquake import (
     HazardCurves as HazardCurves,

@@ -169,7 +169,7 @@ class FragilityFit(AbstractTable):
 
     - `fragility`: the `LogNormalFragility` of largest likelihood.
     - `covariance`: (2, 2) of (ln median, ln dispersion), the inverse of the observed information: good for many
-      outcomes, too narrow for few.
+      outcomes, too narrow for few: `fragility_intervals`.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
     - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
       outcomes are separable in the usual order, the median lies between them.
@@ -216,6 +216,11 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
 
     **Source:** Silvapulle (1981), when the maximum exists; Baker (2015), the fit to counts at levels.
     """
+    return _fit(*counted(levels, toppled, trials))
+
+
+def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real, Real]:
+    """Levels, how many toppled and how many survived at each, (n,), of what users give."""
     levels = positive("levels", levels)
     if levels.ndim != 1 or levels.size == 0:
         raise ValueError(f"Argument `levels` must be a list of at least one value, but has shape {levels.shape}.")
@@ -223,7 +228,7 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
     if trials.shape not in ((), levels.shape):
         raise ValueError(f"Argument `trials` must have shape {levels.shape} or (), but has shape {trials.shape}.")
     levels, trials, toppled = alike(levels, trials, outcomes(toppled, levels, trials))
-    return _fit(levels, toppled, trials - toppled)
+    return levels, toppled, trials - toppled
 
 
 @eqx.filter_jit

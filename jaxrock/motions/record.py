@@ -1,16 +1,16 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
 import abc
-import functools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, not_negative, size, strength, with_throw
+from jaxrock._checks import Values, is_traced, not_negative, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
@@ -175,7 +175,8 @@ def _padded(part):
     return Padded(*_with_room(part.samples, part.dt, roomy(count) - count))
 
 
-@functools.partial(jax.jit, static_argnums=2)
 def _with_room(samples, dt, more: int):
+    # Known samples go through NumPy: of JAX's padding there would be a program for every number of samples.
     room = [(0, 0)] * (samples.ndim - 1) + [(0, more)]
-    return jnp.pad(samples, room), dt, dt * (samples.shape[-1] - 1)
+    roomier = jnp.pad(samples, room) if is_traced(samples) else jnp.asarray(np.pad(np.asarray(samples), room))
+    return roomier, dt, dt * (samples.shape[-1] - 1)

@@ -21,6 +21,8 @@ from jaxrock.studies.critical import (
 from jaxrock.studies.sensitivities import (
     Sensitivity as Sensitivity,
     SensitivityMap as SensitivityMap,
+    Slopes as Slopes,
+    SlopeStatus as SlopeStatus,
     sensitivity as sensitivity,
     sensitivity_map as sensitivity_map,
 )

@@ -20,12 +20,26 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.exponential import ExponentialPulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
-from jaxrock.status import Status
+from jaxrock.status import Enumeration, Status, item
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.studies.spectra import axis, scaled_law
 from jaxrock.sweeps.sweep import surface
 
 Scalar = Inexact[Array, "..."]
+
+
+class SlopeStatus(Enumeration):
+    """Whether slopes can be followed; `SlopeStatus[found.margin.status]` is the message."""
+
+    useful = item("A linear step says what comes of changes that are much smaller than `reach`.")
+    useless = item(
+        "Right, and useless: a relative change of a thousandth of the parameters, or of less, uses up all that this "
+        "result can change by, so that no step along its slope predicts anything. What many scenes do together is "
+        "smooth: shares that topple of blocks with scatter (`hazard.simulated_fragility` of `blocks.draw_blocks`, "
+        "`inverse.calibrate_block`) and likelihoods that know of scatter (`inverse.log_density`)."
+    )
+    not_smooth = item("Two peaks tie, or an impact is grazed before the peak: slopes are those of one side, if any.")
+    missing = item("The scene overturned, so that it has no peak, or it could not be computed: there are no slopes.")
 
 
 class Slopes(eqx.Module):
@@ -34,6 +48,10 @@ class Slopes(eqx.Module):
     - `value`: the result.
     - `derivative`: (..., parameters) partial derivatives, in the units of the result over those of the parameters.
     - `elasticity`: (..., parameters) per cent of the result per cent of the parameter, d ln y/d ln x.
+    - `reach`: relative change of the parameters (of all together, in the steepest direction) that to first order
+      changes the result by all of its range: by itself, the margin by 1 at least. Linear steps must stay far below it;
+      infinite where all slopes are zero, NaN where there are none.
+    - `status`: a `SlopeStatus`.
     """
 
     __repr__ = described
@@ -41,6 +59,8 @@ class Slopes(eqx.Module):
     value: Scalar
     derivative: Inexact[Array, "... parameters"]
     elasticity: Inexact[Array, "... parameters"]
+    reach: Scalar
+    status: SlopeStatus
 
 
 class Sensitivity(AbstractTable):
@@ -83,12 +103,15 @@ def _table(found: Sensitivity, axes: tuple[str, ...]) -> dict[str, Column]:
         told[name] = Column(axes, slopes.value, unit)
         told[f"{name}_derivative"] = Column(over, slopes.derivative, f"{unit} over {_OWN}")
         told[f"{name}_elasticity"] = Column(over, slopes.elasticity)
+        told[f"{name}_reach"] = Column(axes, slopes.reach)
+        told[f"{name}_slopes"] = Column(axes, slopes.status)
     names = ("valid", "condition", "graze_distance", "boundary_distance")
     told |= {name: Column(axes, getattr(found, name)) for name in names}
     return told | {"status": Column(axes, found.outcome.status)}
 
 
 _OWN = "that of the parameter"
+_USELESS = 1e-3  # the reach below which slopes are: parameters of no block, and of no earthquake, are known as well
 _RESULTS = ("max_rotation", "max_velocity", "margin", "clearance")
 
 
@@ -130,26 +153,35 @@ def sensitivity(
     independent = len(names)
     values = jnp.append(values, strength)
 
-    def slopes(name, known):
-        value, row = getattr(result, name), rows[_RESULTS.index(name)]
+    successful = result.status == Status.successful
+
+    def steepest(name):
+        return jnp.linalg.norm((rows[_RESULTS.index(name)] * values)[:independent])
+
+    def slopes(name, known, range_=0.0):
+        value, row, steep = getattr(result, name), rows[_RESULTS.index(name)], steepest(name)
         relative = row * values / jnp.where(value == 0, 1.0, value)
-        row, relative = (jnp.where(known, x, jnp.nan) for x in (row, relative))
-        return Slopes(value, row, relative)
+        reach = jnp.maximum(jnp.abs(value), range_) / steep
+        row, relative, reach = (jnp.where(known, x, jnp.nan) for x in (row, relative, reach))
+        status = SlopeStatus.where(reach < _USELESS, SlopeStatus.useless, SlopeStatus.useful)
+        missing = ~successful | ~known & result.overturned
+        status = SlopeStatus.where(known, status, SlopeStatus.not_smooth)
+        status = SlopeStatus.where(missing, SlopeStatus.missing, status)
+        return Slopes(value, row, relative, reach, status)
 
     def distance(name, value):
         """To first order, the relative change of all parameters together that makes a result zero."""
-        steepest = jnp.linalg.norm((rows[_RESULTS.index(name)] * values)[:independent])
-        near = jnp.isfinite(value) & (steepest > 0)
-        return jnp.where(near, jnp.abs(value) / jnp.where(near, steepest, 1.0), jnp.inf)
+        steep = steepest(name)
+        near = jnp.isfinite(value) & (steep > 0)
+        return jnp.where(near, jnp.abs(value) / jnp.where(near, steep, 1.0), jnp.inf)
 
-    successful = result.status == Status.successful
     rotation = slopes("max_rotation", valid)
     return Sensitivity(
         names=(*names, "uplift_strength"),
         values=values,
         max_rotation=rotation,
         max_velocity=slopes("max_velocity", valid),
-        margin=slopes("margin", successful),
+        margin=slopes("margin", successful, 1.0),
         outcome=result,
         valid=valid,
         condition=jnp.linalg.norm(rotation.elasticity[:independent]),

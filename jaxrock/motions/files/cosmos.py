@@ -21,8 +21,14 @@ _DATA = re.compile(
     re.IGNORECASE,
 )
 _FIRST = re.compile(r"^\s*(RAW|UNCORRECTED|CORRECTED|RESPONSE)\b.*\(\s*FORMAT\s+V?\d", re.IGNORECASE)
+_SPECTRA = re.compile(r"^\s*RESPONSE\b.*\(\s*FORMAT\s+V?\d", re.IGNORECASE)
 _REALS = re.compile(r"^\s*(\d+)\s+Real-header values follow.*?\(\s*\d*F(\d+)\.\d+", re.IGNORECASE)
 _STEP, _PEAK, _UNKNOWN = 61, 63, -999.0  # places in the real header: time step [ms], largest sample
+
+
+def is_spectra(lines: list[str]) -> bool:
+    """Whether these are the lines of a COSMOS V3 file: response spectra, of which the package reads CSMIP's alone."""
+    return any(map(_SPECTRA.match, lines[:3]))
 
 
 class COSMOS(AbstractFormat):
@@ -32,11 +38,17 @@ class COSMOS(AbstractFormat):
     suffixes = (".v1c", ".v2c")
 
     def recognises(self, lines):
-        return bool(lines) and any(_FIRST.match(line) for line in lines[:3]) and any(map(_DATA.match, lines[:400]))
+        if is_spectra(lines):  # to say what it is
+            return True
+        return any(_FIRST.match(line) for line in lines[:3]) and any(map(_DATA.match, lines[:400]))
 
     def read(self, name, lines, dt, unit, column):
         no_column(name, column, "COSMOS")
         at = next((number for number, line in enumerate(lines) if _DATA.match(line)), None)
+        if at is None and is_spectra(lines):
+            raise file_error(
+                name, "holds response spectra (COSMOS V3), but no accelerations: read the record's V2 file."
+            )
         if at is None:
             raise file_error(name, "no line announces 'acceleration pts', as a COSMOS file must.")
         count, what, seconds, written, per_line, width = _DATA.match(lines[at]).groups()

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxrock._arguments import arguments, at_least, path_of
 from jaxrock._text import file_error, text_lines
+from jaxrock.motions.files.cosmos import is_spectra
 from jaxrock.motions.files.csmip import chosen_channel, told
 from jaxrock.motions.files.parsing import NUMBER, announced_columns, fixed_numbers
 from jaxrock.motions.record import Origin
@@ -53,12 +54,17 @@ def read_spectra(path: str | os.PathLike, channel: Annotated[int, at_least(0)] =
 
     **Returns:** a `ResponseSpectra`, to three digits: what `intensity.spectral_velocity` makes of a record.
 
-    **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is damaged, cut short
-    or no V3 file, or whose pseudo-velocities are not those of its displacements.
+    **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is damaged or cut
+    short, for one that is no V3 file of CSMIP (COSMOS's is told as such), or whose pseudo-velocities are not those of
+    its displacements.
     """
     path = path_of("path", path)
     name, lines = path.name, text_lines(path)
     starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+    if is_spectra(lines):
+        raise file_error(
+            name, "is a V3 file of COSMOS; only CSMIP's are read. `intensity` makes spectra of its V2 file."
+        )
     if not starts:
         raise file_error(name, "no line begins with 'Response and Fourier amplitude spectra', as a V3 file must.")
     channel = chosen_channel(name, "V3", channel, len(starts))
