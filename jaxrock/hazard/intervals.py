@@ -14,8 +14,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
-from scipy.optimize import brentq, minimize_scalar
-from scipy.special import chdtri, log_ndtr, stdtrit
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, inner_share, scalar
@@ -69,6 +67,8 @@ def fragility_intervals(
     **Source:** Firth (1993), the penalty; Heinze & Schemper (2002), its profile for outcomes that can be parted;
     Kosmidis & Firth (2021), why all is finite, for probits, too.
     """
+    from scipy.special import chdtri
+
     levels, toppled, survived = (np.asarray(x, float) for x in counted(levels, toppled, trials))
     confidence = _confidence(confidence)
     tried = toppled + survived > 0
@@ -96,6 +96,8 @@ def intervals_of_motions(fit, motions: int, confidence: ArrayLike) -> FragilityI
     motions is their number times the variance of that mean, and has the scatter of a sample's variance; what else there
     is, is within every motion and known by as many scenes.
     """
+    from scipy.special import chdtri, stdtrit
+
     confidence = _confidence(confidence)
     if motions < 2 or fit.status != FitStatus.successful:
         nothing = jnp.full(2, jnp.nan)
@@ -125,6 +127,8 @@ class _Height(NamedTuple):
 
     def __call__(self, intercept: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """Heights (lines,) of intercepts and slopes (lines,)."""
+        from scipy.special import log_ndtr
+
         z = intercept[:, None] + slope[:, None] * self.abscissas
         above, below = log_ndtr(z), log_ndtr(-z)
         weights = np.log(self.toppled + self.survived) - z**2 - above - below
@@ -193,6 +197,8 @@ def _highest(height: Callable[[np.ndarray], np.ndarray], low: float, high: float
 
 def _ends(height: _Height, drop: float) -> tuple[np.ndarray, np.ndarray]:
     """Ends of median and slope, within which the profiles are less than `drop` below the highest place."""
+    from scipy.optimize import brentq, minimize_scalar
+
     flattest, steepest = height.range
     found = minimize_scalar(lambda place: -height.at_slope(place), bounds=(flattest, steepest), method="bounded")
     # Where outcomes do not rise, no slope that does is as good as none.
