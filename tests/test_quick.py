@@ -13,6 +13,7 @@ from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import root_of
 from jaxrock.responses.arguments import start_of
 from jaxrock.responses.outcome import _passes
+from references.edge_cases import GROUPS, kept_cases, solver
 
 PULSES = {
     "sine": rk.SinePulse,
@@ -116,3 +117,32 @@ def test_pick(count):
     values, index = jnp.arange(10.0, 10.0 + count), jnp.arange(-1, count + 3)
     expected = values[jnp.clip(index, 0, count - 1)]
     np.testing.assert_array_equal(jax.vmap(lambda i: pick(values, jnp.maximum(i, 0)))(index), expected)
+
+
+# ------------------------------------------------------------------------------------- ten thousand on an edge
+
+
+@pytest.mark.parametrize(
+    "model, kind",
+    [
+        ("nonlinear", "cosine"),
+        ("linear", "cosine"),
+        *(pytest.param(m, k, marks=pytest.mark.slow) for m in MODELS for k in ("sine", "exponential", "rectangle")),
+    ],
+)
+def test_no_wrong_answer_on_an_edge(model, kind):
+    """Scenes within 1e-14 to 1e-3 of overturning, or of a touch of the ground, all at once: refused or right.
+
+    Some stand still at first, tilted; some turn back beyond pi/2.
+    """
+    groups, scenes, _, known = kept_cases(again=False)
+    members = [i for i, g in enumerate(GROUPS) if (g.model, g.kind, g.delayed) == (model, kind, False)]
+    chosen = np.flatnonzero(np.isin(groups, members))
+    found = solver(model, kind, False, rk.Series())(scenes[chosen])
+    fell, decided = known[chosen, 0], (known[chosen, 0] >= 0) & (found.status == rk.Status.successful)
+    assert decided.mean() > 0.9
+    np.testing.assert_array_equal(found.overturned[decided], fell[decided] == 1)
+    alpha, safe = scenes[chosen, 0], decided & (fell == 0)
+    with np.errstate(invalid="ignore"):
+        off = np.abs((found.max_rotation - known[chosen, 1]) - known[chosen, 2]) / alpha
+    assert np.all(off[safe] <= 10 * np.maximum(found.error / alpha, 1e-11)[safe])

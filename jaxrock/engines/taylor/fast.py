@@ -124,6 +124,20 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
     return _Part(length, opening, speed, acceleration, full, outward, has_extremum, bound, certain)
 
 
+def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
+    """The velocity over a part, as `root_between` takes it, without the zero at its start: divided by the time where
+    the block stands still there, and by its square where it leaves rest with no acceleration, either."""
+    velocity, length = derivative(terms), part.length
+    still = velocity[0] == 0
+    later = [jnp.where(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
+    left = [jnp.where(still, b, a) for a, b in zip(velocity, [*later, jnp.zeros_like(length)])]
+    power = jnp.where(start.uplifting, 2.0, jnp.where(still, 1.0, 0.0))
+    per_time = jnp.where(still, 1 / length, 0.0)
+    share = jnp.where(start.uplifting, per_time * per_time, jnp.where(still, per_time, 1.0))
+    slope = (part.acceleration - power * part.speed * per_time) * share
+    return left, jnp.zeros_like(length), length, (left[0], part.speed * share), (left[1], slope)
+
+
 class _Meeting(NamedTuple):
     """Where a part of a step ends, and what happens until then."""
 
@@ -145,12 +159,10 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     turns = keep_flag(part.outward * part.speed < 0, state.local)
 
     def turn():
-        x, last = root_between(
-            _TURN, derivative(terms), zero, part.length, (terms[1], part.speed), (2 * terms[2], part.acceleration)
-        )
+        x, last = root_between(_TURN, *_leaving(start, terms, part))
         x = keep_by(x, one)
         opening, _, acceleration = (keep_by(value, one) for value in jet(terms, x, 2))
-        return x, opening, acceleration, last <= 1e-6 * x
+        return x, opening, acceleration, (last <= 1e-6 * x) & (x > 0)
 
     turn_at, top, top_acceleration, sure = _if(
         turns, turn, (part.length, part.opening, part.acceleration, part.certain)
@@ -194,7 +206,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
         x, last = root_between(
             _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
         )
-        return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (last <= 1e-4 * x)
+        return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | ((last <= 1e-4 * x) & (x > 0))
 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
@@ -265,6 +277,8 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     struck = _if(hits.impact, strike, noted)
     away = state.beyond & (state.velocity >= 0)
     lost = _if(away, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(away))
+    if scene.falls_flat:
+        certain = certain & (jnp.maximum(opening, meeting.top) < jnp.pi / 2)
     postponed = ~certain & ~lost & (struck.status == Status.successful)
     after = replace(
         struck,
