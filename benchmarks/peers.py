@@ -15,6 +15,8 @@ import importlib
 import importlib.util
 import json
 import pathlib
+import subprocess
+import sys
 import time
 
 import common  # noqa: F401, the search path and double precision
@@ -37,6 +39,7 @@ PEERS = {
     "scipy": ("scipy_loop", "scipy", "SciPy, DOP853"),
     "diffrax": ("diffrax_loop", "diffrax", "diffrax.Event, vmapped"),
 }
+ONE_DEVICE = {"jaxrock", "jaxrock-diffrax"}
 FEW, FEW_QUICK, LONG = 200, 20, 60.0  # scenes where a peer is slow; seconds after which it is not repeated
 
 
@@ -110,31 +113,51 @@ def arguments():
     parser.add_argument("--problems", nargs="+", default=["P1", "P2", "P3", "P4", "P5", "P6", "P7", "one"])
     parser.add_argument("--peers", nargs="+", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--quick", action="store_true", help="fewer scenes, once each")
-    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--draw", action="store_true", help="table and picture from the numbers that are there")
     parser.add_argument("--keep", action="store_true", help="keep the numbers of other problems and peers")
     return parser.parse_args()
 
 
+def parts(options):
+    """What has a process of its own: one block on one core; jaxrock, whose machine code shares the cores of one device;
+    and peers, some of which want a device of JAX a core."""
+    problems = [name for name in options.problems if name != "one"]
+    own = [name for name in options.peers if name in ONE_DEVICE]
+    others = [name for name in options.peers if name not in ONE_DEVICE]
+    found = [(["one"], options.peers)] if "one" in options.problems else []
+    return found + [(problems, peers) for peers in (own, others) if problems and peers]
+
+
 def main():
     """Measure, and write the report."""
     options, file = arguments(), HERE / "peers.json"
-    data = json.loads(file.read_text()) if (options.draw or options.keep) and file.exists() else {"rows": []}
-    if not options.draw:
-        if "one" in options.problems:
-            data["one"] = {"rows": one_block.measure(), "surroundings": report.surroundings()}
-            file.write_text(json.dumps(data, indent=0))
-            options.problems.remove("one")
-        if options.problems:
+    keeps = (options.draw or options.keep) and file.exists()
+    data = json.loads(file.read_text()) if keeps else {"rows": []}
+    several = [] if options.draw else parts(options)
+    if len(several) > 1:
+        file.write_text(json.dumps(data, indent=0))
+        for problems, peers in several:
+            words = ["--quick"] * options.quick + ["--keep", "--repeat", str(options.repeat)]
+            words += ["--problems", *problems, "--peers", *peers]
+            subprocess.run([sys.executable, __file__, *words], check=True)
+        return
+    if options.problems == ["one"]:
+        data["one"] = {"rows": one_block.measure(), "surroundings": report.surroundings()}
+        file.write_text(json.dumps(data, indent=0))
+    elif not options.draw:
+        if set(options.peers) - ONE_DEVICE:
             rk.use_cpu_devices()
-            measure(options, data, file)
+        measure(options, data, file)
     report.write(data, {name: peer[2] for name, peer in PEERS.items()}, HERE)
 
 
 def measure(options, data, file):
     """Every peer on every problem; the numbers are written after each."""
     there = [name for name in options.peers if importlib.util.find_spec(PEERS[name][1])]
-    data["skipped"] = [PEERS[name][2] for name in options.peers if name not in there]
+    skipped = {PEERS[name][2]: name in there for name in options.peers}
+    data["skipped"] = [name for name in data.get("skipped", []) if name not in skipped]
+    data["skipped"] += [name for name, found in skipped.items() if not found]
     data["surroundings"], data["repeat"] = report.surroundings(), options.repeat
     data["runs"] = data.get("runs", 0) + 1
     answers = json.loads(references.FILE.read_text())
