@@ -84,7 +84,7 @@ class Spread(eqx.Module):
 
     def after_flow(self, repulsion: Scalar, time: Scalar) -> "Spread":
         """Errors after a time (p t) under x'' = repulsion x; an attraction is taken as none."""
-        pull = jnp.maximum(repulsion, 0.0)
+        pull = jnp.maximum(repulsion, 1e-12)  # for arcs without an end, too
         square = pull * time**2
 
         def far():
