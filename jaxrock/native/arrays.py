@@ -37,8 +37,30 @@ def _part(x: np.ndarray, axis: int, start: int, size: int) -> np.ndarray:
 
 
 def _taken(e, equation, x, *starts) -> np.ndarray:
+    return _part_of(e, boxed(x), starts, equation.params["slice_sizes"])
+
+
+def _gathered(e, equation, x, indices) -> np.ndarray:
+    """One part of an array, without axes of length one."""
+    told, mode, x = equation.params["dimension_numbers"], equation.params["mode"], boxed(x)
+    axes, whole = told.start_index_map, len(told.offset_dims) == equation.outvars[0].aval.ndim
+    inside = mode in (jax.lax.GatherScatterMode.CLIP, jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+    if not inside or told.operand_batching_dims or not whole or boxed(indices).shape != (len(axes),):
+        raise Unsupported("more than one part looked up at a time")
+    part = _part_of(e, x, _starts(e, x, axes, indices), equation.params["slice_sizes"])
+    return np.squeeze(part, tuple(told.collapsed_slice_dims))
+
+
+def _starts(e, x: np.ndarray, axes: Sequence[int], indices) -> list:
+    """Where a part begins along every axis: at indices along some, at zero along the others."""
+    starts = [e.constant_of(0, ir.VectorType(ir.IntType(32), e.lanes))] * x.ndim
+    for axis, start in zip(axes, boxed(indices), strict=True):
+        starts[axis] = start
+    return starts
+
+
+def _part_of(e, x: np.ndarray, starts: Sequence, sizes: Sequence[int]) -> np.ndarray:
     """A part of an array; one that is partly outside is moved inside."""
-    x, sizes = boxed(x), equation.params["slice_sizes"]
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last, number = x.shape[axis] - size, _number(start)
         if number is not None:
@@ -89,9 +111,7 @@ def _scattered(e, equation, x, indices, part) -> np.ndarray:
     if batched or boxed(indices).shape != (len(axes),) or len(told.update_window_dims) != part.ndim:
         raise Unsupported("more than one part set at a time")
     part = np.expand_dims(part, tuple(told.inserted_window_dims))
-    starts = [e.constant_of(0, ir.VectorType(ir.IntType(32), e.lanes))] * x.ndim
-    for axis, start in zip(axes, boxed(indices), strict=True):
-        starts[axis] = start
+    starts = _starts(e, x, axes, indices)
     return _with_part(e, x, part, starts, moves=mode == jax.lax.GatherScatterMode.CLIP)
 
 
@@ -146,6 +166,7 @@ def _place_of(name: str) -> Callable:
 OF_FEW = {
     "dynamic_slice": _taken,
     "dynamic_update_slice": _set,
+    "gather": _gathered,
     "scatter": _scattered,
     "dot_general": _product,
     "argmin": _place_of("lt"),

@@ -118,7 +118,7 @@ class Emitter:
             raise Unsupported("a number from outside")
         value = np.asarray(value, dtype)
         if value.size > SMALL**2:
-            raise Unsupported("a large array in the program")
+            raise Unsupported(f"a large array in the program {value.shape} {value.ravel()[:20]}")
         return (
             _each(lambda x: self.constant(x, value.dtype), value) if value.ndim else self.constant(value, value.dtype)
         )

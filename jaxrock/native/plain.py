@@ -12,11 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
-from jaxrock.native.operations import KNOWN, NOTHING
+from jaxrock.native.operations import KNOWN, MOVES, NOTHING, Unsupported
+from jaxrock.native.partition import needed_by
 
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
 _TABLE = 256  # numbers of a constant that may be looked into: a solver's table
@@ -91,6 +93,10 @@ class _Run:
             return self._cases(equation, given)
         if name == "while":
             return self._loop(equation, given)
+        if name == "scan" and parameters["length"] <= _TURNS:
+            return self._scan(parameters, given)
+        if "callback" in name:  # which another library may have put where it is hardly ever called
+            raise Unsupported(f"operation {name}")
         if name in NOTHING:
             return given
         found = _computed(equation, given)
@@ -115,8 +121,11 @@ class _Run:
         results = [_Run(binds=False).of(branch, operands) for branch in branches]
         if not self.binds:
             return [first if all(_same(first, x) for x in others) else None for first, *others in zip(*results)]
-        cases = tuple(self._with_known(branch, operands) for branch in branches)
-        return self._bound(equation, given, equation.params | {"branches": cases})
+        cases = [self._with_known(branch, operands) for branch in branches]
+        kept = [any(needs) for needs in zip(*map(_needs, cases))]
+        cases = tuple(_with_inputs(case, kept) for case in cases)
+        operands = [x for x, keeps in zip(operands, kept) if keeps]
+        return self._bound(equation, [which, *operands], equation.params | {"branches": cases})
 
     def _with_known(self, program: ClosedJaxpr, given: Sequence, keep: Sequence = ()) -> ClosedJaxpr:
         """A program of the same inputs, of which some are known; its results `keep` are given."""
@@ -127,6 +136,19 @@ class _Run:
             return [x if x is not None else y for x, y in zip(keep or [None] * len(found), found)]
 
         return _traced(run, program)
+
+    def _scan(self, parameters: dict, given: list) -> list:
+        """A loop over the rows of arrays, unrolled."""
+        consts, carried, length = parameters["num_consts"], parameters["num_carry"], parameters["length"]
+        fixed, carry, lists = given[:consts], given[consts : consts + carried], given[consts + carried :]
+        rows = []
+        for turn in range(length):
+            place = length - 1 - turn if parameters["reverse"] else turn
+            found = self.of(parameters["jaxpr"], [*fixed, *carry, *(_row(x, place) for x in lists)])
+            carry = found[:carried]
+            rows.append(found[carried:])
+        columns = zip(*(rows[::-1] if parameters["reverse"] else rows))
+        return [*carry, *(_stacked(column) for column in columns)]
 
     def _loop(self, equation, given: list) -> list:
         parameters = equation.params
@@ -151,12 +173,31 @@ class _Run:
             same = kept
         if not self.binds:
             return same
+        cond, body = self._with_known(cond, [*of_cond, *same]), self._with_known(body, [*of_body, *same], same)
+        kept, needed = _needs(cond)[:n_cond], _needs(body)[:n_body]
+        of_cond = [x for x, keeps in zip(of_cond, kept) if keeps]
+        of_body = [x for x, keeps in zip(of_body, needed) if keeps]
         changed = parameters | {
-            "cond_jaxpr": self._with_known(cond, [*of_cond, *same]),
-            "body_jaxpr": self._with_known(body, [*of_body, *same], same),
+            "cond_jaxpr": _with_inputs(cond, [*kept, *(True for _ in carry)]),
+            "body_jaxpr": _with_inputs(body, [*needed, *(True for _ in carry)]),
+            "cond_nconsts": len(of_cond),
+            "body_nconsts": len(of_body),
         }
-        found = self._bound(equation, given, changed)
+        found = self._bound(equation, [*of_cond, *of_body, *carry], changed)
         return [x if y is None else y for x, y in zip(found, same)]
+
+
+def _needs(program: ClosedJaxpr) -> list[bool]:
+    """Which inputs a program needs."""
+    needed = needed_by(program.jaxpr.eqns, list(program.jaxpr.outvars))
+    return [v in needed for v in program.jaxpr.invars]
+
+
+def _with_inputs(program: ClosedJaxpr, kept: Sequence[bool]) -> ClosedJaxpr:
+    """A program without the inputs that are not kept, which it does not need."""
+    jaxpr = program.jaxpr
+    inputs, told = [v for v, keeps in zip(jaxpr.invars, kept, strict=True) if keeps], jaxpr.debug_info
+    return ClosedJaxpr(jaxpr.replace(invars=inputs, debug_info=told.with_unknown_names()), program.consts)
 
 
 def _turns(goes_on: Callable, turn: Callable, carry: list) -> int | None:
@@ -170,6 +211,16 @@ def _turns(goes_on: Callable, turn: Callable, carry: list) -> int | None:
             return turns
         state = turn(state)
     return None
+
+
+def _row(x, place: int):
+    return x if x is None else x[place] if _is_known(x) else jax.lax.index_in_dim(x, place, keepdims=False)
+
+
+def _stacked(rows: Sequence):
+    if any(x is None for x in rows):
+        return None
+    return np.stack(rows) if all(map(_is_known, rows)) else jnp.stack(rows)
 
 
 def _is_known(x) -> bool:
@@ -190,9 +241,8 @@ def _same(x, y) -> bool:
 def _computed(equation, given: list) -> list | None:
     """The results of an operation that are known; None: they are not."""
     name, parameters, variable = equation.primitive.name, equation.params, equation.outvars[0]
-    if name not in KNOWN or math.prod(variable.aval.shape) > _MOST:
-        return _chosen(name, parameters, given)
-    if not all(map(_is_known, given)):
+    most = _TABLE if name in MOVES else _MOST
+    if name not in KNOWN or math.prod(variable.aval.shape) > most or not all(map(_is_known, given)):
         return _chosen(name, parameters, given)
     with np.errstate(all="ignore"):
         found = KNOWN[name](parameters, *given)
