@@ -187,9 +187,9 @@ def _any_power(e, equation, x, y):
     if not is_float(y) or not isinstance(y, ir.Constant):
         return e.each("pow", x, y) if is_float(y) else e.each("pow", x, e.b.sitofp(y, x.type))
     exponent = y.constant[0].constant
-    if exponent == 0 or exponent == round(exponent):
+    if not math.isfinite(exponent) or exponent == round(exponent):
         return e.each("pow", x, y)
-    return _by(lambda x, y: exponential(y * _logarithm_of_any(x)))(e, equation, x, y)
+    return _by(lambda x, y: exponential(y * _logarithm_of_any(jnp.where(x == -jnp.inf, jnp.inf, x))))(e, equation, x, y)
 
 
 def _round(e, equation, x):
