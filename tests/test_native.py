@@ -361,10 +361,15 @@ SMALL_ARRAYS = {
 
 @pytest.mark.parametrize("name", SMALL_ARRAYS)
 def test_small_arrays_as_a_whole(name):
-    """At places of each lane's own, also outside of them."""
-    agree(
-        lambda i, x, y: [SMALL_ARRAYS[name](i, x, y)], PLACES, TABLES, ORDERS, rtol=1e-14 if name == "products" else 0
-    )
+    """At places of each lane's own, also outside of them; in a loop, where XLA cannot do them before."""
+    function = SMALL_ARRAYS[name]
+
+    def in_a_loop(*given):
+        like = jax.eval_shape(function, *given)
+        start = True, list(given), jnp.zeros(like.shape, like.dtype)
+        return [jax.lax.while_loop(lambda c: c[0], lambda c: (False, [-v for v in c[1]], function(*c[1])), start)[2]]
+
+    agree(in_a_loop, PLACES, TABLES, ORDERS, rtol=1e-14 if name == "products" else 0)
 
 
 def test_next_numbers():
@@ -413,10 +418,12 @@ def turns(x):
     """Of a number that is not known: the loop stays, but what is the same in all its turns is known in it."""
 
     def turn(carry):
-        total, flag, table = carry
-        return jnp.where(flag, 0.0, total + table[1]), flag & (total > 3), jnp.where(flag, -table, table)
+        total, flag, table, odd, late = carry
+        total = jnp.where(flag, 0.0, total + table[1])
+        return total, flag & (total > 3), jnp.where(flag, -table, table), total > 3, late | odd
 
-    return list(jax.lax.while_loop(lambda c: c[0] < 5, turn, (x, False, jnp.arange(3.0))))
+    start = x, False, jnp.arange(3.0), False, False
+    return list(jax.lax.while_loop(lambda c: c[0] < 5, turn, start))
 
 
 PROGRAMS = {
@@ -597,6 +604,22 @@ def test_a_place_of_a_lanes_own_list_in_a_refilled_loop():
     for refilled in (False, True):
         found = run(function, [numbers, turns], [False, False], refilled)
         np.testing.assert_allclose(found[1], numbers[:, 3] * turns, rtol=1e-14)
+
+
+def test_arrays_that_are_constants_of_a_refilled_loop():
+    table, start = np.array([1.0, 2.0, 3.0]), np.array([0.5, -0.5])
+
+    def function(leaves):
+        def turn(carry):
+            i, pair = carry
+            return i + 1, pair[::-1] + table[1:] * leaves[0]
+
+        return list(jax.lax.while_loop(lambda c: c[0] < leaves[1], turn, (jnp.int32(0), start)))
+
+    x, turns = jnp.linspace(0, 1, 40), jnp.arange(40, dtype=jnp.int32) % 5
+    found = run(function, [x, turns], [False, False], True)
+    for one, other in zip(found, jax.vmap(lambda *leaves: function(leaves))(x, turns), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-15)
 
 
 def test_an_interface_that_is_not_known_is_left_to_xla(monkeypatch, caplog):
