@@ -162,6 +162,14 @@ def _place_of(name: str) -> Callable:
     return operation
 
 
+def is_one_place(equation) -> bool:
+    """Whether a look-up, or what is set, is at one place; products of a batch are at many."""
+    name, parameters = equation.primitive.name, equation.params
+    if name == "dot_general":
+        return not any(parameters["dimension_numbers"][1])
+    return name not in ("gather", "scatter") or len(equation.invars[1].aval.shape) == 1
+
+
 # Functions of the emitter, the equation, and its operands.
 OF_FEW = {
     "dynamic_slice": _taken,

@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.arrays import OF_FEW
+from jaxrock.native.arrays import OF_FEW, is_one_place
 from jaxrock.native.lists import Memory, boxed, of_memory, unboxed
 from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 
@@ -118,7 +118,7 @@ class Emitter:
             raise Unsupported("a number from outside")
         value = np.asarray(value, dtype)
         if value.size > SMALL**2:
-            raise Unsupported(f"a large array in the program {value.shape} {value.ravel()[:20]}")
+            raise Unsupported("a large array in the program")
         return (
             _each(lambda x: self.constant(x, value.dtype), value) if value.ndim else self.constant(value, value.dtype)
         )
@@ -283,7 +283,7 @@ def is_known(equation) -> bool:
             shape = equation.invars[0].aval.shape
             return math.prod(shape) <= (SMALL if len(shape) == 1 else SMALL**2)
         if name in OF_FEW and name != "dynamic_slice":
-            return all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
+            return is_one_place(equation) and all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
         return name in OPERATIONS | MOVES | OF_FEW
     programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
     return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))

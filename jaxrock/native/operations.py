@@ -321,6 +321,8 @@ MOVES: dict[str, Callable] = {
 
 
 def _convert_known(parameters, x):
+    if x.dtype.kind == "f" and np.dtype(parameters["new_dtype"]).kind != "f":
+        return None  # what is too large becomes the largest
     return x.astype(parameters["new_dtype"])
 
 

@@ -8,7 +8,7 @@ chosen, loops whose turns are known are unrolled, and what does not change in a 
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -23,7 +23,7 @@ from jaxrock.native.partition import needed_by
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}
 _TABLE = 256  # numbers of a constant that may be looked into: a solver's table
 _MOST = 64  # of an array that is computed here
-_TURNS = 32  # of a loop that is unrolled, at most
+_TURNS, _OPERATIONS = 32, 1 << 14  # of a loop that is unrolled, at most
 
 
 def plain(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -74,7 +74,8 @@ class _Run:
         """The results of a program (closed)."""
         jaxpr = program.jaxpr
         values: dict[Any, Any] = dict(zip(jaxpr.invars, given, strict=True))
-        values.update((v, _known(x)) for v, x in zip(jaxpr.constvars, program.consts))
+        consts = map(_known, program.consts)
+        values.update(zip(jaxpr.constvars, consts if self.binds else _only_known(consts), strict=True))
 
         def read(atom):
             return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
@@ -93,7 +94,7 @@ class _Run:
             return self._cases(equation, given)
         if name == "while":
             return self._loop(equation, given)
-        if name == "scan" and parameters["length"] <= _TURNS:
+        if name == "scan" and _is_short(parameters["length"], parameters["jaxpr"]):
             return self._scan(parameters, given)
         if "callback" in name:  # which another library may have put where it is hardly ever called
             raise Unsupported(f"operation {name}")
@@ -118,8 +119,8 @@ class _Run:
         branches = equation.params["branches"]
         if _is_known(which):
             return self.of(branches[int(np.clip(int(which), 0, len(branches) - 1))], operands)
-        results = [_Run(binds=False).of(branch, operands) for branch in branches]
         if not self.binds:
+            results = [self.of(branch, operands) for branch in branches]
             return [first if all(_same(first, x) for x in others) else None for first, *others in zip(*results)]
         cases = [self._with_known(branch, operands) for branch in branches]
         kept = [any(needs) for needs in zip(*map(_needs, cases))]
@@ -155,18 +156,15 @@ class _Run:
         n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
         of_cond, of_body, carry = given[:n_cond], given[n_cond : n_cond + n_body], given[n_cond + n_body :]
         cond, body = parameters["cond_jaxpr"], parameters["body_jaxpr"]
-        asks = _Run(binds=False)
-        turns = _turns(
-            lambda state: asks.of(cond, [*of_cond, *state])[0], lambda s: asks.of(body, [*of_body, *s]), carry
-        )
-        if turns is not None:
+        asks, for_cond, for_body, same = _Run(binds=False), *map(_only_known, (of_cond, of_body, carry))
+        turns = _turns(lambda s: asks.of(cond, [*for_cond, *s])[0], lambda s: asks.of(body, [*for_body, *s]), same)
+        if turns is not None and _is_short(turns, body):
             for _ in range(turns):
                 carry = self.of(body, [*of_body, *carry])
             return carry
         # What is the same after a turn if it was before.
-        same = [x if _is_known(x) else None for x in carry]
         while True:
-            after = asks.of(body, [*of_body, *same])
+            after = asks.of(body, [*for_body, *same])
             kept = [x if _is_known(x) and _same(x, y) else None for x, y in zip(same, after)]
             if [x is None for x in kept] == [x is None for x in same]:
                 break
@@ -202,7 +200,7 @@ def _with_inputs(program: ClosedJaxpr, kept: Sequence[bool]) -> ClosedJaxpr:
 
 def _turns(goes_on: Callable, turn: Callable, carry: list) -> int | None:
     """How many turns a loop takes, if that is known."""
-    state = [x if _is_known(x) else None for x in carry]
+    state = carry
     for turns in range(_TURNS + 1):
         going = goes_on(state)
         if not _is_known(going):
@@ -221,6 +219,19 @@ def _stacked(rows: Sequence):
     if any(x is None for x in rows):
         return None
     return np.stack(rows) if all(map(_is_known, rows)) else jnp.stack(rows)
+
+
+def _is_short(turns: int, program: ClosedJaxpr) -> bool:
+    """Whether a loop is to be unrolled."""
+    return turns <= _TURNS and turns * _size(program.jaxpr) <= _OPERATIONS
+
+
+def _size(jaxpr) -> int:
+    return sum(1 + sum(map(_size, _programs(equation))) for equation in jaxpr.eqns)
+
+
+def _only_known(values: Iterable) -> list:
+    return [x if _is_known(x) else None for x in values]
 
 
 def _is_known(x) -> bool:
@@ -246,6 +257,8 @@ def _computed(equation, given: list) -> list | None:
         return _chosen(name, parameters, given)
     with np.errstate(all="ignore"):
         found = KNOWN[name](parameters, *given)
+    if found is None:
+        return None
     found = found if isinstance(found, list) else [found]
     return [np.asarray(x, v.aval.dtype) for x, v in zip(found, equation.outvars)]
 
@@ -283,4 +296,7 @@ def _expanded(primitive, parameters: tuple, shapes: tuple) -> ClosedJaxpr:
 def _written_out(equation) -> ClosedJaxpr:
     """What an operation of another library does, in operations of JAX."""
     shapes = tuple((x.aval.shape, x.aval.dtype) for x in equation.invars)
-    return _expanded(equation.primitive, tuple(equation.params.items()), shapes)
+    try:
+        return _expanded(equation.primitive, tuple(equation.params.items()), shapes)
+    except Exception as error:  # it does not consist of operations of JAX
+        raise Unsupported(f"operation {equation.primitive.name}") from error
