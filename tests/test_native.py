@@ -10,10 +10,15 @@ import pytest
 native = pytest.importorskip("jaxrock.native.call", reason="needs llvmlite")
 machine = pytest.importorskip("jaxrock.native.machine", reason="needs llvmlite")
 
+import diffrax  # noqa: E402
+import equinox as eqx  # noqa: E402
+import equinox.internal as eqxi  # noqa: E402
+
 import jaxrock as rk  # noqa: E402
+from jaxrock.native import plain as plain_programs  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
-from jaxrock.transforms.differentiation import differentiable  # noqa: E402
+from jaxrock.transforms.differentiation import differentiable, with_derivatives_of  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
 OTHERS = np.roll(NUMBERS, 5)
@@ -334,6 +339,131 @@ def test_places_outside_of_a_table():
     agree(lambda i, table: [table[i]], np.array([-30, -1, 0, 9, 10, 300]), np.arange(10.0), shared=(1,))
 
 
+PLACES = np.array([-9, -1, 0, 1, 2, 3, 9])
+TABLES = np.random.default_rng(0).random((7, 4, 3)) - 0.5
+ORDERS = np.stack([np.roll(np.array([0.5, -np.inf, np.nan, 3.0, -2.0, 3.0, np.nan]), k) for k in range(7)])
+
+# Of a place, a table of four rows, and a list of seven numbers: all a lane's own.
+SMALL_ARRAYS = {
+    "a part of a table": lambda i, x, y: jax.lax.dynamic_slice(x, (i, i - 1), (2, 2)),
+    "a part that is known": lambda i, x, y: jax.lax.dynamic_slice(x * i, (3, -5), (2, 2)),
+    "a row set, or moved inside": lambda i, x, y: jax.lax.dynamic_update_slice(x, x[:1] * 2, (i, 0)),
+    "a corner set": lambda i, x, y: jax.lax.dynamic_update_slice(x, x[:2, :2] * 2, (i, i - 1)),
+    "a row set, or not": lambda i, x, y: x.at[i].set(x[0] * 2, mode="drop"),
+    "a number set": lambda i, x, y: x.at[2, i].set(7.0, mode="clip"),
+    "a column": lambda i, x, y: jax.vmap(lambda row: row[i])(x),
+    "a choice of four": lambda i, x, y: jax.lax.select_n(jnp.clip(i, 0, 3), *x[:, 0]),
+    "where it is least": lambda i, x, y: jnp.argmin(y),
+    "where it is largest": lambda i, x, y: jnp.argmax(y[:5]),
+    "products": lambda i, x, y: x[0] @ x[1] + x.T @ x + jnp.tensordot(x, x),
+}
+
+
+@pytest.mark.parametrize("name", SMALL_ARRAYS)
+def test_small_arrays_as_a_whole(name):
+    """At places of each lane's own, also outside of them; in a loop, where XLA cannot do them before."""
+    function = SMALL_ARRAYS[name]
+
+    def in_a_loop(*given):
+        like = jax.eval_shape(function, *given)
+        start = True, list(given), jnp.zeros(like.shape, like.dtype)
+        return [jax.lax.while_loop(lambda c: c[0], lambda c: (False, [-v for v in c[1]], function(*c[1])), start)[2]]
+
+    agree(in_a_loop, PLACES, TABLES, ORDERS, rtol=1e-14 if name == "products" else 0)
+
+
+def test_next_numbers():
+    """Upward, downward, to where it is, from zero and past the largest; below the least normal one all is zero."""
+    x, y = (v.ravel() for v in np.meshgrid(np.append(NUMBERS, np.finfo(float).max), NUMBERS))
+    (found,), _ = both(lambda x, y: [jnp.nextafter(x, y)], x, y)
+    with np.errstate(all="ignore"):
+        np.testing.assert_array_equal(found, np.nextafter(x, y))
+
+
+@pytest.mark.parametrize("power", [0.2, -0.75, 3.0, -2.0, 0.0, None], ids=str)
+def test_powers(power):
+    """Of known exponents, and of a lane's own; NumPy is the judge."""
+    x, y = (v.ravel() for v in np.meshgrid(np.append(NUMBERS, np.linspace(0.1, 30, 9)), OTHERS))
+    found, _ = both(lambda x, y: [jax.lax.pow(x, y if power is None else jnp.full_like(x, power))], x, y)
+    with np.errstate(all="ignore"):
+        np.testing.assert_allclose(found[0], np.power(x, y if power is None else power), rtol=3e-14)
+
+
+def names_in(program) -> set[str]:
+    """Names of all operations of a program, and of the programs in it."""
+    inner = [names_in(p) for equation in program.eqns for p in plain_programs._programs(equation)]
+    return {equation.primitive.name for equation in program.eqns}.union(*inner)
+
+
+def stages(x):
+    """As solvers write them: a table that is looked into, a buffer, a flag that never changes."""
+    table = jnp.asarray(np.tri(5, k=-1) / 4)
+
+    def stage(carry):
+        i, filled, odd = carry
+        value = jnp.sin(x + table[i] @ filled[:])
+        return i + 1, eqxi.buffer_at_set(filled, i, value), odd & (x > 0)
+
+    start = jnp.where(eqxi.unvmap_any(jnp.array(False)), 1, 0), jnp.zeros(5), jnp.array(False)
+    i, filled, odd = eqxi.while_loop(lambda c: c[0] < 5, stage, start, max_steps=9, kind="lax", buffers=lambda c: c[1])
+    return [jnp.where(odd, 0.0, filled[4]), i]
+
+
+def rows(x):
+    """A polynomial, as NumPy's functions write it; a case that is known."""
+    return [jnp.polyval(jnp.arange(4.0), x), jax.lax.cond(jnp.arange(3)[1] > 0, jnp.cos, jnp.sin, x)]
+
+
+def turns(x):
+    """Of a number that is not known: the loop stays, but what is the same in all its turns is known in it."""
+
+    def turn(carry):
+        total, flag, table, odd, late = carry
+        total = jnp.where(flag, 0.0, total + table[1])
+        return total, flag & (total > 3), jnp.where(flag, -table, table), total > 3, late | odd
+
+    start = x, False, jnp.arange(3.0), False, False
+    return list(jax.lax.while_loop(lambda c: c[0] < 5, turn, start))
+
+
+PROGRAMS = {
+    "stages of a solver": (stages, set()),
+    "rows of an array": (rows, set()),
+    "turns that are not known": (turns, {"while"}),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_programs_in_plain_operations(name):
+    """What is known is computed, and loops of known turns are unrolled: the same numbers come out."""
+    function, left = PROGRAMS[name]
+    x = np.linspace(-1, 4, 9)
+    program = plain_programs.plain(jax.make_jaxpr(jax.jit(function))(1.0))
+    kept = names_in(program.jaxpr) & {"while", "scan", "cond", "jit", "select_n", "dynamic_slice", "unvmap_any"}
+    assert kept == left
+    expected = jax.vmap(function)(x)
+    for found, other in zip(jax.vmap(jax.extend.core.jaxpr_as_fun(program))(x), expected, strict=True):
+        np.testing.assert_allclose(found, other, rtol=1e-15)
+
+
+def test_what_nobody_needs_is_left_out():
+    def function(x):
+        spare = jax.lax.while_loop(lambda y: y < 9, lambda y: y * 2, x)
+        return [with_derivatives_of(jnp.sin(x), spare)]
+
+    assert names_in(plain_programs.plain(jax.make_jaxpr(function)(1.0)).jaxpr) == {"sin"}
+
+
+def test_what_calls_back_is_left_to_xla():
+    """It may stand where it is called only if something is wrong: of all lanes at once it would always be."""
+
+    def function(x):
+        return [eqxi.unvmap_any(x > 3) * eqx.error_if(x, x < 0, "negative")]
+
+    with pytest.raises(Unsupported, match="callback"):
+        both(function, np.linspace(1, 2, 9))
+
+
 UNKNOWN = {
     "order": lambda x: jnp.argsort(jnp.stack([x, -x]))[0] * x,
     "gamma": lambda x: jax.scipy.special.gamma(x),
@@ -362,6 +492,28 @@ def test_programs_have_names_of_their_own():
     assert len({machine.registered(*each) for each in ((program, [False]), (program, [True]), (other, [False]))}) == 3
 
 
+class Damper(eqx.Module):
+    """Of docs/how_to/own_physics.md."""
+
+    size: jax.Array
+
+    def __call__(self, opening, velocity, block):
+        return self.size * velocity
+
+
+def damped(a, u):
+    model = rk.Equation(
+        restoring=lambda opening, block: jnp.sin(block.alpha - opening),
+        arm=lambda opening, block: jnp.cos(block.alpha - opening),
+        dissipation=Damper(0.2),
+    )
+    return rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 0.6), model).margin
+
+
+def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), **settings):
+    return rk.outcome(rk.Block(a, 2.0, 0.9), u * motion, engine=rk.Diffrax(**settings))
+
+
 PULSE, SHORT = rk.SinePulse(0.4, 0.8), rk.Record(rk.example_record().samples[500:2500], 0.005)
 SCENES = {
     "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
@@ -379,11 +531,18 @@ SCENES = {
         rk.outcome(rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3))).margin
     ),
     "spring": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear")).margin,
+    "an equation with a damper": damped,
+    "its derivatives by diffrax": jax.grad(damped, (0, 1)),
+    "another solver of diffrax": lambda a, u: by_diffrax(a, u, solver=diffrax.Dopri8()).margin,
+    "diffrax under a record": lambda a, u: by_diffrax(a, u, SHORT).margin,
 }
 
 
 # What the others are made of.
-FALL_BACK_SLOWLY = ("value", "derivatives", "a scaled record", "vertical records")
+FALL_BACK_SLOWLY = (
+    *("value", "derivatives", "a scaled record", "vertical records"),
+    *("its derivatives by diffrax", "another solver of diffrax", "diffrax under a record"),
+)
 
 
 @pytest.mark.parametrize(
@@ -394,6 +553,32 @@ def test_scenes_do_not_fall_back(name, caplog):
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         jax.jit(jax.vmap(SCENES[name])).lower(jnp.full(333, 0.2), jnp.full(333, 0.5))
     assert "left to XLA" not in caplog.text
+
+
+def test_diffrax_in_lanes():
+    """As alone, to the bit, and as the series."""
+    a, u = jnp.linspace(0.1, 0.3, 40), jnp.linspace(1.3, 0.2, 40)
+    found = jax.vmap(by_diffrax)(a, u)
+    for i in (0, 17, 39):
+        alone = by_diffrax(a[i], u[i])
+        jax.tree.map(lambda one, many, i=i: np.testing.assert_array_equal(one, many[i]), alone, found)
+    exact = jax.vmap(lambda a, u: rk.outcome(rk.Block(a, 2.0, 0.9), rk.SinePulse(u, 1.0)))(a, u)
+    np.testing.assert_array_equal(found.overturned, exact.overturned)
+    np.testing.assert_array_equal(found.impact_count, exact.impact_count)
+    np.testing.assert_allclose(found.max_rotation, exact.max_rotation, rtol=1e-6)
+    assert 5 < found.overturned.sum() < 35
+    assert found.impact_count.max() > 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["an equation with a damper", "its derivatives by diffrax"])
+def test_diffrax_as_xla_has_it(name, monkeypatch):
+    a, u = jnp.linspace(0.1, 0.3, 20), jnp.linspace(1.3, 0.2, 20)
+    found = jax.vmap(SCENES[name])(a, u)
+    jax.clear_caches()
+    monkeypatch.setattr(batching, "native", None)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.vmap(SCENES[name])(a, u)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -419,6 +604,22 @@ def test_a_place_of_a_lanes_own_list_in_a_refilled_loop():
     for refilled in (False, True):
         found = run(function, [numbers, turns], [False, False], refilled)
         np.testing.assert_allclose(found[1], numbers[:, 3] * turns, rtol=1e-14)
+
+
+def test_arrays_that_are_constants_of_a_refilled_loop():
+    table, start = np.array([1.0, 2.0, 3.0]), np.array([0.5, -0.5])
+
+    def function(leaves):
+        def turn(carry):
+            i, pair = carry
+            return i + 1, pair[::-1] + table[1:] * leaves[0]
+
+        return list(jax.lax.while_loop(lambda c: c[0] < leaves[1], turn, (jnp.int32(0), start)))
+
+    x, turns = jnp.linspace(0, 1, 40), jnp.arange(40, dtype=jnp.int32) % 5
+    found = run(function, [x, turns], [False, False], True)
+    for one, other in zip(found, jax.vmap(lambda *leaves: function(leaves))(x, turns), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-15)
 
 
 def test_an_interface_that_is_not_known_is_left_to_xla(monkeypatch, caplog):

@@ -18,6 +18,7 @@ from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
 from jaxrock.native.partition import Part, ahead, around_loop, computed
+from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
 
 
@@ -37,6 +38,7 @@ class Plan:
     """
 
     def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
+        program = plain(program) if has_foreign(program.jaxpr) else program
         program = hoisted(program, lambda equation: not is_known(equation) or any(map(_is_large, equation.outvars)))
         self._program, self._shared, self._alone = program, shared, alone
         self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)

@@ -15,7 +15,8 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.lists import OF_FEW, Memory, boxed, of_memory, unboxed
+from jaxrock.native.arrays import OF_FEW, is_one_place
+from jaxrock.native.lists import Memory, boxed, of_memory, unboxed
 from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
@@ -161,7 +162,7 @@ class Emitter:
         if name in SUMS and boxed(inputs[0]).size:
             return [self._total(equation, boxed(inputs[0]))]
         if name in OF_FEW:
-            return [OF_FEW[name](self, equation, *inputs)]
+            return [unboxed(OF_FEW[name](self, equation, *inputs))]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
         return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
@@ -276,11 +277,14 @@ def is_known(equation) -> bool:
     """Whether an operation may be written; in the end only writing it tells."""
     if equation.primitive.name not in WITH_PROGRAMS:
         name = equation.primitive.name
-        small = name == "sort" and len(equation.invars) == 1 and equation.invars[0].aval.shape in _LISTS
+        if name == "sort":
+            return len(equation.invars) == 1 and equation.invars[0].aval.shape in _LISTS
         if name in SUMS:
             shape = equation.invars[0].aval.shape
             return math.prod(shape) <= (SMALL if len(shape) == 1 else SMALL**2)
-        return name in OPERATIONS | MOVES or name == "dynamic_slice" or small
+        if name in OF_FEW and name != "dynamic_slice":
+            return is_one_place(equation) and all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
+        return name in OPERATIONS | MOVES | OF_FEW
     programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
     return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
 

@@ -136,24 +136,23 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
 
 def emit_loop(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """As `emit`, of a program that is one loop: a lane that is done takes the next scene, and waits for no other."""
-    jaxpr = program.jaxpr
-    f = _Frame(jaxpr, lanes, name)
-    return _Refilled(f, jaxpr, shared).module()
+    return _Refilled(_Frame(program.jaxpr, lanes, name), program, shared).module()
 
 
 class _Refilled:
     """A loop whose lanes are filled again. What changes with a lane's scene is kept on the stack meanwhile."""
 
-    def __init__(self, frame: _Frame, jaxpr, shared: list[bool]):
-        self.f, self.b, self.e = frame, frame.b, frame.e
+    def __init__(self, frame: _Frame, program, shared: list[bool]):
+        self.f, self.b, self.e, jaxpr = frame, frame.b, frame.e, program.jaxpr
         (self.equation,) = jaxpr.eqns
-        self.jaxpr, self.shared = jaxpr, dict(zip(jaxpr.invars, shared, strict=True))
+        self.shared = dict(zip(jaxpr.invars, shared, strict=True))
+        self.constants = dict(zip(jaxpr.constvars, program.consts, strict=True))
         self.of = dict(zip(jaxpr.invars, frame.sources))
         parameters = self.equation.params
         consts = parameters["cond_nconsts"] + parameters["body_nconsts"]
         self.consts, self.carry = self.equation.invars[:consts], self.equation.invars[consts:]
         # Before all loops, where what only depends on them goes, too.
-        given = dict.fromkeys(v for v in self.consts if not isinstance(v, Literal) and self.shared[v])
+        given = dict.fromkeys(v for v in self.consts if self._is_given(v) and self.shared[v])
         self.known = {v: frame.argument(v, self.of[v], True, None, None) for v in given}
         self.scene, self.active, self.ready = (self._room(kind) for kind in (_I64, _I8, _I8))
         # Stack of every number that is a lane's own: (source in memory, number in it, room).
@@ -166,8 +165,15 @@ class _Refilled:
         room.align = 64
         return room
 
+    def _is_given(self, variable) -> bool:
+        return not isinstance(variable, Literal) and variable not in self.constants
+
+    def _constant(self, variable) -> np.ndarray:
+        value = variable.val if isinstance(variable, Literal) else self.constants[variable]
+        return np.asarray(value, kind_of(variable))
+
     def _is_own(self, variable) -> bool:
-        return not isinstance(variable, Literal) and not self.shared[variable] and not is_long(variable.aval.shape)
+        return self._is_given(variable) and not self.shared[variable] and not is_long(variable.aval.shape)
 
     def _rooms(self, variable) -> list:
         if is_long(variable.aval.shape):
@@ -218,9 +224,9 @@ class _Refilled:
         rooms = iter([room for *_, room in self.own])
         values = dict(self.known)
         for v in self.consts:
-            if not isinstance(v, Literal) and v not in values:
+            if self._is_given(v) and v not in values:
                 values[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
-        return [self.e.known(v.val, kind_of(v)) if isinstance(v, Literal) else values[v] for v in self.consts]
+        return [values[v] if self._is_given(v) else self.e.known(self._constant(v), kind_of(v)) for v in self.consts]
 
     def _starts(self, size: int) -> list:
         b = self.b
@@ -261,8 +267,8 @@ class _Refilled:
 
     def _of_scene(self, variable, k: int, scene):
         """One number of a scene."""
-        if isinstance(variable, Literal):
-            value = np.asarray(variable.val, kind_of(variable)).ravel()[k]
+        if not self._is_given(variable):
+            value = self._constant(variable).ravel()[k]
             kind = _I8 if value.dtype == np.bool_ else self.e.kind(value.dtype)
             return kind(int(value) if isinstance(kind, ir.IntType) else float(value))
         at = _I64(k) if self.shared[variable] else self.f.place(k, scene)

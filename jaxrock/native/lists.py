@@ -91,18 +91,7 @@ def _is_column(parameters: dict, memory: Memory) -> bool:
     return inside and maps == ((0, 1), (), (1,)) and parameters["slice_sizes"] == (memory.rows, 1)
 
 
-def _pick(e, equation, numbers, index, *more) -> np.ndarray:
-    """One number of a few; an index outside is moved to the nearest inside."""
-    sizes = equation.params["slice_sizes"]
-    if sizes != (1,) or more:
-        raise Unsupported(f"a slice of {sizes}")
-    found, *others = boxed(numbers)
-    for place, number in enumerate(others, 1):
-        found = e.b.select(e.b.icmp_signed(">=", index, e.constant_of(place, index.type)), number, found)
-    return boxed([found])
-
-
-def _sort(e, equation, *arrays) -> np.ndarray:
+def sorted_list(e, equation, *arrays) -> np.ndarray:
     """The few numbers of a list in order, by exchanging neighbours."""
     if len(arrays) > 1 or boxed(arrays[0]).ndim != 1:
         raise Unsupported("a sort of more than one list")
@@ -118,7 +107,3 @@ def _sort(e, equation, *arrays) -> np.ndarray:
             numbers[i] = chosen(e, equation, swapped, one, other)
             numbers[i + 1] = chosen(e, equation, swapped, other, one)
     return boxed(numbers)
-
-
-# Operations on short lists as a whole.
-OF_FEW = {"dynamic_slice": _pick, "sort": _sort}

@@ -124,8 +124,10 @@ def _positive_power(e, x, exponent: int):
 
 def _power(e, equation, x):
     exponent = equation.params["y"]
-    if not is_float(x) or exponent == 0:
-        raise Unsupported(f"power {exponent}")
+    if not is_float(x):
+        raise Unsupported(f"power {exponent} of whole numbers")
+    if exponent == 0:
+        return e.constant(1, equation.invars[0].aval.dtype)
     power = _positive_power(e, x, abs(exponent))
     return power if exponent > 0 else e.b.fdiv(e.constant(1, equation.invars[0].aval.dtype), power)
 
@@ -159,9 +161,35 @@ def _to_integer(e, x, limits, dtype, kind):
 
 
 def _choose(e, _, which, *cases):
-    if len(cases) != 2 or not _is_flag(which):
-        raise Unsupported("a choice of many")
-    return e.b.select(which, cases[1], cases[0])
+    if _is_flag(which):
+        return e.b.select(which, cases[1], cases[0])
+    found = cases[0]
+    for place, case in enumerate(cases[1:], 1):
+        found = e.b.select(e.b.icmp_signed(">=", which, e.constant_of(place, which.type)), case, found)
+    return found
+
+
+def _next(e, equation, x, y):
+    """The next number from x towards y."""
+    dtype = equation.invars[0].aval.dtype
+    zero, least = e.constant(0, dtype), e.constant(np.finfo(dtype).smallest_subnormal, dtype)
+    bits = e.b.bitcast(x, e.vector(np.dtype(f"i{dtype.itemsize}")))
+    one = e.constant_of(1, bits.type)
+    grows = e.b.xor(e.b.fcmp_ordered("<", x, y), e.b.fcmp_ordered("<", x, zero))
+    moved = e.b.bitcast(e.b.select(grows, e.b.add(bits, one), e.b.sub(bits, one)), x.type)
+    moved = e.b.select(e.b.fcmp_ordered("==", x, zero), e.intrinsic("copysign", least, y), moved)
+    moved = e.b.select(e.b.fcmp_ordered("==", x, y), y, moved)
+    return e.b.select(e.b.fcmp_unordered("uno", x, y), e.b.fadd(x, y), moved)
+
+
+def _any_power(e, equation, x, y):
+    """x^y: where y is known by exponential and logarithm, whose rounding counts as often as the logarithm is large."""
+    if not is_float(y) or not isinstance(y, ir.Constant):
+        return e.each("pow", x, y) if is_float(y) else e.each("pow", x, e.b.sitofp(y, x.type))
+    exponent = y.constant[0].constant
+    if not math.isfinite(exponent) or exponent == round(exponent):
+        return e.each("pow", x, y)
+    return _by(lambda x, y: exponential(y * _logarithm_of_any(jnp.where(x == -jnp.inf, jnp.inf, x))))(e, equation, x, y)
 
 
 def _round(e, equation, x):
@@ -204,6 +232,8 @@ OPERATIONS: dict[str, Callable] = {
     "sign": _sign,
     "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
     "integer_pow": _power,
+    "pow": _any_power,
+    "nextafter": _next,
     "sqrt": lambda e, _, x: e.intrinsic("sqrt", x),
     "rsqrt": lambda e, q, x: e.b.fdiv(e.constant(1, q.invars[0].aval.dtype), e.intrinsic("sqrt", x)),
     "floor": lambda e, _, x: e.intrinsic("floor", x),
@@ -287,4 +317,56 @@ MOVES: dict[str, Callable] = {
     "split": lambda parameters, x: np.split(x, np.cumsum(parameters["sizes"])[:-1], parameters["axis"]),
     "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
     "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
+}
+
+
+def _convert_known(parameters, x):
+    if x.dtype.kind == "f" and np.dtype(parameters["new_dtype"]).kind != "f":
+        return None  # what is too large becomes the largest
+    return x.astype(parameters["new_dtype"])
+
+
+def _iota(dtype, shape, dimension, **_):
+    places = np.arange(shape[dimension], dtype=dtype)
+    return np.broadcast_to(places.reshape([-1 if axis == dimension else 1 for axis in range(len(shape))]), shape)
+
+
+def _taken(parameters, x, *starts):
+    sizes = parameters["slice_sizes"]
+    starts = [min(max(int(start), 0), n - size) for start, n, size in zip(starts, x.shape, sizes)]
+    return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes))]
+
+
+# Of numbers that are known beforehand, in NumPy: functions of the parameters and arrays. Only what NumPy rounds as JAX.
+KNOWN: dict[str, Callable] = {
+    **{name: MOVES[name] for name in MOVES if name != "pad"},
+    **{
+        name: (lambda _, *xs, f=f: f(*xs))
+        for name, f in {
+            "add": np.add,
+            "sub": np.subtract,
+            "mul": np.multiply,
+            "neg": np.negative,
+            "abs": np.abs,
+            "min": np.minimum,
+            "max": np.maximum,
+            "eq": np.equal,
+            "ne": np.not_equal,
+            "lt": np.less,
+            "le": np.less_equal,
+            "gt": np.greater,
+            "ge": np.greater_equal,
+            "and": np.bitwise_and,
+            "or": np.bitwise_or,
+            "not": np.invert,
+            "is_finite": np.isfinite,
+        }.items()
+    },
+    "reduce_or": lambda parameters, x: np.any(x, parameters["axes"]),
+    "reduce_and": lambda parameters, x: np.all(x, parameters["axes"]),
+    "reduce_max": lambda parameters, x: np.max(x, parameters["axes"]),
+    "iota": lambda parameters: _iota(**parameters),
+    "dynamic_slice": _taken,
+    "convert_element_type": _convert_known,
+    "select_n": lambda _, which, *cases: np.choose(which.astype(int), cases),
 }

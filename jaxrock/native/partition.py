@@ -27,12 +27,14 @@ def part_of(program: ClosedJaxpr, equations: list, outputs: list) -> Part:
     """The part of some operations, in order; `outputs`: variables that may be its inputs, too."""
     jaxpr = program.jaxpr
     made, constants = {v for equation in equations for v in equation.outvars}, set(jaxpr.constvars)
-    used = [v for equation in equations for v in equation.invars] + outputs
-    inputs = [v for v in used if not isinstance(v, Literal) and v not in made and v not in constants]
+    used = needed_by(equations, outputs)
+    inputs = [v for v in used if v not in made and v not in constants]
+    consts = [(v, x) for v, x in zip(jaxpr.constvars, program.consts, strict=True) if v in used]
     # Arguments have no names here: JAX would compare their number.
     told = jaxpr.debug_info.with_unknown_names()
-    cut = jaxpr.replace(invars=list(dict.fromkeys(inputs)), outvars=outputs, eqns=equations, debug_info=told)
-    return Part(ClosedJaxpr(cut, program.consts))
+    known = [v for v, _ in consts]
+    cut = jaxpr.replace(constvars=known, invars=inputs, outvars=outputs, eqns=equations, debug_info=told)
+    return Part(ClosedJaxpr(cut, [x for _, x in consts]))
 
 
 def needed_by(equations: list, outputs: list) -> dict:

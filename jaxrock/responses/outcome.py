@@ -159,7 +159,7 @@ def _outcome(block, motion, model, initial, engine) -> Outcome:
         return _by_steps(scene)
     check_single(block=block, motion=motion)
     if not isinstance(engine, Series):
-        return differentiable(_by_steps, _on_tape, None, "outcome", outcome_like)(scene)
+        return differentiable(_by_steps, _on_tape, None, "outcome", outcome_like, in_lanes=True, refilled=True)(scene)
     passes = _passes(POLICY.is_record(motion.knots.size - 1))
     return differentiable(passes.whole, _on_tape, passes, "outcome", outcome_like)(scene)
 

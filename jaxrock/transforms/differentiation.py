@@ -31,6 +31,7 @@ def differentiable(
     results: Callable | None = None,
     in_lanes: bool = False,
     plain: Callable | None = None,
+    refilled: bool = False,
 ) -> Callable:
     """`function(tree)` with derivatives of every order, forward and reverse, from forward mode alone.
 
@@ -42,7 +43,8 @@ def differentiable(
     `on_tape`: the same function, through whose own code reverse mode goes; for derivatives by very many numbers.
     `passes`: the function in parts; `function` is then their `whole`.
     `name`: of a function that depends on nothing but its argument: then it need not be traced if it has been before.
-    `in_lanes`: whether machine code may run it; `plain`: the same function as forward mode goes through it best.
+    `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
+    `plain`: the same function as forward mode goes through it best.
     `results`: of the tree what the function returns (of `jax.ShapeDtypeStruct`), where that is known without tracing.
     """
 
@@ -52,7 +54,7 @@ def differentiable(
         like = [jax.ShapeDtypeStruct(jnp.shape(x), x.dtype) for x in leaves]
         told = None if name is None else facts_of((name, structure.unflatten(like)))
         known = results(structure.unflatten(like)) if told is not None and results is not None else None
-        recipe = Recipe(function, structure, like, passes, on_tape, told, known, in_lanes, plain=plain)
+        recipe = Recipe(function, structure, like, passes, on_tape, told, known, in_lanes, refilled, plain)
         recipe, leaves = _without_outside(recipe, leaves)
         return computed(recipe, leaves)
 

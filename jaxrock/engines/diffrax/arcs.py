@@ -155,20 +155,30 @@ class Diffrax(AbstractEngine):
         first = first_step(arc, self.rtol)
         first = jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0))
         controller = self.controller or StepControl(self.rtol, limits[0], dtmax=limits[1], first=first)
+        term, zero, y0 = diffrax.ODETerm(field), jnp.zeros_like(length), jnp.stack([arc.opening, arc.velocity])
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
+            term,
             self.solver,
-            t0=jnp.zeros_like(length),
+            t0=zero,
             t1=length,
             dt0=None if isinstance(controller, StepControl) else first,
-            y0=jnp.stack([arc.opening, arc.velocity]),
+            y0=y0,
             args=arc,
+            solver_state=self._begun(term, zero, y0, arc),
             stepsize_controller=controller,
             event=event,
             adjoint=self.adjoint,
             max_steps=POLICY.solve_steps,
             throw=False,
         )
+
+    def _begun(self, term: diffrax.ODETerm, zero: Scalar, y0: Pair, arc: Arc) -> PyTree:
+        """The solver's state with its first evaluation done, where it takes that from step to step: else its steps
+        would have a stage that only the first of them needs."""
+        solver = self.solver
+        if not isinstance(solver, diffrax.AbstractERK) or solver.init(term, zero, zero, y0, arc) is None:
+            return None
+        return jnp.array(False), term.vf(zero, y0, arc)
 
     def locate(
         self, arc: Arc, limits: tuple[Scalar, Scalar], length: Scalar, event: diffrax.Event
@@ -198,8 +208,10 @@ class Diffrax(AbstractEngine):
             clear = jnp.abs(value) < jnp.abs(slope) / jnp.finfo(slope.dtype).eps  # no arc of no length
             return jnp.where(clear, value / jnp.where(clear, slope, 1.0), 0.0)
 
-        time = jnp.where(solution.event_mask, carried(end, left), length + (end - jax.lax.stop_gradient(length)))
-        return solution, time, at(time)
+        # Without derivatives they are what was found.
+        free = length + (end - jax.lax.stop_gradient(length))
+        time = with_derivatives_of(end, jnp.where(solution.event_mask, carried(end, left), free))
+        return solution, time, with_derivatives_of(y, at(time))
 
 
 class ArcStepper(AbstractStepper):
