@@ -219,6 +219,17 @@ def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scal
     return jnp.minimum(least, jnp.maximum(contributed, stepper.rounding / stepper.tolerance * least))
 
 
+def _stands(stepper: TaylorStepper, meeting: _Meeting) -> Flag | bool:
+    """Whether the block has not come to lie flat on the way."""
+    return not stepper.scene.falls_flat or jnp.maximum(meeting.opening, meeting.top) < jnp.pi / 2
+
+
+def _lost(stepper: TaylorStepper, state: State, start: Start) -> Flag:
+    """As `escaped`, which is asked only of blocks on their way out."""
+    away = state.beyond & (state.velocity >= 0)
+    return _if(away, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(away))
+
+
 def advance(stepper: TaylorStepper, state: State) -> State:
     """One step of a lane that rocks."""
     stepper = stepper.on(state.side)
@@ -233,7 +244,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
-    certain = keep_flag(meeting.certain & sure, state.local)
+    certain = keep_flag(meeting.certain & sure & _stands(stepper, meeting), state.local)
 
     opening, _ = landed(scene, hits, meeting.opening, meeting.speed)
     velocity = keep_by(meeting.speed * (1 / stretch), one)
@@ -275,10 +286,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
         return impact(stepper, noted, hits.impact, velocity, shaking.at(at), steepest, (part.length - at) * unit)
 
     struck = _if(hits.impact, strike, noted)
-    away = state.beyond & (state.velocity >= 0)
-    lost = _if(away, lambda: escaped(stepper, state, start.angle), jnp.zeros_like(away))
-    if scene.falls_flat:
-        certain = certain & (jnp.maximum(opening, meeting.top) < jnp.pi / 2)
+    lost = _lost(stepper, state, start)
     postponed = ~certain & ~lost & (struck.status == Status.successful)
     after = replace(
         struck,
