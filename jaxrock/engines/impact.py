@@ -79,7 +79,9 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
     return _Rebound(rebound, here, there, jax.lax.stop_gradient(spread))
 
 
-def _rests_if_soon(stepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar) -> tuple:
+def _rests_if_soon(
+    stepper: AbstractStepper, state: State, hit: Flag, after: _Rebound, steepest: tuple, reach: Scalar
+) -> tuple[Flag, Int[Array, ""], Scalar]:
     """As `_rests`, which is not asked where the next hop alone takes too long for that."""
     given = stepper, state, hit, after, steepest, reach
     stepper, state, hit, after, steepest, reach = jax.lax.stop_gradient(given)
