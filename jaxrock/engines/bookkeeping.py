@@ -22,11 +22,7 @@ _LOST = 1e-2  # standard error over the saddle's angle beyond which a state mean
 def checked(stepper: AbstractStepper, before: State, after: State) -> State:
     """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-    lost = (after.side != 0) & ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
-    if not stepper.history:
-        # In the free stage only the next peak or passage counts, which `note` judges.
-        lost = lost & (before.piece < stepper.scene.pieces)
-    undecided = lost & (after.status == Status.successful)
+    undecided = (after.side != 0) & is_lost(stepper, before, after) & (after.status == Status.successful)
     status = Status.where(undecided, Status.undecided, after.status)
     return replace(
         after,
@@ -34,6 +30,13 @@ def checked(stepper: AbstractStepper, before: State, after: State) -> State:
         status=Status.where(good, status, Status.not_finite),
         done=after.done | ~good,
     )
+
+
+def is_lost(stepper: AbstractStepper, before: State, after: State) -> Flag:
+    """Whether the error of a block off the ground has outgrown its state."""
+    lost = ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
+    # In the free stage only the next peak or passage counts, which `note` judges.
+    return lost if stepper.history else lost & (before.piece < stepper.scene.pieces)
 
 
 def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
@@ -58,15 +61,21 @@ def errors_after(
     given = stepper, state, angle, ground, elapsed, step
     stepper, state, angle, (acceleration, weight), elapsed, step = jax.lax.stop_gradient(given)
     push = state.side * acceleration
-    moments, p = stepper.scene.moments, stepper.scene.p  # an error has no derivative
-    eps, time, speed = 2 * jnp.finfo(p.dtype).eps, p * elapsed, jnp.abs(state.velocity)
-    clock = eps * p * state.local  # the time of a state is rounded, too
-    pull = eps * (moments.restoring_at_rest + jnp.abs(push) * moments.arm_at_rest)  # of what acceleration is left
+    moments, time = stepper.scene.moments, stepper.scene.p * elapsed  # an error has no derivative
+    of_angle, of_velocity = rounded(stepper, state, jnp.abs(push), time)
     spread = state.spread.after_flow(moments.repulsion(angle, push, weight), time)
-    return spread.plus(
-        step[0] + eps * (jnp.abs(state.opening) + speed * time) + pull * time**2 + clock * speed,
-        step[1] + eps * speed + pull * (time + p * state.local),
-    )
+    return spread.plus(step[0] + of_angle, step[1] + of_velocity)
+
+
+def rounded(stepper: AbstractStepper, state: State, push: Scalar, time: Scalar) -> tuple[Scalar, Scalar]:
+    """What rounding adds to the errors of angle and velocity in a step of `time` (p t), under a ground acceleration of
+    this size [g]."""
+    moments, p = stepper.scene.moments, stepper.scene.p
+    eps, speed = 2 * jnp.finfo(p.dtype).eps, jnp.abs(state.velocity)
+    clock = p * state.local  # the time of a state is rounded, too
+    pull = eps * (moments.restoring_at_rest + push * moments.arm_at_rest)  # of what acceleration is left
+    of_angle = eps * (jnp.abs(state.opening) + speed * (time + clock)) + pull * time**2
+    return of_angle, eps * speed + pull * (time + clock)
 
 
 def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:

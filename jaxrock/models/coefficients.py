@@ -95,6 +95,11 @@ class Terms(eqx.Module):
         pairs = pairs if sign is None else [(sign * c, f) for c, f in pairs]
         return [c if f is _ONE else c * f for c, f in pairs]
 
+    def plus(self, other: "Terms") -> "Terms":
+        """The sum of both."""
+        pairs = zip(self.coefficients, other.coefficients)
+        return Terms(*(a if b is None else b if a is None else a + b for a, b in pairs))
+
     def each(self, function: Callable, *others: Any) -> "Terms":
         """Terms that a function makes of every coefficient there is, and of what stands in its place in `others`."""
         pairs = zip(self.coefficients, *others)

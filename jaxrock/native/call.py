@@ -17,6 +17,7 @@ from jaxrock.native.emitter import SMALL, is_known
 from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
+from jaxrock.native.parted import emit_parted, has_parts
 from jaxrock.native.partition import Part, ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
@@ -39,14 +40,16 @@ class Plan:
 
     def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
         program = plain(program) if has_foreign(program.jaxpr) else program
-        program = hoisted(program, lambda equation: not is_known(equation) or any(map(_is_large, equation.outvars)))
+        program = hoisted(program, _is_before_loops)
         self._program, self._shared, self._alone = program, shared, alone
         self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)
         own = self._first_own()
         self._pieces = []
         for part in around_loop(self._rest) if refilled else [self._rest]:
             is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
-            name = registered(part.program, [v not in own for v in part.inputs], emit_loop if is_loop else emit)
+            parted = is_loop and has_parts(part.program.jaxpr.eqns[0])
+            writes = emit_parted if parted else emit_loop if is_loop else emit
+            name = registered(part.program, [v not in own for v in part.inputs], writes)
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(part, name))
 
@@ -82,6 +85,16 @@ class Plan:
             arrays = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
             values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
         return [jnp.moveaxis(x, -1, 0)[:size] for x in arrays]
+
+
+# What takes as long as many products: it is not done again whenever a lane takes the next scene.
+_DEAR = {"div", "sqrt", "rsqrt", "exp", "expm1", "log", "sin", "cos", "tan", "asin", "atan", "atan2", "tanh", "pow"}
+
+
+def _is_before_loops(equation) -> bool:
+    """Whether what stays the same in a loop is computed before it, once for each scene."""
+    is_dear = equation.primitive.name in _DEAR and bool(__import__("os").environ.get("DEAR","1")=="1")
+    return is_dear or not is_known(equation) or any(map(_is_large, equation.outvars))
 
 
 def _is_large(variable) -> bool:

@@ -8,13 +8,13 @@ from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxrock.native.partition import needed_by, part_of
 
 
-def hoisted(program: ClosedJaxpr, is_left: Callable, constants: int = 0) -> ClosedJaxpr:
-    """The program with all that stays the same in its loops, and `is_left` to XLA, before them, with what that needs.
+def hoisted(program: ClosedJaxpr, is_left: Callable, constants: Sequence[int] = ()) -> ClosedJaxpr:
+    """The program with all that stays the same in its loops, and `is_left` to what is before them, with what that needs.
 
-    `constants`: how many of its inputs, the first, stay the same in all turns of a loop around it: what only depends on
-    these comes out of the cases of its conditions, too.
+    `constants`: places of its inputs that stay the same in all turns of a loop around it: what only depends on these
+    comes out of the cases of its conditions, too.
     """
-    constant = set(program.jaxpr.invars[:constants]) | set(program.jaxpr.constvars)
+    constant = {program.jaxpr.invars[place] for place in constants} | set(program.jaxpr.constvars)
     if not _has_any(program.jaxpr, constant, is_left):
         return program
 
@@ -28,15 +28,15 @@ def _has_any(jaxpr, constant: set, is_left: Callable) -> bool:
     """Whether there is anything to hoist."""
     constant = constant | _same(jaxpr, constant)[1]
     for equation in jaxpr.eqns:
+        inner = []
         if equation.primitive.name == "while":
             body, count = equation.params["body_jaxpr"].jaxpr, equation.params["body_nconsts"]
-            inner = set(body.invars[:count]) | set(body.constvars)
-            if _to_hoist(body, inner, is_left) or _has_any(body, inner, is_left):
-                return True
+            inner = [(body, set(body.invars[:count]) | set(body.constvars))]
         if equation.primitive.name == "cond" and constant:
             branches = equation.params["branches"]
-            if any(_to_hoist(x.jaxpr, _of_branch(x, equation, constant), is_left) for x in branches):
-                return True
+            inner = [(x.jaxpr, _variables(x, _places(equation, constant))) for x in branches]
+        if any(_to_hoist(x, same, is_left) or _has_any(x, same, is_left) for x, same in inner):
+            return True
     return False
 
 
@@ -60,10 +60,14 @@ def _to_hoist(jaxpr, constant: set, is_left: Callable) -> list:
     return found[::-1]
 
 
-def _of_branch(branch: ClosedJaxpr, equation, constant: set) -> set:
-    """Inputs of a case that are constant."""
-    operands = zip(branch.jaxpr.invars, equation.invars[1:], strict=True)
-    return {v for v, x in operands if isinstance(x, Literal) or x in constant} | set(branch.jaxpr.constvars)
+def _places(equation, constant: set) -> list[int]:
+    """Places of the operands of a condition's cases that are constant."""
+    return [k for k, x in enumerate(equation.invars[1:]) if isinstance(x, Literal) or x in constant]
+
+
+def _variables(program: ClosedJaxpr, places: Sequence[int]) -> set:
+    """What is constant at the start of a program, of which these inputs are."""
+    return {program.jaxpr.invars[place] for place in places} | set(program.jaxpr.constvars)
 
 
 def _run(program: ClosedJaxpr, leaves: Sequence, constant: set, is_left: Callable) -> list:
@@ -104,7 +108,7 @@ def _run_loop(loop, given: list, is_left: Callable) -> list:
     """A loop, and before it what is hoisted out of it."""
     parameters = loop.params
     n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
-    body, consts = hoisted(parameters["body_jaxpr"], is_left, n_body), given[n_cond : n_cond + n_body]
+    body, consts = hoisted(parameters["body_jaxpr"], is_left, range(n_body)), given[n_cond : n_cond + n_body]
     constants = body.jaxpr.invars[:n_body]
     more = _to_hoist(body.jaxpr, set(constants) | set(body.jaxpr.constvars), is_left)
     body, found = _without(body, more, dict(zip(constants, consts)), n_body)
@@ -115,9 +119,10 @@ def _run_loop(loop, given: list, is_left: Callable) -> list:
 def _run_cases(equation, given: list, constant: set, is_left: Callable) -> list:
     """A condition, and before it what is hoisted out of its cases."""
     which, *operands = given
-    branches, found = [], []
+    branches, found, places = [], [], _places(equation, constant)
     for branch in equation.params["branches"]:
-        more = _to_hoist(branch.jaxpr, _of_branch(branch, equation, constant), is_left)
+        branch = hoisted(branch, is_left, places)
+        more = _to_hoist(branch.jaxpr, _variables(branch, places), is_left)
         values = dict(zip(branch.jaxpr.invars, operands))
         branches.append(_without(branch, more, values, len(branch.jaxpr.invars)))
         found += branches[-1][1]

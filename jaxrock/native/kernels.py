@@ -5,6 +5,7 @@ Several threads may call such a function with the same arguments: each takes lan
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ def is_long(shape: tuple[int, ...]) -> bool:
     return len(shape) == 1 and shape[0] > SMALL
 
 
-class _Frame:
+class Frame:
     """A function `void name(void **outputs, void **inputs, int64 *next)`.
 
     The first input tells for how many lanes there is room in the arrays, and how many are wanted (int32 both); `next`
@@ -52,8 +53,8 @@ class _Frame:
         self.e = Emitter(self.b, lanes)
         self.sources = [self._array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
         self.targets = [self._array(outputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.outvars)]
-        sizes = self._array(inputs, 0, np.int32)
-        self.width, self.count = (self.b.sext(self.b.load(self.b.gep(sizes, [_I32(i)])), _I64) for i in (0, 1))
+        self.sizes = self._array(inputs, 0, np.int32)
+        self.width, self.count = (self.b.sext(self.b.load(self.b.gep(self.sizes, [_I32(i)])), _I64) for i in (0, 1))
 
     def _array(self, of, index: int, dtype):
         kind = _I8 if dtype == np.bool_ else self.e.kind(dtype)
@@ -73,13 +74,14 @@ class _Frame:
 
     def load(self, pointer, at):
         """Numbers for all lanes; flags are bytes in memory."""
-        return self._as_flag(pointer, self.b.load(self.vector(pointer, at), align=1))
+        return self.as_flag(pointer, self.b.load(self.vector(pointer, at), align=1))
 
     def load_shared(self, pointer, number: int):
         """A number that all lanes share."""
-        return self._as_flag(pointer, self.e.splat(self.b.load(self.b.gep(pointer, [_I64(number)]))))
+        return self.as_flag(pointer, self.e.splat(self.b.load(self.b.gep(pointer, [_I64(number)]))))
 
-    def _as_flag(self, pointer, value):
+    def as_flag(self, pointer, value):
+        """What was loaded from there; flags are bytes in memory."""
         is_flag = pointer.type.pointee == _I8
         return self.b.icmp_unsigned("!=", value, self.e.constant_of(0, value.type)) if is_flag else value
 
@@ -108,7 +110,7 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     (at least 1). What is not `shared` has an axis of lanes.
     """
     jaxpr = program.jaxpr
-    f = _Frame(jaxpr, lanes, name)
+    f = Frame(jaxpr, lanes, name)
     b, e = f.b, f.e
     head, inside, after = (b.append_basic_block(name) for name in ("lanes", "program", "end"))
     b.branch(head)
@@ -136,13 +138,15 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
 
 def emit_loop(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """As `emit`, of a program that is one loop: a lane that is done takes the next scene, and waits for no other."""
-    return _Refilled(_Frame(program.jaxpr, lanes, name), program, shared).module()
+    return Refilled(Frame(program.jaxpr, lanes, name), program, shared).module()
 
 
-class _Refilled:
-    """A loop whose lanes are filled again. What changes with a lane's scene is kept on the stack meanwhile."""
+class Refilled:
+    """A loop whose lanes are filled again. What changes with a lane's scene is kept on the stack meanwhile, in as many
+    slots as there are lanes, or more."""
 
-    def __init__(self, frame: _Frame, program, shared: list[bool]):
+    def __init__(self, frame: Frame, program, shared: list[bool], slots: int | None = None):
+        self.slots = slots or frame.e.lanes
         self.f, self.b, self.e, jaxpr = frame, frame.b, frame.e, program.jaxpr
         (self.equation,) = jaxpr.eqns
         self.shared = dict(zip(jaxpr.invars, shared, strict=True))
@@ -161,7 +165,7 @@ class _Refilled:
         self.changing = [each for v in self.carry for each in self._rooms(v)]
 
     def _room(self, kind):
-        room = self.b.alloca(kind, self.e.lanes)
+        room = self.b.alloca(kind, self.slots)
         room.align = 64
         return room
 
@@ -184,9 +188,7 @@ class _Refilled:
     def module(self) -> ir.Module:
         """The function."""
         f, b, e = self.f, self.b, self.e
-        for i in range(e.lanes):
-            b.store(_I64(-1), b.gep(self.scene, [_I64(i)]))
-            b.store(_I8(1), b.gep(self.ready, [_I64(i)]))
+        self._each_lane(self._clear)
         outer, run, end = (b.append_basic_block(name) for name in ("refill", "run", "end"))
         e.before.append(b.block)
         b.branch(outer)
@@ -195,13 +197,13 @@ class _Refilled:
         active = f.load(self.active, _I64(0))
         b.cbranch(e.any(active), run, end)
         b.position_at_end(run)
-        carry = like([self._like(v) for v in self.carry], [self._take(room) for *_, room in self.changing])
+        carry = self._state(self._take)
         more = b.icmp_signed("<", b.load_atomic(f.next, "monotonic", 8), f.count)
 
         def leaves(going):
             return b.and_(more, e.any(b.and_(active, b.not_(going))))
 
-        state, going = e.loop(self.equation.params, self._consts() + carry, active, leaves)
+        state, going = e.loop(self.equation.params, self._consts(self._take) + carry, active, leaves)
         for value, (_, _, room) in zip(flat(state), self.changing, strict=True):
             f.store(value, room, _I64(0))
         f.store(b.not_(going), self.ready, _I64(0))
@@ -219,36 +221,49 @@ class _Refilled:
         shape = variable.aval.shape
         return np.empty(shape, object) if shape else None
 
-    def _consts(self) -> list:
+    def _state(self, take: Callable) -> list:
+        """What stands for the state of the loop; `take(room)`: the numbers of lanes from their slots."""
+        return like([self._like(v) for v in self.carry], [take(room) for *_, room in self.changing])
+
+    def _consts(self, take: Callable) -> list:
         """What stands for the constants of the loop."""
         rooms = iter([room for *_, room in self.own])
         values = dict(self.known)
         for v in self.consts:
             if self._is_given(v) and v not in values:
-                values[v] = self.f.argument(v, self.of[v], False, lambda *_: self._take(next(rooms)), self._starts)
+                values[v] = self.f.argument(v, self.of[v], False, lambda *_: take(next(rooms)), lambda size: self._starts(take, size))
         return [values[v] if self._is_given(v) else self.e.known(self._constant(v), kind_of(v)) for v in self.consts]
 
-    def _starts(self, size: int) -> list:
-        b = self.b
-        starts = [b.mul(b.load(b.gep(self.scene, [_I64(i)])), _I64(size)) for i in range(self.e.lanes)]
+    def _starts(self, take: Callable, size: int) -> list:
+        scene = take(self.scene)
+        starts = [self.b.mul(self.e.lane(scene, i), _I64(size)) for i in range(self.e.lanes)]
         self.e.remember(starts, 1)
         return starts
 
-    def _each_lane(self, function) -> None:
+    def _clear(self, lane) -> None:
+        self.b.store(_I64(-1), self.b.gep(self.scene, [lane]))
+        self.b.store(_I8(1), self.b.gep(self.ready, [lane]))
+
+    def _each_lane(self, function, first=_I64(0), count=None) -> None:
+        """`function(slot)` of one after the other, from the first on."""
         b = self.b
         before, head, after = b.block, b.append_basic_block("lane"), b.append_basic_block("lanes")
         b.branch(head)
         b.position_at_end(head)
         lane = b.phi(_I64)
-        with b.if_then(b.icmp_signed("!=", b.load(b.gep(self.ready, [lane])), _I8(0))):
-            function(lane)
+        function(b.add(first, lane))
         following = b.add(lane, _I64(1))
         lane.add_incoming(_I64(0), before)
         lane.add_incoming(following, b.block)
-        b.cbranch(b.icmp_signed("<", following, _I64(self.e.lanes)), head, after)
+        b.cbranch(b.icmp_signed("<", following, _I64(self.e.lanes) if count is None else count), head, after)
         b.position_at_end(after)
 
     def _exchange(self, lane) -> None:
+        """Store what a lane has found that is ready, and load its next scene."""
+        with self.b.if_then(self.b.icmp_signed("!=", self.b.load(self.b.gep(self.ready, [lane])), _I8(0))):
+            self._exchanged(lane)
+
+    def _exchanged(self, lane) -> None:
         """Store what a lane has found, and load its next scene; where there is none, the last, for nothing."""
         b, count = self.b, self.f.count
         scene, active = b.gep(self.scene, [lane]), b.gep(self.active, [lane])

@@ -268,12 +268,13 @@ OPERATIONS: dict[str, Callable] = {
     "select_n": _choose,
     "convert_element_type": _convert,
     "keep": lambda e, _, value, witness: value,  # what is in a register is computed once
+    "lanes_part": lambda e, *_: e.constant(True, bool),
     "unseen_one": lambda e, q, _: e.constant(1, q.outvars[0].aval.dtype),
     "bitcast_convert_type": lambda e, q, x: e.b.bitcast(x, e.vector(q.params["new_dtype"])),
 }
 
 # What changes no value.
-NOTHING = ("stop_gradient", "copy", "reshard", "pvary", "pcast")
+NOTHING = ("stop_gradient", "copy", "apart", "reshard", "pvary", "pcast")
 
 
 OPERATIONS |= dict.fromkeys(NOTHING, lambda e, _, x: x)

@@ -55,10 +55,11 @@ class End(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """Taylor coefficients about a start: the opening angle, its sine and cosine, the arm, and, where the ground moves
-    vertically, the restoring moment."""
+    """Taylor coefficients about a start: the opening angle, its speed, sine and cosine, the arm, and, where the ground
+    moves vertically, the restoring moment."""
 
     opening: list[Scalar]
+    speed: list[Scalar]
     sine: list[Scalar]
     cosine: list[Scalar]
     arm: list[Scalar | None]
@@ -66,9 +67,11 @@ class Expansion(NamedTuple):
 
 
 def _total(terms: list) -> Any:
-    """Their sum, in four chains side by side: additions one after the other would wait for each other."""
-    chains = [sum(terms[i + 4 :: 4], start=terms[i]) for i in range(min(4, len(terms)))]
-    return sum(chains[1:], start=chains[0]) if len(chains) < 4 else (chains[0] + chains[1]) + (chains[2] + chains[3])
+    """Their sum, from the middle outwards: in products of series the outer terms are the newest, and the sum of the
+    others need not wait for them."""
+    middle = (len(terms) - 1) / 2
+    first, *rest = sorted(range(len(terms)), key=lambda place: abs(place - middle))
+    return sum((terms[place] for place in rest), start=terms[first])
 
 
 def _product(first: list, second: list, k: int) -> Any:
@@ -88,6 +91,10 @@ def expand(start: Start, order: int) -> Expansion:
     scale = keep_by(-(start.stretch**2), one)
     pushes = [keep_by(scale * start.side, one) * u for u in start.shaking.horizontal]
     scaled = moments.restoring_terms.each(lambda c: keep_by(scale * c, one))
+    # Under a straight line every term is a few products, of the moment and the arm together: the oldest come first.
+    straight = start.shaking.vertical is None and len(pushes) <= 2
+    now, *before = (moments.arm_terms.each(lambda c, push=push: keep_by(push * c, one)) for push in pushes)
+    now, last = now.plus(scaled), None
     for k in range(order - 1):
         if moments.trigonometric and k > 0:
             sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
@@ -95,18 +102,23 @@ def expand(start: Start, order: int) -> Expansion:
         basis = Basis.of_term(k, x, sine, cosine)
         arm = moments.arm_terms.along(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
-        moment = _product(pushes, arms, k)
-        restoring = scaled.along(basis, empty=None)
-        moment = moment if restoring is None else moment + restoring
+        if straight:
+            products = before[0].products(last) if before and last else []
+            moment = sum(products + now.products(basis), start=0.0)
+        else:
+            moment = _product(pushes, arms, k)
+            restoring = scaled.along(basis, empty=None)
+            moment = moment if restoring is None else moment + restoring
+        last = basis
         if start.shaking.vertical is not None:
             restorings.append(moments.restoring_terms.along(basis, empty=None))
             moment = moment + scale * _product(start.shaking.vertical, restorings, k)
-        term = keep_by(moment * (1 / ((k + 1) * (k + 2))), one)
+        slope = keep_by(moment * (1 / (k + 1)), one)
         if k == 0:
-            term = jnp.where(start.uplifting, 0.0, term)  # by continuity, exactly
-        x.append(term)
-        slopes.append((k + 2) * term)
-    return Expansion(x, sine, cosine, arms, restorings)
+            slope = jnp.where(start.uplifting, 0.0, slope)  # by continuity, exactly
+        slopes.append(slope)
+        x.append(slope * (1 / (k + 2)))
+    return Expansion(x, slopes, sine, cosine, arms, restorings)
 
 
 class _Weights(NamedTuple):

@@ -21,7 +21,9 @@ from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
+from jaxrock.engines.taylor.glide import Glide, onward, settled
 from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.numerics.apart import apart, lanes_part
 from jaxrock.numerics.newton import root_between
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
@@ -361,6 +363,32 @@ def most_steps(pieces: int) -> int:
     return POLICY.fast_steps + 3 * pieces
 
 
+def _follow_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
+    """Lanes glide while nothing happens, and part with the others where something may: that takes many times as long."""
+
+    strongest = stepper.scene.outlook.strongest_drive
+
+    def step(carry):
+        s, glide = carry
+
+        def of(step):
+            def stepped():
+                after = step(stepper, settled(stepper, s, glide, strongest))
+                return after, Glide.of(after)
+
+            return stepped
+
+        def careful():
+            return jax.lax.cond(apart(s.side == 0), of(wait), of(advance))
+
+        return jax.lax.cond(apart(lanes_part() & glide.goes), lambda: onward(stepper, s, glide), careful)
+
+    def going(carry):
+        return ~carry[0].done & (carry[0].steps < limit)
+
+    return settled(stepper, *jax.lax.while_loop(going, step, (state, Glide.of(state))), strongest)
+
+
 def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
     """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
     limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
@@ -372,11 +400,7 @@ def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) ->
         return state.side == 0
 
     if POLICY.is_record(stepper.scene.most_pieces):
-        # Among many lanes under a record some rest at any time: each takes the step it needs.
-        def step(s):
-            return jax.lax.cond(resting(s), lambda: wait(stepper, s), lambda: advance(stepper, s))
-
-        return until(lambda s: True, step)(state)
+        return _follow_record(stepper, state, limit)
     rest = until(resting, lambda s: wait(stepper, s))
     rock = until(lambda s: ~resting(s), lambda s: advance(stepper, s))
     return until(lambda s: True, lambda s: rock(rest(s)))(state)
