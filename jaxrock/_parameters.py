@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxrock._checks import RANGES, Range, finite, one_of, together
+from jaxrock._checks import RANGES, Range, check_shapes, finite, one_of
 
 
 class Parameter(NamedTuple):
@@ -85,7 +85,7 @@ def set_parameters(owner: eqx.Module, **values: Any) -> None:
         if array.size == 0:
             raise ValueError(f"Argument `{called}` must hold at least one number, but has shape {array.shape}.")
         setattr(owner, name, array)
-    together(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
+    check_shapes(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
 
 
 if TYPE_CHECKING:

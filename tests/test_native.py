@@ -207,7 +207,7 @@ def test_lanes_are_filled_again(count):
         np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
-@pytest.mark.parametrize("refilled", [False, True], ids=["together", "refilled"])
+@pytest.mark.parametrize("refilled", [False, True], ids=["in step", "refilled"])
 @pytest.mark.parametrize("threads", [2, 7])
 def test_threads_share_lanes(threads, refilled):
     """Each lane is done by one of them, once; of those that are not wanted nothing is asked."""
@@ -221,8 +221,8 @@ def test_threads_share_lanes(threads, refilled):
     x, turns = jnp.asarray(random.random(3001)), jnp.asarray(random.integers(0, 2000, 3001))
 
     given = function, [x, turns], [False, False], refilled
-    alone, together, some = run(*given), run(*given, threads=threads), run(*given, 1111, threads)
-    for one, other, part in zip(alone, together, some, strict=True):
+    alone, shared, some = run(*given), run(*given, threads=threads), run(*given, 1111, threads)
+    for one, other, part in zip(alone, shared, some, strict=True):
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(one[:1111], part[:1111])
     np.testing.assert_array_equal(alone[1], turns)

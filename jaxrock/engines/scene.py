@@ -13,9 +13,9 @@ from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.outlook import Outlook
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
+from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking, sum_of_series
-from jaxrock.motions.together import in_place as found_in_place, is_in_place
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]

@@ -165,7 +165,7 @@ def find_record(
     search = Search(site, size, allowed_changes(*space, None if kept is None else kept.rows))
     if search.reached(np.zeros((1, samples.size)))[0]:
         return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0, kept)
-    scaling = min(_length(search.along(direction)) for direction in (samples, -samples))
+    scaling = min(_length(search.in_direction(direction)) for direction in (samples, -samples))
     for _ in range(_ROUNDS):
         bar = Progress(starts * steps, "record", progress)
         directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
@@ -181,7 +181,7 @@ def _nearest(search: Search, directions: "_Directions", starts: int, steps: int,
     """The lengths to which all starts come, and what the shortest is of."""
     found = []
     for number in range(starts):
-        reached = search.along(directions(number))
+        reached = search.in_direction(directions(number))
         found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
         bar.add((number + 1) * steps - bar.done)
     lengths = [_length(each) for each in found]
@@ -246,7 +246,7 @@ class _Directions(NamedTuple):
     def __call__(self, number: int) -> np.ndarray:
         """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby."""
         if number == 0:
-            louder, softer = (self.search.along(self.search.allowed(x)) for x in (self.samples, -self.samples))
+            louder, softer = (self.search.in_direction(self.search.allowed(x)) for x in (self.samples, -self.samples))
             best = min(louder, softer, key=_length)
             return self.samples * 0.0 if best is None else best.direction
         if number == 1:

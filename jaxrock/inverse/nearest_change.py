@@ -110,7 +110,7 @@ class Search(NamedTuple):
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)
 
-    def along(self, direction: np.ndarray) -> Found | None:
+    def in_direction(self, direction: np.ndarray) -> Found | None:
         """The first change in a direction that does what is wanted, about; None: there is none."""
         scale = rms(direction)
         if not scale > 0:

@@ -18,9 +18,9 @@ from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record, with_room
-from jaxrock.motions.together import Chosen, Together
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
@@ -111,8 +111,8 @@ class Suite(AbstractNamed):
         """The motion of a traced number."""
         if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
             with contextlib.nullcontext() if is_traced(self.groups) else jax.ensure_compile_time_eval():
-                together = Together.of([record for record in self.motions() if isinstance(record, Record)])
-            return Chosen(together, number, jnp.ones((), together.samples.dtype))
+                joined = JoinedRecords.of([record for record in self.motions() if isinstance(record, Record)])
+            return Chosen(joined, number, jnp.ones((), joined.samples.dtype))
         kinds = {jax.tree.structure(group) for group in self.groups}
         if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
             raise ValueError(

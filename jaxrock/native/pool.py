@@ -21,7 +21,7 @@ _CLOSED = 1 << 32  # no more may begin; more than there are threads
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
-def together(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
+def call_in_threads(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
     """Call a program in this thread and, where there are many lanes, at the same time in others.
 
     `tables`: of outputs and of inputs; `interface`, `context`: what XLA has passed for calls of its own functions.

@@ -93,13 +93,13 @@ def expand(start: Start, order: int) -> Expansion:
             sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
             cosine.append(keep_by(_product(slopes, sine, k - 1) * (-1 / k), one))
         basis = Basis.of_term(k, x, sine, cosine)
-        arm = moments.arm_terms.along(basis, empty=None)
+        arm = moments.arm_terms.summed(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
         moment = _product(pushes, arms, k)
-        restoring = scaled.along(basis, empty=None)
+        restoring = scaled.summed(basis, empty=None)
         moment = moment if restoring is None else moment + restoring
         if start.shaking.vertical is not None:
-            restorings.append(moments.restoring_terms.along(basis, empty=None))
+            restorings.append(moments.restoring_terms.summed(basis, empty=None))
             moment = moment + scale * _product(start.shaking.vertical, restorings, k)
         term = keep_by(moment * (1 / ((k + 1) * (k + 2))), one)
         if k == 0:
@@ -197,7 +197,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     def of(own):
         of_term, of_source = backwards(own)
 
-        def along(_, terms, sign=None):
+        def gain(_, terms, sign=None):
             terms = [term for term in terms if term is not None]
             return sum(w * (term if sign is None else sign * term) for w, term in zip(of_source, terms))
 
@@ -209,8 +209,8 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
         horizontal, vertical = start.shaking
         zero = jnp.zeros_like(length)
         moments = Coefficients(
-            start.moments.restoring_terms.each(along, sources.restoring),
-            start.moments.arm_terms.each(functools.partial(along, sign=side), sources.arm),
+            start.moments.restoring_terms.each(gain, sources.restoring),
+            start.moments.arm_terms.each(functools.partial(gain, sign=side), sources.arm),
         )
         of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
         shaking = Shaking(
