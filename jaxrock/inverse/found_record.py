@@ -50,7 +50,7 @@ class RecordStatus(Enumeration):
     )
     spectrum_changed = item(
         "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "
-        "5 %: see `spectrum`."
+        "5 %: see `spectrum`. No change was found that keeps it; fewer periods or a wider `band` may help."
     )
     not_reached = item(
         "No change was found that makes margins as wanted: none on straight lines from the start, nor on the way of "
@@ -166,10 +166,14 @@ def find_record(
     if search.reached(np.zeros((1, samples.size)))[0]:
         return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0, kept)
     scaling = min(_length(search.in_direction(direction)) for direction in (samples, -samples))
+    best, lengths = None, []
     for _ in range(_ROUNDS):
         bar = Progress(starts * steps, "record", progress)
         directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
-        lengths, best = _nearest(search, directions, starts, steps, bar)
+        reached, nearest = _nearest(search, directions, starts, steps, bar)
+        if best is not None and nearest is None:
+            break  # the last one stays, and its status says that the spectrum does not
+        lengths, best = reached, nearest
         more = None if kept is None or best is None else kept.kept_at(samples + best.change)
         if more is None:
             break
