@@ -27,9 +27,9 @@ class JoinedRecords(Owner):
 
     samples: Inexact[Array, " places"] = parameter("g", strength, axes=1)
     dt: Inexact[Array, " records"] = parameter("s", size, axes=1)
-    first: Int[Array, " records"]  # place of each
-    count: Int[Array, " records"]  # samples of each
-    owner: Int[Array, " places"]  # which record has a place
+    first: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # place of each
+    count: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # samples of each
+    owner: Int[Array, " places"] = parameter("-", axes=1, is_whole=True)  # which record has a place
     longest: int = eqx.field(static=True)  # room for the samples of any
 
     @classmethod
@@ -101,7 +101,7 @@ class Chosen(AbstractChosen):
     """One of many records, by its number, which may be traced: what `suite[number]` is."""
 
     joined: JoinedRecords
-    record: Int[Array, "..."] = parameter("-", is_free=False)
+    record: Int[Array, "..."] = parameter("-", is_free=False, is_whole=True)
     sure: Inexact[Array, "..."] = parameter("-", is_free=False)  # 1; what is not a number where there is no such record
 
     @property
