@@ -236,7 +236,7 @@ def if_known(allowed: Range, name: str, value: Values) -> Inexact[Array, "..."]:
     return array if isinstance(array, jax.core.Tracer) else allowed(name, array)
 
 
-def together(**arrays: Array | None) -> None:
+def check_shapes(**arrays: Array | None) -> None:
     """Raise ValueError for arguments whose shapes do not go together."""
     shapes = {name: array.shape for name, array in arrays.items() if array is not None}
     if len({*shapes.values(), ()}) <= 2:

@@ -48,9 +48,16 @@ class Task(ctypes.Structure):
                 ("task", ctypes.c_void_p), ("data", ctypes.c_void_p)]  # fmt: skip
 
 
+class Done(ctypes.Structure):
+    """With an error, which XLA may free."""
+
+    _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("error", ctypes.c_void_p)]
+
+
 class Interface(ctypes.Structure):
     _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api_version", Version),
-                ("internal", ctypes.c_void_p), ("create_error", _Complain), ("others", ctypes.c_void_p * 10),
+                ("internal", ctypes.c_void_p), ("create_error", _Complain), ("get_message", ctypes.c_void_p),
+                ("destroy_error", ctypes.c_void_p), ("others", ctypes.c_void_p * 8),
                 ("schedule", ctypes.c_void_p)]  # fmt: skip
 
 

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxrock._checks import RANGES, Range, finite, one_of, together
+from jaxrock._checks import RANGES, Range, check_shapes, finite, one_of
 
 
 class Parameter(NamedTuple):
@@ -31,6 +31,7 @@ class Parameter(NamedTuple):
     follows: str = ""  # the property that tells its value where it is not given
     is_free: bool = True  # whether it is one of its own: what only repeats another is not
     argument: str = ""  # of the owner's maker, where it has another name
+    is_whole: bool = False  # whether it counts, or is a place, and stays a whole number
 
 
 _UNDECLARED = Parameter(axes=None)
@@ -45,6 +46,7 @@ def parameter(
     follows: str = "",
     is_free: bool = True,
     argument: str = "",
+    is_whole: bool = False,
 ) -> Any:
     """Declare a field of a block, a motion or a model as a parameter.
 
@@ -59,12 +61,14 @@ def parameter(
     - `follows`: name of the property that tells its value where the field is None.
     - `is_free`: whether it can be varied by itself.
     - `argument`: what the owner's maker calls it, if not by the name of the field.
+    - `is_whole`: whether it is a count or a place among others, which stays a whole number. All other numbers of a
+      block or a motion are real, of whatever kind they are given.
 
     **Returns:** a field for an Equinox module.
     """
     if isinstance(range, str):
         range = RANGES[one_of("range", range, tuple(RANGES))]
-    return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free, argument)})
+    return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free, argument, is_whole)})
 
 
 def declared(kind: type) -> dict[str, Parameter]:
@@ -85,7 +89,7 @@ def set_parameters(owner: eqx.Module, **values: Any) -> None:
         if array.size == 0:
             raise ValueError(f"Argument `{called}` must hold at least one number, but has shape {array.shape}.")
         setattr(owner, name, array)
-    together(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
+    check_shapes(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
 
 
 if TYPE_CHECKING:
@@ -118,7 +122,8 @@ class Leaf(NamedTuple):
     def is_number(self) -> bool:
         """Whether it is one number for a scene, by which derivatives may be taken."""
         one = self.declared.axes == 0 or (self.declared.axes is None and jnp.ndim(self.value) == 0)
-        return one and self.declared.is_free and jnp.issubdtype(jnp.result_type(self.value), jnp.inexact)
+        free = self.declared.is_free and not self.declared.is_whole
+        return one and free and jnp.issubdtype(jnp.result_type(self.value), jnp.inexact)
 
 
 def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECLARED) -> Iterator[Leaf]:
@@ -154,6 +159,12 @@ def broadcast(owner: Any, shape: tuple[int, ...]) -> Any:
 def one_of_many(owners: Any, index: Any) -> Any:
     """One of many owners in one tree, whose numbers have a leading axis."""
     return jax.tree.map(lambda x, own: x if own else x[index], owners, shared(owners))
+
+
+def in_precision(owner: Any, dtype: Any) -> Any:
+    """The owner with all its numbers as real ones of this kind, but for what is declared whole."""
+    leaves = [leaf.value if leaf.declared.is_whole else jnp.asarray(leaf.value, dtype) for leaf in leaves_of(owner)]
+    return jax.tree.unflatten(jax.tree.structure(owner), leaves)
 
 
 def check_single(**owners: Any) -> None:

@@ -68,7 +68,7 @@ def scenes(ndim: int) -> tuple[str, ...]:
     return ("scene",)[:ndim] if ndim < 2 else tuple(f"scene_{i}" for i in range(ndim))
 
 
-def along_time(time, histories: dict[str, tuple[Any, str]]) -> dict[str, Column]:
+def over_time(time, histories: dict[str, tuple[Any, str]]) -> dict[str, Column]:
     """Columns of histories, each with its unit: over the time of one scene, or sample by sample of many."""
     many = scenes(np.ndim(time) - 1)
     axes = (*many, "sample" if many else "time")

@@ -696,7 +696,16 @@ CALLS: dict[str, Call] = {
     ),
     "parameter": Call(
         rk.parameter,
-        {"unit": "s", "range": "positive", "symbol": "T", "axes": 0, "follows": "", "is_free": True, "argument": ""},
+        {
+            "unit": "s",
+            "range": "positive",
+            "symbol": "T",
+            "axes": 0,
+            "follows": "",
+            "is_free": True,
+            "argument": "",
+            "is_whole": False,
+        },
     ),
 }
 

@@ -136,7 +136,7 @@ def solver(model, kind, delayed, engine):
     return in_batches
 
 
-def changes_along(group, found):
+def changes_within(group, found):
     """Where the edge lies between neighbours: verdicts, or numbers of impacts of safe blocks."""
     lost = np.asarray(found.overturned)
     return lost if group.edge == "boundary" else np.where(lost, -1, np.asarray(found.impact_count))
@@ -154,7 +154,7 @@ def on_the_edge(group, random):
     def value(scenes, tuned):
         scenes = scenes.copy()
         scenes[:, column] = tuned
-        return changes_along(group, solve(scenes))
+        return changes_within(group, solve(scenes))
 
     chosen, lows, highs = [], [], []
     while sum(map(len, chosen)) < group.count:

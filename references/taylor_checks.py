@@ -250,7 +250,7 @@ def safe_points(table):
     return {"papers, linear sine pulses": worst}
 
 
-def along(path, states, impacts, start):
+def compared_on(path, states, impacts, start):
     """Pairs of found and known numbers along a path: states, and impacts with their times since `start`."""
     for known, (x, v) in zip(states, path.states):
         yield from ((x, known["theta"]), (v, known["thetadot"]))
@@ -280,7 +280,7 @@ def nonlinear(table):
                 # Without loss at impact the same peak comes again: the first one counts.
                 if row["t_theta_max_s"] in same:
                     pairs.append((path.peak_time - start, same[0]))
-            pairs += along(path, row["states"], row["first_impacts"], start)
+            pairs += compared_on(path, row["states"], row["first_impacts"], start)
             worst = max([worst, *(abs(a.mpf(own - a.number(text))) for own, text in pairs)])
     return {"papers, nonlinear pulses": worst}
 
@@ -298,7 +298,7 @@ def ricker(table):
             )  # fmt: skip
             path = follow(scene, 1, [center + a.number(state["t"]) for state in known["states"]], a)
             pairs = [(path.peak, known["theta_max_rad"]), (path.peak_time - center, known["t_theta_max"])]
-            pairs += along(path, known["states"], known["impacts"], center)
+            pairs += compared_on(path, known["states"], known["impacts"], center)
             worst = max([worst, *(abs(a.mpf(own - a.number(text))) for own, text in pairs)])
     return {"papers, Ricker pulses": worst}
 

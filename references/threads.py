@@ -107,7 +107,7 @@ def answer(question: Callable) -> str:
     return found if isinstance(found, str) else told(found)
 
 
-def together(seconds: float, threads: int, seed: int, right: dict[str, str], folder: Path, few: bool) -> dict:
+def asked_by_threads(seconds: float, threads: int, seed: int, right: dict[str, str], folder: Path, few: bool) -> dict:
     """Threads that ask at random until the time is over, each at least once: how often what was asked, and what was
     answered wrongly."""
     asked, wrong, end = collections.Counter(), [], time.monotonic() + seconds
@@ -176,7 +176,7 @@ def work(plan: dict) -> None:
     jax.config.update("jax_enable_x64", True)
     folder = Path(plan["folder"])
     if "right" in plan:
-        found = together(plan["seconds"], plan["threads"], plan["seed"], plan["right"], folder, plan["few"])
+        found = asked_by_threads(plan["seconds"], plan["threads"], plan["seed"], plan["right"], folder, plan["few"])
     else:
         found = {name: answer(question) for name, question in questions(folder, plan["few"]).items()}
     print(json.dumps(found))

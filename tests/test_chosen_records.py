@@ -8,7 +8,7 @@ import pytest
 import jaxrock as rk
 from jaxrock._checks import is_traced
 from jaxrock.engines.scene import Scene
-from jaxrock.motions.together import Chosen, Together
+from jaxrock.motions.joined_records import Chosen, JoinedRecords
 
 SAMPLES = 1.5 * np.asarray(rk.example_record().samples)
 LENGTHS, STEPS = (300, 2, 310, 265), (0.01, 0.02, 0.005, 0.013)
@@ -46,7 +46,7 @@ def test_an_axis_of_records_beside_one_after_the_other(grid, by_hand, name):
 @pytest.mark.parametrize("number", range(4))
 def test_bounds_of_what_is_to_come_end_with_a_record(number):
     """They are those of the record alone: what follows in the array is another motion."""
-    motion = Chosen(Together.of(RECORDS), jnp.int32(number), jnp.ones(()))
+    motion = Chosen(JoinedRecords.of(RECORDS), jnp.int32(number), jnp.ones(()))
     among = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=True)
     alone = Scene.of(BLOCK, 2.0 * RECORDS[number], rk.Linear())
     here = slice(int(among.first), int(among.pieces) + 1)
@@ -98,7 +98,7 @@ def test_lanes_share_the_samples_of_all_records():
 def test_what_is_known_stays_so():
     """Else every call would put all records together again, and every suite be a program of its own."""
     found = []
-    jax.jit(lambda number: found.append(SUITE[number].together) or number)(1)
+    jax.jit(lambda number: found.append(SUITE[number].joined) or number)(1)
     assert not is_traced(found)
 
 
@@ -116,7 +116,7 @@ def test_numbers_without_a_record_are_no_other_record():
     exported = jax.export.export(compiled)(jax.ShapeDtypeStruct(numbers.shape, numbers.dtype))
     expected = [np.nan, *SUITE.peak_acceleration[jnp.array([0, 3])], np.nan]
     np.testing.assert_allclose(exported.call(numbers), expected, rtol=1e-12)
-    nothing = Chosen(Together.of(RECORDS), jnp.int32(0), jnp.asarray(jnp.nan))
+    nothing = Chosen(JoinedRecords.of(RECORDS), jnp.int32(0), jnp.asarray(jnp.nan))
     scene = Scene.of(BLOCK, 2.0 * nothing, rk.Linear(), in_place=True)
     shaking, _ = scene.shaking(jnp.int32(0), jnp.zeros(()), 8)
     assert np.isnan([scene.outlook.strongest_drive, *shaking.horizontal[:2]]).all()

@@ -136,6 +136,22 @@ def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
     assert (tmp_path / "out" / "impacts.csv").read_text() == "time_s,velocity_before_rad_per_s\n"
 
 
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_no_film_of_a_block_that_never_moves(words, at2, tmp_path, capsys, monkeypatch):
+    """It says so at once; a film of an earlier run, which would be overwritten, is not left beside these results."""
+    monkeypatch.setattr(rk.plot, "animate", lambda *_, **__: pytest.fail("draws a block that stands still"))
+    film = tmp_path / "out" / "animation.gif"
+    film.parent.mkdir()
+    film.write_bytes(b"GIF89a of a block that rocks")
+    assert main(["run", at2, *GIVEN, "--scale", "0.1", "--animate", "--out", str(film.parent), *words]) == 0
+    printed = capsys.readouterr().out
+    assert not film.exists() and str(film) not in printed
+    if words:
+        assert json.loads(printed)["results"]["overturned"] is False
+    else:
+        assert printed.splitlines()[-1] == "no film: the block never uplifts"
+
+
 def test_run_that_cannot_be_completed(command, at2):
     """Impacts that never die out: exit status 1, and the reason."""
     status, table, errors = command("run", at2, "--restitution", "1", "--model", "linear", "--duration", "1e6")

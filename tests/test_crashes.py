@@ -400,7 +400,7 @@ def test_many_processes_share_one_sweep_at_a_time(monkeypatch):
 def test_threads_at_once_answer_as_one_alone(tmp_path):
     wanted = {name: threads.answer(question) for name, question in threads.questions(tmp_path, few=True).items()}
     jax.clear_caches()  # they compile at once, too
-    found = threads.together(0.5, 8, 0, wanted, tmp_path, few=True)
+    found = threads.asked_by_threads(0.5, 8, 0, wanted, tmp_path, few=True)
     assert not found["wrong"] and sum(found["asked"].values()) >= 8
 
 

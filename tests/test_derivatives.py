@@ -129,8 +129,8 @@ def test_all_samples_of_a_record(model):
         # After the peak, and while the block rests, a sample changes nothing: exactly.
         quiet = np.isin(known["indices"], known["rest"] + known["after"])
         assert np.all(np.asarray(slopes)[np.array(known["indices"])[quiet]] == 0)
-        along = float(jnp.dot(slopes, record.samples))
-        assert along == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
+        summed = float(jnp.dot(slopes, record.samples))
+        assert summed == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
 
 
 SETTINGS = {"linear": {"model": rk.Linear(), "engine": rk.Series(order=6)}, "nonlinear": {}}
@@ -163,8 +163,8 @@ def test_many_blocks_by_all_samples(settings):
     np.testing.assert_allclose(jnp.einsum("brn,cn->cbr", rows, changes), differences, rtol=1e-6, atol=1e-9)
     each = jax.jit(jax.vmap(jax.jacrev(one, argnums=1), in_axes=(0, None)))(alpha, start)
     np.testing.assert_allclose(each[:, 0], rows[:, 0], rtol=1e-10, atol=1e-12)
-    along = jax.jit(lambda d: jax.jvp(many, (start,), (d,))[1])(changes[0])
-    np.testing.assert_allclose(along[:, 0], rows[:, 0] @ changes[0], rtol=1e-10)
+    pushed = jax.jit(lambda d: jax.jvp(many, (start,), (d,))[1])(changes[0])
+    np.testing.assert_allclose(pushed[:, 0], rows[:, 0] @ changes[0], rtol=1e-10)
     of_sum = jax.jit(jax.grad(lambda x: many(x)[:, 0].sum()))(start)
     np.testing.assert_allclose(of_sum, rows[:, 0].sum(axis=0), rtol=1e-10, atol=1e-12)
 

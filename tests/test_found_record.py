@@ -133,6 +133,29 @@ def test_allowed_changes_are_a_projection(band, baseline):
     assert np.linalg.matrix_rank(matrix) < 42 - 2 * baseline
 
 
+def test_what_leaves_nothing_leaves_no_rounding():
+    """Which would be a direction like any other, out of all bounds."""
+    project = allowed_changes(COUNT, DT, (1.0, 3.0), True, np.random.default_rng(0).normal(size=(4, COUNT)))
+    np.testing.assert_array_equal(project(np.random.default_rng(1).normal(size=(5, COUNT))), 0.0)
+
+
+NARROW = {"band": (1.0, 3.0), "spectrum": (0.25,), "starts": 2, "steps": 5}  # four numbers, of which three are held
+
+
+def test_what_was_found_stays_where_the_spectrum_cannot_be_kept():
+    """One number is left, by which the block topples; to keep the peak that then grows, none."""
+    kept = KeptSpectrum.of(np.array(NARROW["spectrum"]), np.asarray(START.samples), DT)
+    result = rk.inverse.find_record(BLOCK, START, **NARROW, **LINEAR)
+    change = np.asarray(result.record.samples - START.samples)
+    assert bool(result.status == rk.inverse.RecordStatus.spectrum_changed) and result.spectrum > 0.05
+    assert rk.outcome(BLOCK, result.record, **LINEAR).overturned and -1e-3 < result.margin[0] <= 0
+    np.testing.assert_allclose([result.change, np.min(result.changes)], size(change), rtol=1e-9)
+    allowed = allowed_changes(COUNT, DT, NARROW["band"], True, kept.rows)(change)
+    np.testing.assert_allclose(allowed, change, atol=1e-12)
+    again = kept.kept_at(np.asarray(result.record.samples))
+    np.testing.assert_array_equal(allowed_changes(COUNT, DT, NARROW["band"], True, again.rows)(np.eye(COUNT)), 0.0)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_least_change_under_several_bounds(seed):
     random = np.random.default_rng(seed)

@@ -72,12 +72,12 @@ def lognormal(median, dispersion):
 def assert_slopes(function, numbers):
     """Derivatives of all results in three directions against central differences of sixth order."""
     function = jax.jit(function)
-    along = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,))[1])
+    pushed = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,))[1])
     for seed in range(3):
         direction = numbers * np.random.default_rng(seed).normal(size=numbers.size)
         at = lambda n, h=1e-3, direction=direction: function(numbers + n * h * direction)
         differences = (45 * (at(1) - at(-1)) - 9 * (at(2) - at(-2)) + at(3) - at(-3)) / 0.06
-        np.testing.assert_allclose(along(numbers, direction), differences, rtol=1e-8)
+        np.testing.assert_allclose(pushed(numbers, direction), differences, rtol=1e-8)
 
 
 # --------------------------------------------------------------------------------------- hazard curves

@@ -96,8 +96,8 @@ def test_small_rotations_tell_alpha_and_p_only_together():
     assert found.status == rk.inverse.HistoryStatus.not_identified
     assert any("alpha" in warning and " p " in warning for warning in found.warnings)
     relative = found.covariance / np.outer(found.values, found.values)
-    together = np.array([1.0, 2.0, 0.0, 0.0])
-    assert np.sqrt(relative[0, 0]) > 0.25 and np.sqrt(together @ relative @ together) < 0.01
+    both = np.array([1.0, 2.0, 0.0, 0.0])
+    assert np.sqrt(relative[0, 0]) > 0.25 and np.sqrt(both @ relative @ both) < 0.01
     assert found["p"] ** 2 * found["alpha"] == pytest.approx(P**2 * ALPHA, rel=0.01)
 
 

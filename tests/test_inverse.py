@@ -161,7 +161,7 @@ def truth(seed, scatter=SCATTER):
     return ["toppled" if x else "survived" for x in overturned(amplitude=size, period=TRUTH["period"], **known)]
 
 
-def along(seen, **over):
+def logs_at(seen, **over):
     """The log-likelihood over lists of both parameters, which neither climbs nor interpolates."""
     found = rk.inverse.feasible_region(rk.inverse.Likelihood(seen, rk.SinePulse, SCATTER), over, progress=False)
     return np.asarray(found.log_likelihood)
@@ -171,10 +171,13 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     seen = rocks(truth(3))
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
     lists = {name: np.geomspace(float(x.low), float(x.high), 512) for name, x in UNKNOWNS.items()}
-    assert along(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
+    assert logs_at(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
     ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}
-    below = 2 * (float(found.log_likelihood) - along(seen, **lists | {"amplitude": ends["amplitude"]}).max(axis=1))
-    ratios = [below, 2 * (float(found.log_likelihood) - along(seen, **lists | {"period": ends["period"]}).max(axis=0))]
+    below = 2 * (float(found.log_likelihood) - logs_at(seen, **lists | {"amplitude": ends["amplitude"]}).max(axis=1))
+    ratios = [
+        below,
+        2 * (float(found.log_likelihood) - logs_at(seen, **lists | {"period": ends["period"]}).max(axis=0)),
+    ]
     for ratio, is_open in zip(np.ravel(ratios), np.ravel(found.open)):
         assert ratio < 3.84 + 0.01 if is_open else abs(ratio - 3.84) < 0.3
     assert np.sum(found.open) < 4
@@ -191,7 +194,7 @@ def test_a_posterior_is_that_of_a_grid():
     # Uniform in logarithms: so is the grid, of middles of cells.
     axes = [np.linspace(np.log(float(x.low)), np.log(float(x.high)), 161) for x in UNKNOWNS.values()]
     middles = [np.exp((axis[1:] + axis[:-1]) / 2) for axis in axes]
-    values = along(seen, amplitude=middles[0], period=middles[1])
+    values = logs_at(seen, amplitude=middles[0], period=middles[1])
     weights = np.exp(values - values.max()) / np.exp(values - values.max()).sum()
     for i, (name, axis, middle) in enumerate(zip(found.names, axes, middles)):
         share = weights.sum(axis=1 - i)

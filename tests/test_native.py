@@ -1,9 +1,13 @@
 """Machine code for many lanes at once does what JAX does for each."""
 
+import ctypes
 import logging
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 import pytest
 
@@ -15,6 +19,7 @@ import equinox as eqx  # noqa: E402
 import equinox.internal as eqxi  # noqa: E402
 
 import jaxrock as rk  # noqa: E402
+from jaxrock import _foreign  # noqa: E402
 from jaxrock.native import plain as plain_programs  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
@@ -207,7 +212,7 @@ def test_lanes_are_filled_again(count):
         np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
-@pytest.mark.parametrize("refilled", [False, True], ids=["together", "refilled"])
+@pytest.mark.parametrize("refilled", [False, True], ids=["in step", "refilled"])
 @pytest.mark.parametrize("threads", [2, 7])
 def test_threads_share_lanes(threads, refilled):
     """Each lane is done by one of them, once; of those that are not wanted nothing is asked."""
@@ -221,11 +226,60 @@ def test_threads_share_lanes(threads, refilled):
     x, turns = jnp.asarray(random.random(3001)), jnp.asarray(random.integers(0, 2000, 3001))
 
     given = function, [x, turns], [False, False], refilled
-    alone, together, some = run(*given), run(*given, threads=threads), run(*given, 1111, threads)
-    for one, other, part in zip(alone, together, some, strict=True):
+    alone, shared, some = run(*given), run(*given, threads=threads), run(*given, 1111, threads)
+    for one, other, part in zip(alone, shared, some, strict=True):
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(one[:1111], part[:1111])
     np.testing.assert_array_equal(alone[1], turns)
+
+
+def test_functions_of_xla_are_where_its_header_has_them():
+    header = Path(jaxlib.__file__).parent / "include" / "xla" / "ffi" / "api" / "c_api.h"
+    if not header.exists():
+        pytest.skip("a jaxlib without headers")
+    order = re.findall(r"^ *_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_(\w+)\);", header.read_text(), re.MULTILINE)
+    first, size = _foreign.Interface.create_error.offset, ctypes.sizeof(ctypes.c_void_p)
+    fields = {"create_error": "Error_Create", "get_message": "Error_GetMessage", "destroy_error": "Error_Destroy",
+              "schedule": "ThreadPool_Schedule"}  # fmt: skip
+    for own, name in fields.items():
+        assert getattr(_foreign.Interface, own).offset == first + size * order.index(name)
+
+
+@pytest.mark.parametrize("taken", [0, 1])
+def test_errors_of_a_pool_without_threads_are_given_back(taken):
+    """XLA answers with an error where it takes no task, which is then ours; this thread does what is left."""
+    (name,) = native.Plan(jax.make_jaxpr(lambda x: [x * x])(1.0), [False]).names
+    function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    handler, error, asked, freed = function(machine._machine()._engine.get_function_address(name)), 4096, [], []
+
+    @function
+    def schedule(address):
+        task = _foreign.Task.from_address(address)
+        asked.append(task.struct_size)
+        if len(asked) > taken:
+            return error
+        ctypes.CFUNCTYPE(None, ctypes.c_void_p)(task.task)(task.data)  # in the thread that asks, as XLA may
+
+    @function
+    def destroy(address):
+        done = _foreign.Done.from_address(address)
+        freed.append((done.struct_size, done.extension_start, done.error))
+
+    def buffers(*arrays):
+        each = [_foreign.Buffer(0, None, 0, x.ctypes.data) for x in arrays]
+        table = (ctypes.c_void_p * len(each))(*map(ctypes.addressof, each))
+        held.extend([each, table])
+        return _foreign.Buffers(size=len(each), buffers=ctypes.addressof(table))
+
+    held, x, found = [], np.arange(1024.0), np.zeros(1024)
+    interface = _foreign.Interface(
+        destroy_error=ctypes.cast(destroy, ctypes.c_void_p), schedule=ctypes.cast(schedule, ctypes.c_void_p)
+    )
+    frame = _foreign.Frame(api=ctypes.addressof(interface), stage=_foreign.EXECUTE, rets=buffers(found))
+    frame.args = buffers(np.array([x.size, x.size, 4], np.int32), x)
+    assert handler(ctypes.addressof(frame)) is None
+    assert len(asked) == taken + 1 and freed == [(24, None, error)]
+    np.testing.assert_array_equal(found, x * x)
 
 
 def test_exponential_less_one():

@@ -46,6 +46,41 @@ def test_peaks_of_motions(motion, peak, speed):
     np.testing.assert_allclose(rk.intensity.peak_velocity(motion), G * speed, rtol=1e-9)
 
 
+LINES = np.array([0.0, 0.3, -0.1, 0.2, -0.4, 0.0])
+NORTH, EAST = rk.Record(LINES, 0.2), rk.Record(LINES[::-1] / 2, 0.2)
+
+
+def peaks_of(factor):
+    """Of a suite that is made of a number: of a record, of both its components in two planes."""
+    both = rk.motions.Components(rk.Record(factor * LINES, 0.2), EAST)
+    suites = [rk.motions.Suite([rk.Record(factor * LINES, 0.2), EAST]), rk.motions.Suite([both], azimuth=[0.3, 1.2])]
+    return [peak for suite in suites for peak in (suite.peak_acceleration, suite.peak_velocity)]
+
+
+def test_a_suite_may_be_made_of_what_is_traced():
+    """By `jax.jit`, `jax.vmap` and `jax.grad`: as outside of them, and as peaks go with the factor."""
+    factors = jnp.array([0.5, 1.0, 2.0])
+    one_by_one = [np.stack(each) for each in zip(*map(peaks_of, factors))]
+    for found, compiled, expected in zip(jax.vmap(peaks_of)(factors), jax.jit(peaks_of)(2.0), one_by_one):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        np.testing.assert_allclose(compiled, expected[2], rtol=1e-12)
+    slope = jax.jacobian(lambda factor: peaks_of(factor)[0])(2.0)
+    np.testing.assert_allclose(slope, [0.4, 0.0], rtol=1e-12)
+
+
+def test_a_motion_that_does_not_move_is_refused_where_it_is_traced():
+    with pytest.raises(Exception, match="`motions` must move the ground"):
+        jax.block_until_ready(jax.jit(peaks_of)(0.0))
+
+
+def test_a_known_suite_stays_known_within_a_program():
+    """Its peaks are numbers, by which levels may be chosen."""
+    known = []
+    jax.jit(lambda x: known.append(rk.motions.Suite([NORTH, EAST])) or x)(1.0)
+    assert float(known[0].peak_acceleration[0]) == 0.4
+    np.testing.assert_array_equal(known[0].peak_velocity, rk.motions.Suite([NORTH, EAST]).peak_velocity)
+
+
 # --------------------------------------------------------------------------------------- verdicts
 
 DURATIONS = jnp.array([0.1, 0.3, 0.5, 0.8, 1.3])

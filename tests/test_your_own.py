@@ -4,6 +4,7 @@ Judges: the same motion as a record, the same model as one of the package.
 """
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -97,6 +98,56 @@ def test_a_motion_with_an_array():
     own, by_samples = slope(ramps()), slope(record()).samples
     np.testing.assert_allclose(own.corners, by_samples, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(own.height, by_samples @ CORNERS, rtol=1e-9)
+
+
+WHOLE = np.array([0, 3, -2, 3, -1, 0])  # times 0.1: the corners, about
+
+
+@pytest.mark.parametrize("kind", [jnp.int32, jnp.int64, jnp.uint8])
+def test_whole_numbers_are_numbers(kind):
+    """Of whatever kind they are, in a block, in a motion, in a record that was made so: as real ones."""
+
+    def answer(kind):
+        signed = jnp.asarray(WHOLE, jnp.int8 if kind is jnp.uint8 else kind)
+        block = eqx.tree_at(lambda block: block.p, BLOCK, jnp.asarray(2, kind))
+        own = Ramps(jnp.asarray(0.1), signed, jnp.asarray(1, kind), jnp.asarray(1, kind))
+        other = eqx.tree_at(lambda motion: motion.samples, record(), signed)
+        found = [rk.outcome(block, motion, **QUICK) for motion in (own, other, 0.1 * rk.Record(signed, 0.25))]
+        return [(each.max_rotation, each.margin, each.impact_count) for each in found]
+
+    np.testing.assert_allclose(answer(kind), answer(float), rtol=1e-14)
+    assert answer(kind)[2][0] > 0
+
+
+class Picked(rk.motions.AbstractMotion):
+    """One of many lists of corners, by its number."""
+
+    lists: jax.Array
+    number: jax.Array = rk.parameter("-", is_whole=True)
+    scales = None
+
+    @property
+    def _own(self):
+        return rk.Record(self.lists[self.number], 0.25, throw=False)
+
+    @property
+    def knots(self):
+        return self._own.knots
+
+    @property
+    def bounds(self):
+        return self._own.bounds
+
+    def series(self, piece, local, unit, order):
+        return self._own.series(piece, local, unit, order)
+
+
+@pytest.mark.parametrize("kind", [jnp.int32, jnp.int64])
+def test_what_is_declared_whole_stays_so(kind):
+    """A place in a list; nobody varies it."""
+    motion = Picked(jnp.stack([CORNERS, 2 * CORNERS]), jnp.asarray(1, kind))
+    assert rk.outcome(BLOCK, motion, **QUICK).max_rotation == rk.outcome(BLOCK, record(2.0), **QUICK).max_rotation
+    assert "number" not in named(BLOCK, motion)
 
 
 def test_its_parameters():

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, pair, word_of
-from jaxrock._checks import Range, Values, acute, checked, rate, ratio, size, strength, together, with_throw
+from jaxrock._checks import Range, Values, acute, check_shapes, checked, rate, ratio, size, strength, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.mesh import section_of
@@ -125,7 +125,7 @@ class AsymmetricBlock(Owner):
         """
         first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
         gyration = _gyration("gyration_radius", gyration_radius)
-        together(R1=first, R2=second, gyration_radius=gyration, gravity=gravity)
+        check_shapes(R1=first, R2=second, gyration_radius=gyration, gravity=gravity)
         kappa = first**2 / (first**2 + gyration**2)
         return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
 
@@ -156,7 +156,7 @@ class AsymmetricBlock(Owner):
         """
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
         p1, p2 = rate("p1", p1), rate("p2", p2)
-        together(p1=p1, p2=p2, inertia_ratio=kappa)
+        check_shapes(p1=p1, p2=p2, inertia_ratio=kappa)
         square = (p2 / p1) ** 2
         inner = 1 - 4 * square**2 * kappa * (1 - kappa)
         checked("p2", jnp.broadcast_to(p2, inner.shape), _LARGEST, lambda _: inner >= 0)

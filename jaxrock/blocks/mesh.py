@@ -211,10 +211,10 @@ class Rock(NamedTuple):
 
     def _between(self, azimuth: float) -> Section:
         """The section by the points on the ground alone."""
-        along = _direction(azimuth)
-        places = (self.base[:, :2] - self.centre[:2]) @ along
+        direction = _direction(azimuth)
+        places = (self.base[:, :2] - self.centre[:2]) @ direction
         right, left = (np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin()))
-        axis = np.array([-along[1], along[0], 0.0])
+        axis = np.array([-direction[1], direction[0], 0.0])
         return Section(
             right, left, np.array([0.0, self.centre[2]]), float(np.sqrt(axis @ self.inertia @ axis)), (False, False)
         )

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, checked, not_negative, share, size, together, with_throw
+from jaxrock._checks import Range, check_shapes, checked, not_negative, share, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine
@@ -187,7 +187,7 @@ class PerSide(AbstractRestitution):
     @with_throw
     def __init__(self, first: ArrayLike, second: ArrayLike, *, throw: bool = True):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
-        together(**{"restitution[0]": self.first, "restitution[1]": self.second})
+        check_shapes(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
         product = checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
         self.first = jnp.where(jnp.isnan(product), product, self.first)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, rate, size, together, with_throw
+from jaxrock._checks import acute, check_shapes, rate, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.restitution import (
@@ -76,7 +76,7 @@ class Block(Owner):
         **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.2.
         """
         width, height, gravity = size("width", width), size("height", height), size("gravity", gravity)
-        together(width=width, height=height, gravity=gravity)
+        check_shapes(width=width, height=height, gravity=gravity)
         half_diagonal = jnp.hypot(width, height) / 2
         return cls.from_radius(jnp.arctan2(width, height), half_diagonal, restitution, gravity=gravity)
 

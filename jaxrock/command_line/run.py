@@ -18,7 +18,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--duration", type=number, help="how long to follow the block [s] (default: a little past the record)"
     )
     parser.add_argument(
-        "--animate", nargs="?", const="gif", choices=("gif", "html", "mp4"), help="also write a film: a GIF, or as said"
+        "--animate",
+        nargs="?",
+        const="gif",
+        choices=("gif", "html", "mp4"),
+        help="also write a film: a GIF, or as said; none of a block that never uplifts",
     )
     add_restitution(parser)
     add_record(parser)
@@ -35,9 +39,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     report.table(_entries(size, block, record, model, result))
     _write(report, arguments.out, response)
     if arguments.animate:
-        path = arguments.out / f"animation.{arguments.animate}"
-        rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
-        report.wrote(path)
+        _film(report, arguments.out / f"animation.{arguments.animate}", response, block)
     for status in (response.status, result.status):
         if status != rk.Status.successful:
             return report.failed(f"these are not results: {rk.Status[status]}")
@@ -77,6 +79,15 @@ def _write(report: Report, folder: Path, response: rk.responses.Response) -> Non
               response.impact_velocities)  # fmt: skip
     save(report, rk.plot.history(response)[0].figure, folder / "history.png")
     save(report, rk.plot.phase(response).figure, folder / "phase.png")
+
+
+def _film(report: Report, path: Path, response: rk.responses.Response, block: rk.Block) -> None:
+    """The film, which takes a minute; none of a block that never moves, and none of an earlier run in its place."""
+    if response.status == rk.Status.successful and float(response.max_rotation) == 0:
+        path.unlink(missing_ok=True)
+        return report.say("no film: the block never uplifts")
+    rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
+    report.wrote(path)
 
 
 RUN = Command("run", "simulate one block under a record", _add_options, _run)

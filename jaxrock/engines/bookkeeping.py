@@ -49,7 +49,7 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
     ceiling, weight = stepper.scene.outlook.most_helpful(state.piece)
     hold = -moments.acceleration(angle, state.velocity, ceiling, weight)
     needed = jnp.where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
-    certain = state.velocity - needed > stepper.doubt * state.spread.along(1.0, 1.0)
+    certain = state.velocity - needed > stepper.doubt * state.spread.error_of(1.0, 1.0)
     return state.beyond & (state.velocity >= 0) & certain
 
 

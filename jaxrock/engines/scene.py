@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._parameters import check_single
+from jaxrock._parameters import check_single, in_precision
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.outlook import Outlook
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
+from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking, sum_of_series
-from jaxrock.motions.together import in_place as found_in_place, is_in_place
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
@@ -50,11 +50,6 @@ def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) ->
     return _least_threshold(*_moments(block, model))
 
 
-def _real(x, dtype):
-    """A leaf of a block or a motion in the precision of all; what counts stays whole."""
-    return x if isinstance(x, jax.Array) and x.dtype == jnp.int32 else jnp.asarray(x, dtype)
-
-
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
@@ -86,7 +81,7 @@ class Scene(eqx.Module):
         parameter is an array outside of `jax.vmap`."""
         check_single(block=block, motion=motion)
         dtype = jnp.result_type(*jax.tree.leaves((block, motion)))
-        block, motion = jax.tree.map(lambda x: _real(x, dtype), (block, motion))
+        block, motion = in_precision(block, dtype), in_precision(motion, dtype)
         stretch = found_in_place(motion) if in_place and is_in_place(motion) else None
         motion = motion if stretch is None else stretch.motion
         knots, envelope = motion.knots, motion.envelope

@@ -41,7 +41,7 @@ class Trajectory(eqx.Module):
         time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
         return time.astype(jnp.result_type(time, self.duration))
 
-    def along(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
+    def at_times(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
         """`follow(node, elapsed)` from the node before each time; results have the shape of `time` in front."""
 
         def at(t):

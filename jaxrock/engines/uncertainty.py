@@ -57,7 +57,7 @@ class Spread(eqx.Module):
         """The squared standard error of angle and velocity together [rad^2]."""
         return self.xx + self.vv
 
-    def along(self, of_angle: Scalar | float, of_velocity: Scalar | float) -> Scalar:
+    def error_of(self, of_angle: Scalar | float, of_velocity: Scalar | float) -> Scalar:
         """Standard error of a quantity with these derivatives."""
         return jnp.sqrt(self.variance(of_angle, of_velocity))
 

@@ -59,7 +59,7 @@ class NonlinearScene(FlexibleScene):
         good = (miss <= 1) & jnp.isfinite(miss)
         factor = jnp.where(jnp.isfinite(miss), jnp.clip(0.9 * jnp.maximum(miss, 1e-30) ** -0.1, 0.25, 2.0), 0.25)
         held = jax.lax.stop_gradient(length)
-        next_ = self.along(state, path, length, share, whole)
+        next_ = self.step_on(state, path, length, share, whole)
         # A good step tells nothing against as long a one; if it ended with the piece, not even against a longer one.
         longer = jnp.maximum(factor, 1.0) * held
         next_ = replace(next_, stride=jnp.where(whole, jnp.maximum(longer, state.stride), longer))

@@ -157,9 +157,9 @@ def rocking_phase(numbers: Numbers) -> tuple[Phase, Bool[Array, ""]]:
     shape = numbers.rotation * stiffness / denominator
     ones = jnp.ones_like(at)
     modes = jnp.concatenate([shape, at * shape, ones], axis=1).T
-    along_rotation = jnp.sum(numbers.rotation**2 * numbers.damping * inertia / denominator, 1, keepdims=True)
+    of_rotation = jnp.sum(numbers.rotation**2 * numbers.damping * inertia / denominator, 1, keepdims=True)
     project = (
-        jnp.concatenate([numbers.rotation * square * (at + decay) / denominator, shape, along_rotation], axis=1) / slope
+        jnp.concatenate([numbers.rotation * square * (at + decay) / denominator, shape, of_rotation], axis=1) / slope
     )
     whole = jnp.abs(project @ modes - jnp.eye(rates.size)).max() < 1e-4  # squared by the correction below
     # Without damping the base has no motion of its own: it follows the column.

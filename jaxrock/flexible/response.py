@@ -11,7 +11,7 @@ from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
-from jaxrock._tables import AbstractTable, along_time
+from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.nonlinear import scene_of
@@ -42,7 +42,7 @@ class FlexibleResponse(AbstractTable):
     @property
     def _columns(self):
         units = {"rotation": "rad", "displacement": "m", "bending": "m"}
-        return along_time(self.time, {name: (getattr(self, name), unit) for name, unit in units.items()})
+        return over_time(self.time, {name: (getattr(self, name), unit) for name, unit in units.items()})
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Base rotation [rad], displacement of the top [m], and its bending part [m].
@@ -55,7 +55,7 @@ class FlexibleResponse(AbstractTable):
 
         **Raises:** ValueError for a time outside the history.
         """
-        return _along(self.trajectory, self.trajectory.checked(time), "outputs")[:3]
+        return _at_times(self.trajectory, self.trajectory.checked(time), "outputs")[:3]
 
     def column(self, time: Values) -> Inexact[Array, "..."]:
         """Displacements of the masses relative to the ground [m], from the base (which stays) to the top.
@@ -68,13 +68,13 @@ class FlexibleResponse(AbstractTable):
 
         **Raises:** ValueError for a time outside the history.
         """
-        return _along(self.trajectory, self.trajectory.checked(time), "column")
+        return _at_times(self.trajectory, self.trajectory.checked(time), "column")
 
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
         block = self.scene.block
         scale = block.density * block.width * block.height * block.length**2
-        parts = _along(self.trajectory, self.trajectory.checked(time), "energy")
+        parts = _at_times(self.trajectory, self.trajectory.checked(time), "energy")
         return tuple(scale * part for part in parts)
 
     @property
@@ -184,7 +184,7 @@ def simulate_flexible(
     stop = _duration(block, motion, duration, throw)
     result, path = _simulate(block, motion, stop, _budget(block, motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    rotation, displacement, bending = _along(path, time, "outputs")[:3]
+    rotation, displacement, bending = _at_times(path, time, "outputs")[:3]
     response = FlexibleResponse(time, rotation, displacement, bending, result, path)
     return response if throw else marked_result(response, (block, motion, stop))
 
@@ -230,7 +230,7 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
 
 
 @eqx.filter_jit
-def _along(path: Trajectory, time, what: str):
+def _at_times(path: Trajectory, time, what: str):
     """Outputs, displacements of the masses, or energies, at times."""
     scene = path.stepper
     reach = jnp.cos(scene.numbers.alpha) * scene.block.length
@@ -244,4 +244,4 @@ def _along(path: Trajectory, time, what: str):
         state = curve.state(x)
         return scene.energy(state) if what == "energy" else reach * scene.column(state)
 
-    return path.along(time, follow)
+    return path.at_times(time, follow)

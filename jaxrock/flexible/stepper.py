@@ -164,9 +164,9 @@ class FlexibleScene(eqx.Module):
 
     def advance(self, state: FlexibleState) -> FlexibleState:
         """One step: to an event, to the end of a piece, or as far as the motion's series holds."""
-        return self.along(state, *self.arc(state))
+        return self.step_on(state, *self.arc(state))
 
-    def along(
+    def step_on(
         self, state: FlexibleState, path: Arc, length: Scalar, share: Scalar, whole: Bool[Array, ""]
     ) -> FlexibleState:
         """One step along an arc."""

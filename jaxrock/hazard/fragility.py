@@ -13,13 +13,13 @@ from jaxtyping import Array, ArrayLike, Inexact
 from jaxrock._checks import (
     Values,
     as_real,
+    check_shapes,
     checked,
     if_known,
     level as at_level,
     not_negative,
     positive,
     share,
-    together,
 )
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
@@ -66,7 +66,7 @@ class LogNormalFragility(AbstractFragility):
 
     def __call__(self, level: Values) -> Real:
         level = if_known(at_level, "level", level)
-        together(level=level, median=self.median)
+        check_shapes(level=level, median=self.median)
         z = jnp.log(level / self.median) / self.dispersion
         return jax.lax.erfc(-z / math.sqrt(2)) / 2
 
@@ -323,10 +323,10 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
             line = jax.scipy.special.ndtri(jnp.sum(toppled) / jnp.sum(toppled + survived))[None]
         _, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
         information = rows @ (-curvature[:, None] * rows.T)
-        along = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
-        scores = (along @ rows) * by_z
+        combination = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
+        scores = (combination @ rows) * by_z
         if labels is None:
-            scatter = along @ information @ along
+            scatter = combination @ information @ combination
         else:
             scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
         found.append(jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter)))

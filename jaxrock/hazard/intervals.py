@@ -154,11 +154,11 @@ class _Height(NamedTuple):
         """The highest with one median, whatever the slope."""
         flattest, steepest = self.range
 
-        def along(logarithm):
+        def at(logarithm):
             slope = np.exp(logarithm)
             return self(-slope * median, slope)
 
-        return _highest(along, flattest - np.log1p(abs(median)), steepest)[1]
+        return _highest(at, flattest - np.log1p(abs(median)), steepest)[1]
 
 
 def _log_determinant(weights: np.ndarray, abscissas: np.ndarray) -> np.ndarray:

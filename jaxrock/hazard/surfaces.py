@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import (
     Values,
+    check_shapes,
     checked,
     if_known,
     inner_share,
@@ -24,7 +25,6 @@ from jaxrock._checks import (
     not_negative,
     positive,
     scalar,
-    together,
 )
 from jaxrock._described import described
 from jaxrock._parameters import one_of_many
@@ -70,7 +70,7 @@ class SurfaceFragility(eqx.Module):
     def __call__(self, acceleration: Values, ratio: Values) -> Inexact[Array, "..."]:
         """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
         acceleration, median = if_known(level, "acceleration", acceleration), self._median(ratio)
-        together(acceleration=acceleration, ratio=median)
+        check_shapes(acceleration=acceleration, ratio=median)
         z = (jnp.log(acceleration) - jnp.log(median)) / self.dispersion
         return jax.lax.erfc(-z / math.sqrt(2)) / 2
 
@@ -84,7 +84,7 @@ class SurfaceFragility(eqx.Module):
     def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
         probability, median = inner_share("probability", probability), self._median(ratio)
-        together(probability=probability, ratio=median)
+        check_shapes(probability=probability, ratio=median)
         return median * jnp.exp(self.dispersion * jax.scipy.special.ndtri(probability))
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import as_real, together
+from jaxrock._checks import as_real, check_shapes
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
@@ -56,7 +56,7 @@ class LogDensity(eqx.Module):
             raise ValueError(f"Argument `values` must hold {', '.join(self.names)}, but holds {', '.join(values)}.")
         low, high = self.problem.ends.T
         given = [as_real(name, values[name]) for name in self.names]
-        together(**dict(zip(self.names, given)))
+        check_shapes(**dict(zip(self.names, given)))
         logs = [unknown.log for unknown in self.problem.unknowns.values()]
         place = jnp.stack(jnp.broadcast_arrays(*(jnp.log(x) if log else x for x, log in zip(given, logs))), axis=-1)
         return jnp.log(place - low) - jnp.log(high - place)

@@ -84,8 +84,8 @@ def feasible_region(
         bar.add(count)
     total = np.concatenate(terms).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
-    (first, second), (along, across) = lists, lists.values()
-    return FeasibleRegion((first, second), (along, across), *placed((total, total > total.max() + np.log(0.05))))
+    (first, second), (across, up) = lists, lists.values()
+    return FeasibleRegion((first, second), (across, up), *placed((total, total > total.max() + np.log(0.05))))
 
 
 @eqx.filter_jit

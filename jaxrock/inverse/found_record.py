@@ -50,7 +50,7 @@ class RecordStatus(Enumeration):
     )
     spectrum_changed = item(
         "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "
-        "5 %: see `spectrum`."
+        "5 %: see `spectrum`. No change was found that keeps it; fewer periods or a wider `band` may help."
     )
     not_reached = item(
         "No change was found that makes margins as wanted: none on straight lines from the start, nor on the way of "
@@ -165,11 +165,15 @@ def find_record(
     search = Search(site, size, allowed_changes(*space, None if kept is None else kept.rows))
     if search.reached(np.zeros((1, samples.size)))[0]:
         return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0, kept)
-    scaling = min(_length(search.along(direction)) for direction in (samples, -samples))
+    scaling = min(_length(search.in_direction(direction)) for direction in (samples, -samples))
+    best, lengths = None, []
     for _ in range(_ROUNDS):
         bar = Progress(starts * steps, "record", progress)
         directions = _Directions(search, samples, optimizer, penalty, np.random.default_rng(seed))
-        lengths, best = _nearest(search, directions, starts, steps, bar)
+        reached, nearest = _nearest(search, directions, starts, steps, bar)
+        if best is not None and nearest is None:
+            break  # the last one stays, and its status says that the spectrum does not
+        lengths, best = reached, nearest
         more = None if kept is None or best is None else kept.kept_at(samples + best.change)
         if more is None:
             break
@@ -181,7 +185,7 @@ def _nearest(search: Search, directions: "_Directions", starts: int, steps: int,
     """The lengths to which all starts come, and what the shortest is of."""
     found = []
     for number in range(starts):
-        reached = search.along(directions(number))
+        reached = search.in_direction(directions(number))
         found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
         bar.add((number + 1) * steps - bar.done)
     lengths = [_length(each) for each in found]
@@ -246,7 +250,7 @@ class _Directions(NamedTuple):
     def __call__(self, number: int) -> np.ndarray:
         """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby."""
         if number == 0:
-            louder, softer = (self.search.along(self.search.allowed(x)) for x in (self.samples, -self.samples))
+            louder, softer = (self.search.in_direction(self.search.allowed(x)) for x in (self.samples, -self.samples))
             best = min(louder, softer, key=_length)
             return self.samples * 0.0 if best is None else best.direction
         if number == 1:

@@ -26,6 +26,7 @@ from jaxrock.status import Status
 
 _LANES = 64  # records in one call of the compiled program
 _SHORTEST, _LONGEST = 1e-4, 1e2  # lengths of changes that are looked at first, in root mean squares of the record
+_NOTHING = 1e-10  # of a change: what is left of it by rounding
 _CLOSER = 5  # times that the place on a line is looked for, each 64 times as close
 _TURNS = 0.5 ** np.arange(8)  # shares of the way to the direction that straight margins would have
 _SHORTER = np.array([0.7, 0.85, 0.93, 0.97, 0.985, 0.993, 0.997, 0.999])  # of the length before
@@ -110,7 +111,7 @@ class Search(NamedTuple):
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)
 
-    def along(self, direction: np.ndarray) -> Found | None:
+    def in_direction(self, direction: np.ndarray) -> Found | None:
         """The first change in a direction that does what is wanted, about; None: there is none."""
         scale = rms(direction)
         if not scale > 0:
@@ -214,8 +215,10 @@ def allowed_changes(
     rows = rows[sizes > 1e-12 * np.sqrt(count)]
 
     def projected(changes: np.ndarray) -> np.ndarray:
-        changes = in_band(changes)
-        return changes - (changes @ rows.T) @ rows
+        within = in_band(changes)
+        left = within - (within @ rows.T) @ rows
+        # Of what is not allowed at all rounding is left, which is no direction.
+        return np.where(rms(left) > _NOTHING * rms(changes), left.T, 0.0).T
 
     return projected
 

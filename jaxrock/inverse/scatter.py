@@ -72,7 +72,7 @@ def levels_around(observations: Observations, scatter: ArrayLike, strength: Real
     step = _APART * deviation
     strength = strength[..., None]
     base = jnp.floor(jax.lax.stop_gradient(strength) / step)
-    number = base + _along(np.arange(NODES) - _EACH_SIDE, base[None])
+    number = base + _in_front(np.arange(NODES) - _EACH_SIDE, base[None])
     turned = _FAST * number
     fast, fastest = _amplitude(_FAST), _amplitude(_FASTEST)
     offsets = (
@@ -197,7 +197,7 @@ def _mean_of_ways(logarithms: Real) -> Real:
     return logarithms[..., 0, :] if count == 1 else logsumexp(logarithms, axis=-2) - np.log(count)
 
 
-def _along(values: np.ndarray, like: Real) -> np.ndarray:
+def _in_front(values: np.ndarray, like: Real) -> np.ndarray:
     """Values along the first axis of an array."""
     return values.reshape(-1, *[1] * (like.ndim - 1))
 

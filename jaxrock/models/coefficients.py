@@ -84,7 +84,7 @@ class Terms(eqx.Module):
         """Whether sin x or cos x appear at all."""
         return self.sine is not None or self.cosine is not None
 
-    def along(self, basis: Basis, empty: Any = 0.0) -> Any:
+    def summed(self, basis: Basis, empty: Any = 0.0) -> Any:
         """The sum of coefficients times functions; `empty` where there is none."""
         products = self.products(basis)
         return sum(products, start=0.0) if products else empty
@@ -150,16 +150,16 @@ class Coefficients(AbstractMoments):
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
-        return self.restoring_terms.along(Basis.at(angle))
+        return self.restoring_terms.summed(Basis.at(angle))
 
     def arm(self, angle: Angle) -> Scalar:
         """Overturning moment over m R u g at an opening angle."""
-        return self.arm_terms.along(Basis.at(angle))
+        return self.arm_terms.summed(Basis.at(angle))
 
     def repulsion(self, angle: Angle, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """How fast nearby angles part, per angle: minus the derivative of weight restoring + push arm."""
         slopes = Basis.at(angle).derivative
-        return -_weighed(weight, self.restoring_terms.along(slopes)) - push * self.arm_terms.along(slopes)
+        return -_weighed(weight, self.restoring_terms.summed(slopes)) - push * self.arm_terms.summed(slopes)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
@@ -168,12 +168,12 @@ class Coefficients(AbstractMoments):
     @property
     def restoring_at_rest(self) -> Scalar:
         """Restoring moment over m g R just after uplift: sin(alpha), or alpha in the linear model."""
-        return self.restoring_terms.along(_AT_REST)
+        return self.restoring_terms.summed(_AT_REST)
 
     @property
     def arm_at_rest(self) -> Scalar:
         """Overturning arm over R just after uplift: cos(alpha), or 1 in the linear model."""
-        return self.arm_terms.along(_AT_REST)
+        return self.arm_terms.summed(_AT_REST)
 
     @property
     def sinusoidal(self) -> bool:
@@ -222,11 +222,11 @@ class Coefficients(AbstractMoments):
         if arm.line is not None:
             return jnp.full_like(hold, jnp.inf)
         if self.sinusoidal and self.skew is None and arm.constant is None:
-            across, along = (
-                Terms(*pair).along(Basis(factor, push, None, None))
+            sines, cosines = (
+                Terms(*pair).summed(Basis(factor, push, None, None))
                 for pair in ((moment.sine, arm.sine), (moment.cosine, arm.cosine))
             )
-            return jnp.sqrt(2 * jnp.maximum(jnp.hypot(across, along) - self.repulsion(angle, push, weight), 0.0))
+            return jnp.sqrt(2 * jnp.maximum(jnp.hypot(sines, cosines) - self.repulsion(angle, push, weight), 0.0))
         if arm.sine is not None:
             return jnp.full_like(hold, jnp.inf)
         if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent

@@ -18,11 +18,16 @@ from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record, with_room
-from jaxrock.motions.together import Chosen, Together
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
+
+
+def _known_stays_so(tree) -> contextlib.AbstractContextManager:
+    """Within it what follows from a tree without traced arrays is computed at once, within `jax.jit` too."""
+    return contextlib.nullcontext() if is_traced(tree) else jax.ensure_compile_time_eval()
 
 
 def _is_motion(value) -> bool:
@@ -45,6 +50,8 @@ class Suite(AbstractNamed):
 
     `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
     turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
+
+    Within `jax.jit`, `jax.vmap` and derivatives motions may depend on what is traced.
 
     **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move; for
     components without azimuths, and azimuths without components.
@@ -69,6 +76,10 @@ class Suite(AbstractNamed):
     ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
+        with _known_stays_so((motions, azimuth)):
+            self._set(motions, names, azimuth)
+
+    def _set(self, motions: Sequence, names: Sequence[str] | None, azimuth: Values | None) -> None:
         self.azimuth, self.turns, sources = None, 1, None
         if azimuth is not None or any(isinstance(each, Components) for each in motions):
             records = len(motions)
@@ -82,6 +93,12 @@ class Suite(AbstractNamed):
         self.sources = self.names if sources is None else sources
         self.peak_acceleration = jnp.concatenate([_each(peak_acceleration, group) for group in self.groups])
         self.peak_velocity = jnp.concatenate([_each(peak_velocity, group) for group in self.groups])
+        if is_traced(self.peak_acceleration):
+            peaks, failed = (self.peak_acceleration, self.peak_velocity), ~jnp.all(self.peak_acceleration > _LEAST)
+            self.peak_acceleration, self.peak_velocity = watched(
+                peaks, "Argument `motions` must move the ground", failed
+            )
+            return
         for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
             if not peak > _LEAST:
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
@@ -110,9 +127,9 @@ class Suite(AbstractNamed):
     def _chosen(self, number) -> AbstractMotion:
         """The motion of a traced number."""
         if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
-            with contextlib.nullcontext() if is_traced(self.groups) else jax.ensure_compile_time_eval():
-                together = Together.of([record for record in self.motions() if isinstance(record, Record)])
-            return Chosen(together, number, jnp.ones((), together.samples.dtype))
+            with _known_stays_so(self.groups):
+                joined = JoinedRecords.of([record for record in self.motions() if isinstance(record, Record)])
+            return Chosen(joined, number, jnp.ones((), joined.samples.dtype))
         kinds = {jax.tree.structure(group) for group in self.groups}
         if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
             raise ValueError(

@@ -106,5 +106,5 @@ def threads(devices: int) -> int:
     if not HAS_THREADS:
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    together = min(devices, len(jax.local_devices(backend="cpu")))
-    return max(1, cores // max(1, together))
+    at_once = min(devices, len(jax.local_devices(backend="cpu")))
+    return max(1, cores // max(1, at_once))

@@ -16,7 +16,7 @@ from jaxrock._foreign import (
     MetadataExtension,
     Version,
 )
-from jaxrock.native.pool import together
+from jaxrock.native.pool import call_in_threads
 
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
@@ -53,5 +53,5 @@ def add_handler(module: ir.Module, outputs: int, inputs: int) -> None:
                 buffer = at(buffers, ctypes.sizeof(ctypes.c_void_p) * i)
                 b.store(at(buffer, Buffer.data.offset), b.gep(table, [_I32(i)]))
             tables.append(table)
-        together(b, program, tables, at(frame, Frame.api.offset), at(frame, Frame.ctx.offset))
+        call_in_threads(b, program, tables, at(frame, Frame.api.offset), at(frame, Frame.ctx.offset))
     b.ret(done)

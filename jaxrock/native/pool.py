@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from llvmlite import ir
 
-from jaxrock._foreign import Interface, Task
+from jaxrock._foreign import Done, Interface, Task
 
 HAS_THREADS = os.name == "posix"
 _WANTED, _THREADS = 1, 2  # what the first input of a program tells
@@ -21,7 +21,7 @@ _CLOSED = 1 << 32  # no more may begin; more than there are threads
 _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64)
 
 
-def together(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
+def call_in_threads(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
     """Call a program in this thread and, where there are many lanes, at the same time in others.
 
     `tables`: of outputs and of inputs; `interface`, `context`: what XLA has passed for calls of its own functions.
@@ -76,22 +76,22 @@ class _Shared:
 
     def _asking(self, memory, interface, context) -> Callable:
         """`ask(number)` for a task: whether XLA takes it."""
-        b, asked = self.b, _room_for(self.b, Task)
-        known = {"struct_size": ir.Constant(_I64, ctypes.sizeof(Task)), "extension_start": ir.Constant(_POINTER, None)}
-        parts = known | {"context": context, "task": b.bitcast(self._task(), _POINTER), "data": memory}
-        for name, value in parts.items():
-            place = b.gep(asked, [_I64(getattr(Task, name).offset)])
-            b.store(value, b.bitcast(place, value.type.as_pointer()))
+        b = self.b
+        asked = _made(b, Task, context=context, task=b.bitcast(self._task(), _POINTER), data=memory)
+        done = _made(b, Done)
 
-        def function(name):
-            kind = ir.FunctionType(_POINTER, [_POINTER]).as_pointer()
-            place = b.gep(interface, [_I64(getattr(Interface, name).offset)])
-            return b.load(b.bitcast(place, kind.as_pointer()))
+        def function(name, result):
+            return b.load(_part(b, interface, Interface, name, ir.FunctionType(result, [_POINTER]).as_pointer()))
 
-        schedule = function("schedule")
+        schedule, destroy = function("schedule", _POINTER), function("destroy_error", ir.VoidType())
 
         def ask(number):
-            return b.icmp_unsigned("==", b.call(schedule, [asked]), ir.Constant(_POINTER, None))
+            error = b.call(schedule, [asked])
+            is_taken = b.icmp_unsigned("==", error, ir.Constant(_POINTER, None))
+            with b.if_then(b.not_(is_taken)):  # no thread is free for it: nobody else hears of that
+                b.store(error, _part(b, done, Done, "error", _POINTER))
+                b.call(destroy, [done])
+            return is_taken
 
         return ask
 
@@ -124,9 +124,18 @@ class _Shared:
         return b.bitcast(b.gep(memory, [_I64(8 * number)]), _I64.as_pointer())
 
 
-def _room_for(b: ir.IRBuilder, kind: type[ctypes.Structure]):
-    """Room for a structure."""
-    return b.bitcast(b.alloca(_I64, -(-ctypes.sizeof(kind) // 8)), _POINTER)
+def _made(b: ir.IRBuilder, kind: type[ctypes.Structure], **parts):
+    """A structure of XLA's interface, with some of its parts."""
+    made = b.bitcast(b.alloca(_I64, -(-ctypes.sizeof(kind) // 8)), _POINTER)
+    known = {"struct_size": ir.Constant(_I64, ctypes.sizeof(kind)), "extension_start": ir.Constant(_POINTER, None)}
+    for name, value in (known | parts).items():
+        b.store(value, _part(b, made, kind, name, value.type))
+    return made
+
+
+def _part(b: ir.IRBuilder, structure, kind: type[ctypes.Structure], name: str, of):
+    """Where a part of a structure lies."""
+    return b.bitcast(b.gep(structure, [_I64(getattr(kind, name).offset)]), of.as_pointer())
 
 
 def _count_up(b: ir.IRBuilder, size, act: Callable):

@@ -26,9 +26,9 @@ def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Re
 def _bracketed_root_jvp(function, primals, tangents):
     (lower, upper, *parameters), (_, _, *changes) = primals, tangents
     root = bracketed_root(function, lower, upper, *parameters)
-    _, along = jax.linearize(function, root, *parameters)  # once: it may hold a search, too
-    slope = along(jnp.ones_like(root), *map(jnp.zeros_like, parameters))
-    change = along(jnp.zeros_like(root), *changes)
+    _, change_by = jax.linearize(function, root, *parameters)  # once: it may hold a search, too
+    slope = change_by(jnp.ones_like(root), *map(jnp.zeros_like, parameters))
+    change = change_by(jnp.zeros_like(root), *changes)
     flat = slope == 0  # no root, or a double one
     return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import scalar
 from jaxrock._parameters import check_single
-from jaxrock._tables import AbstractTable, along_time
+from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block
@@ -45,7 +45,7 @@ class Contact(AbstractTable):
     @property
     def _columns(self):
         names = ("horizontal", "normal", "friction")
-        return along_time(self.time, {name: (getattr(self, name), "-") for name in names})
+        return over_time(self.time, {name: (getattr(self, name), "-") for name in names})
 
     @property
     def keeps_contact(self) -> Bool[Array, ""]:

@@ -11,7 +11,7 @@ from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, marked, scalar, span
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
-from jaxrock._tables import AbstractTable, along_time
+from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state, surpasses
@@ -65,7 +65,7 @@ class Response(AbstractTable):
 
     @property
     def _columns(self):
-        return along_time(self.time, {"rotation": (self.rotation, "rad"), "velocity": (self.velocity, "rad/s")})
+        return over_time(self.time, {"rotation": (self.rotation, "rad"), "velocity": (self.velocity, "rad/s")})
 
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Rotation and angular velocity.

@@ -20,9 +20,9 @@ from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.flexible.response import outcome_flexible
 from jaxrock.flexible.stepper import FlexibleOutcome
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.motions.joined_records import is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
-from jaxrock.motions.together import is_in_place
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.status import Status, marked_result

@@ -120,8 +120,8 @@ def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes b
     mesh, copy = _one_device_each()
     dealt = NamedSharding(mesh, PartitionSpec("processes"))
     here = jax.device_put(own[None], mesh.local_devices[0])
-    together = jax.make_array_from_single_device_arrays((jax.process_count(), own.size), dealt, [here])
-    return np.asarray(copy(together).addressable_data(0))
+    brought = jax.make_array_from_single_device_arrays((jax.process_count(), own.size), dealt, [here])
+    return np.asarray(copy(brought).addressable_data(0))
 
 
 @functools.cache

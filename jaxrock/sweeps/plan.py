@@ -48,8 +48,8 @@ class Plan(NamedTuple):
     @property
     def sizes(self) -> np.ndarray:
         """Number of points of every block."""
-        along = [np.minimum(part, n - part * np.arange(-(-n // part))) for n, part in zip(self.shape, self.block)]
-        return functools.reduce(np.multiply.outer, along).ravel()
+        lengths = [np.minimum(part, n - part * np.arange(-(-n // part))) for n, part in zip(self.shape, self.block)]
+        return functools.reduce(np.multiply.outer, lengths).ravel()
 
     def place(self, number: int) -> tuple[slice, ...]:
         """Where a block lies in the grid."""

@@ -1,7 +1,21 @@
-"""Many scenes at once: in machine code of our own, or in chunks of lanes that XLA steps together.
+"""A recipe at one scene or at many: in machine code of our own, or in lanes that XLA steps together.
 
-A quick version of the function, where there is one, goes first; the scenes that it postpones are gathered and done
-by the careful one, again in chunks.
+Which way `Lanes.__call__` takes:
+
+    scenes                      machine code of our own             XLA, everywhere else
+    ------                      -----------------------             --------------------
+    one                         careful, its numbers in one lane    careful, without lanes
+    up to _FEW; or any number   careful, in lanes                   careful, in chunks of _LANES
+      without a quick pass
+    more, with a quick pass     quick, in lanes; careful what it    quick, in chunks of _QUICK_LANES, which after
+                                  postpones, in chunks of             every round (if there are any) are made up
+                                  _NATIVE_LANES                       anew; careful what it postpones
+
+On accelerators XLA's chunks have _WIDE lanes. *Careful* is the function as it was given, *quick* a part of its
+`Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this process, where llvmlite is: not for what users
+export, nor for functions that do not ask for it (`in_lanes`: flexible columns, whole histories and closed forms do
+not), nor for programs of operations that `native` does not know. Whether a program is traced at all, or was kept, is
+told by `lowering`.
 """
 
 import functools
@@ -49,11 +63,8 @@ class Lanes:
         if self.size == 0:
             return [jnp.zeros((0, *x.shape), x.dtype) for x in jax.tree.leaves(self.recipe.results)]
         if self.in_machine_code:
-            if self.size is not None:
-                return self._natively(leaves)
-            leaves = [jnp.asarray(x)[None] if mine else x for x, mine in zip(leaves, self._own_of_one)]
-            return [x[0] for x in self._plan(False, self._own_of_one)(leaves, 1)]
-        return list(self.recipe(leaves)) if self.size is None else self._by_xla(leaves)
+            return self._one_natively(leaves) if self.size is None else self._many_natively(leaves)
+        return list(self.recipe(leaves)) if self.size is None else self._many_by_xla(leaves)
 
     @functools.cached_property
     def in_machine_code(self) -> bool:
@@ -102,7 +113,12 @@ class Lanes:
             self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled, alone)
         return self.recipe.plans[key]
 
-    def _natively(self, leaves) -> list:
+    def _one_natively(self, leaves) -> list:
+        (plan,) = self._plans()
+        leaves = [jnp.asarray(x)[None] if mine else x for x, mine in zip(leaves, self._own_of_one)]
+        return [x[0] for x in plan(leaves, threads=1)]
+
+    def _many_natively(self, leaves) -> list:
         """From beginning to end in machine code of our own."""
         plans, threads = self._plans(), self.threads
         if len(plans) == 1:
@@ -120,7 +136,7 @@ class Lanes:
     def _passes(self) -> Any:
         return self.recipe.passes
 
-    def _by_xla(self, leaves) -> list:
+    def _many_by_xla(self, leaves) -> list:
         """In chunks of lanes."""
         passes, scenes = self._passes, _Scenes(leaves, self.own, self.recipe.structure)
 

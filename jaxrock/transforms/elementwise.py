@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
-from jaxrock._checks import together
+from jaxrock._checks import check_shapes
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -28,7 +28,7 @@ def elementwise(**checks: Callable) -> Callable:
         def checked_and_compiled(*args, **kwargs):
             given = signature.bind(*args, **kwargs).arguments
             given = {name: checks[name](name, value) for name, value in given.items()}
-            together(**given)
+            check_shapes(**given)
             kind = jnp.result_type(*given.values())
             return compiled(*(x.astype(kind) for x in given.values()))
 

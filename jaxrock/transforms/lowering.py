@@ -1,6 +1,16 @@
-"""How a recipe is lowered: machine code of our own on CPUs, where that can be, and XLA's lanes everywhere else.
+"""How a recipe is lowered: as it was kept, where it can be kept, and else by tracing its `Lanes` here.
 
-What is known by its facts is exported, and kept: in another session it need not be traced again.
+    compiled                                    lowered to
+    --------                                    ----------
+    by a user's `jax.export`                    XLA's lanes, traced here: other machines lack our machine code
+    for an accelerator                          XLA's lanes, traced here
+    for this CPU: without facts, without a      lanes (machine code, or XLA's), traced here
+      folder, or it cannot be exported
+    for this CPU otherwise                      lanes as they were exported, in this session or another: copied into
+                                                  the program, or called where they call LAPACK
+
+What lanes are is told by `batching`. What they are exported with (`_exported`) is lowered here once more, within:
+these recipes have their machine code, too.
 """
 
 import contextvars
@@ -32,12 +42,12 @@ def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int |
     exported = getattr(context.module_context.lowering_parameters, "for_export", False)
     portable = exported and _called.get() is None  # by the user, for machines that may not have our machine code
     lanes = Lanes(recipe, own, size, on_cpu, getattr(mesh, "size", 1) or 1, portable)
-    program, codes = _kept(lanes, context.avals_in) or (None, lanes.codes())
+    kept, codes = _kept(lanes, context.avals_in) or (None, lanes.codes())
     if (called := _called.get()) is not None:
         called.extend(codes)
-    if program is None or b"lapack_" in program.mlir_module_serialized:
-        return mlir.lower_fun(lanes if program is None else program.call)(without_mesh(context), *leaves)
-    return _inlined(program, context, leaves)
+    if kept is not None and b"lapack_" not in kept.mlir_module_serialized:
+        return _inlined(kept, context, leaves)
+    return mlir.lower_fun(lanes if kept is None else kept.call)(without_mesh(context), *leaves)
 
 
 def _inlined(program: jax.export.Exported, context, leaves) -> Sequence:

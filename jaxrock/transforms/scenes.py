@@ -14,7 +14,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like
-from jaxrock.transforms.along import columns_of, directions_of, value_and_change, value_and_jacobian
+from jaxrock.transforms.forward_mode import columns_of, directions_of, value_and_change, value_and_jacobian
 from jaxrock.transforms.lowering import lowered
 from jaxrock.transforms.recipe import Recipe
 
@@ -103,7 +103,7 @@ def _pushed(leaves, changes, *, recipe, own, size):
     numbers = sum(x.size for x, move in zip(recipe.like, moves) if move)
     if recipe.on_tape is not None and numbers > _MANY:
         return _pushed_on_tape(leaves, moves, moving, recipe, own, size)
-    derive = _along_directions if recipe.order and recipe.in_lanes else _along_all
+    derive = _jacobian_by_directions if recipe.order and recipe.in_lanes else _jacobian_at_once
     value, jacobian = derive(leaves, moves, recipe, own, size)
 
     def contracted(columns, *moving):
@@ -119,20 +119,20 @@ def _pushed(leaves, changes, *, recipe, own, size):
     return value, [moved(*each) for each in zip(value, jacobian)]
 
 
-def _along_all(leaves, moves, recipe, own, size):
+def _jacobian_at_once(leaves, moves, recipe, own, size):
     """Value and Jacobian by one program of all directions."""
-    along = value_and_jacobian(recipe, moves)
-    found = scenes_p.bind(*leaves, recipe=along, own=own, size=size)
-    value, jacobian = jax.tree.unflatten(jax.tree.structure(along.results), found)
+    both = value_and_jacobian(recipe, moves)
+    found = scenes_p.bind(*leaves, recipe=both, own=own, size=size)
+    value, jacobian = jax.tree.unflatten(jax.tree.structure(both.results), found)
     return jax.tree.leaves(value), jacobian
 
 
-def _along_directions(leaves, moves, recipe, own, size):
+def _jacobian_by_directions(leaves, moves, recipe, own, size):
     """The same, of derivatives: by a program of one direction, which is a scene of its own.
 
     A Hessian of five numbers by one program of all would be thirty-six numbers for every number of the function, and
     take ten times as long to compile as this, of twelve, which computes the first derivatives for every direction."""
-    along = value_and_change(recipe, moves)
+    both = value_and_change(recipe, moves)
     moving = [x for x, move in zip(recipe.like, moves) if move]
     # Of one scene its numbers are given to all directions, so that it is computed where they are.
     spread = [size is None and not x.shape for x in recipe.like]
@@ -141,11 +141,11 @@ def _along_directions(leaves, moves, recipe, own, size):
     given = [jnp.broadcast_to(x, (count,)) if every else x for x, every in zip(leaves, spread)]
 
     def one(*given):
-        return scenes_p.bind(*given, recipe=along, own=(*own, *[False] * len(moving)), size=size)
+        return scenes_p.bind(*given, recipe=both, own=(*own, *[False] * len(moving)), size=size)
 
     axes = [*(0 if every else None for every in spread), *[0] * len(moving)]
     found = jax.vmap(one, in_axes=axes)(*given, *directions)
-    value, changes = jax.tree.unflatten(jax.tree.structure(along.results), found)
+    value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
     value = [x[0] for x in jax.tree.leaves(value)]
     return value, [None if d is None else columns_of(x, d, moving) for x, d in zip(value, changes, strict=True)]
 

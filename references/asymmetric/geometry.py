@@ -62,8 +62,8 @@ def resting(vertices, center):
     """
     hull = convex_hull(vertices)
     for (x, y), (a, b) in zip(hull, hull[1:] + hull[:1]):
-        along = ((center[0] - x) * (a - x) + (center[1] - y) * (b - y)) / ((a - x) ** 2 + (b - y) ** 2)
-        if 0 < along < 1:
+        share = ((center[0] - x) * (a - x) + (center[1] - y) * (b - y)) / ((a - x) ** 2 + (b - y) ** 2)
+        if 0 < share < 1:
             yield ((x, y), (a, b)), -math.atan2(b - y, a - x)
 
 

@@ -147,11 +147,11 @@ class Arc(eqx.Module):
         jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
         # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
         rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
-        along = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
+        directed = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
         guards = Events(
             impact=_guard(time, y[0], [jets[0], jets[1], jets[2] / 2, jets[3] / 6], True),
             turning=_guard(time, y[1], [jets[1], jets[2], jets[3] / 2], ~self.hop),
-            extremum=jnp.where(self.hop, 1.0, along / (1e14 * self.noise)),
+            extremum=jnp.where(self.hop, 1.0, directed / (1e14 * self.noise)),
             saddle=_guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), jets[1]], True),
             flat=_guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat),
         )

@@ -160,7 +160,7 @@ class TaylorStepper(AbstractStepper):
         higher = surpasses(stage.peak, state.peak)
         # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
         slope = -2 * moments.restoring(Angle.of(state.opening))
-        off = state.spread.along(slope, -2 * state.velocity)
+        off = state.spread.error_of(slope, -2 * state.velocity)
         toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
         toss_up = toss_up & (state.status == Status.successful)
         flat = stage.peak_steepness <= 0

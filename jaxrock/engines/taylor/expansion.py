@@ -100,18 +100,18 @@ def expand(start: Start, order: int) -> Expansion:
             sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
             cosine.append(keep_by(_product(slopes, sine, k - 1) * (-1 / k), one))
         basis = Basis.of_term(k, x, sine, cosine)
-        arm = moments.arm_terms.along(basis, empty=None)
+        arm = moments.arm_terms.summed(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
         if straight:
             products = before[0].products(last) if before and last else []
             moment = sum(products + now.products(basis), start=0.0)
         else:
             moment = _product(pushes, arms, k)
-            restoring = scaled.along(basis, empty=None)
+            restoring = scaled.summed(basis, empty=None)
             moment = moment if restoring is None else moment + restoring
         last = basis
         if start.shaking.vertical is not None:
-            restorings.append(moments.restoring_terms.along(basis, empty=None))
+            restorings.append(moments.restoring_terms.summed(basis, empty=None))
             moment = moment + scale * _product(start.shaking.vertical, restorings, k)
         slope = keep_by(moment * (1 / (k + 1)), one)
         if k == 0:
@@ -209,7 +209,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     def of(own):
         of_term, of_source = backwards(own)
 
-        def along(_, terms, sign=None):
+        def gain(_, terms, sign=None):
             terms = [term for term in terms if term is not None]
             return sum(w * (term if sign is None else sign * term) for w, term in zip(of_source, terms))
 
@@ -221,8 +221,8 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
         horizontal, vertical = start.shaking
         zero = jnp.zeros_like(length)
         moments = Coefficients(
-            start.moments.restoring_terms.each(along, sources.restoring),
-            start.moments.arm_terms.each(functools.partial(along, sign=side), sources.arm),
+            start.moments.restoring_terms.each(gain, sources.restoring),
+            start.moments.arm_terms.each(functools.partial(gain, sign=side), sources.arm),
         )
         of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
         shaking = Shaking(

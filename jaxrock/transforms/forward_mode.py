@@ -1,4 +1,4 @@
-"""Forward mode along every number of a scene that moves: value and Jacobian, in one recipe."""
+"""Forward mode in every number of a scene that moves: value and Jacobian, in one recipe."""
 
 import functools
 import math
@@ -19,7 +19,7 @@ def value_and_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
 
 def value_and_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
-    """The recipe of (value, change) along one direction, whose leaves follow the recipe's; for integers None."""
+    """The recipe of (value, change) in one direction, whose leaves follow the recipe's; for integers None."""
     return recipe.derivative(moves, _with_change)
 
 
@@ -27,15 +27,15 @@ def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     moving = _moving(recipe.like, moves)
 
     def both(leaves):
-        along = functools.partial(_pushed, recipe, moves, leaves)
-        value, tangents = jax.vmap(along, out_axes=(None, 0))(*directions_of(_moving(leaves, moves)))
+        pushed = functools.partial(_pushed, recipe, moves, leaves)
+        value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions_of(_moving(leaves, moves)))
         columns = [columns_of(*pair, moving) for pair in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
 
     def shapes(out):
         return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
 
-    return _made(recipe, moves, both, recipe.like, "by", shapes)
+    return _made(recipe, moves, both, recipe.like, "jacobian", shapes)
 
 
 def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
@@ -47,7 +47,7 @@ def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
         changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
 
-    return _made(recipe, moves, both, like, "along", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
+    return _made(recipe, moves, both, like, "change", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
 
 
 def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequence, word: str, shapes: Callable):
@@ -73,7 +73,7 @@ def _is_real(leaf: Any) -> bool:
 
 
 def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *direction: Any) -> tuple[list, list]:
-    """The recipe's leaves, and their change along a direction."""
+    """The recipe's leaves, and their change in a direction."""
 
     def function(moving):
         rest = iter(moving)
@@ -91,7 +91,7 @@ def directions_of(moving: Sequence) -> list:
 
 
 def columns_of(out: Any, column: Any, moving: Sequence) -> list | None:
-    """Derivatives of a leaf of the value by the moving leaves, in their shapes; `column`: along all directions."""
+    """Derivatives of a leaf of the value by the moving leaves, in their shapes; `column`: in all directions."""
     if not _is_real(out):
         return None
     cuts = np.cumsum([math.prod(leaf.shape) for leaf in moving])[:-1]

@@ -19,7 +19,7 @@ from jaxrock.motions.record import AbstractChosen, Padded, Record, Straight, roo
 from jaxrock.motions.shaking import Bounds, Envelope
 
 
-class Together(Owner):
+class JoinedRecords(Owner):
     """Records one after the other, with room for more at the end: so that one program serves many suites.
 
     A record of n samples has n places: its n - 1 pieces, and one for the quiet after it.
@@ -27,13 +27,13 @@ class Together(Owner):
 
     samples: Inexact[Array, " places"] = parameter("g", strength, axes=1)
     dt: Inexact[Array, " records"] = parameter("s", size, axes=1)
-    first: Int[Array, " records"]  # place of each
-    count: Int[Array, " records"]  # samples of each
-    owner: Int[Array, " places"]  # which record has a place
+    first: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # place of each
+    count: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # samples of each
+    owner: Int[Array, " places"] = parameter("-", axes=1, is_whole=True)  # which record has a place
     longest: int = eqx.field(static=True)  # room for the samples of any
 
     @classmethod
-    def of(cls, records: Sequence[Record]) -> "Together":
+    def of(cls, records: Sequence[Record]) -> "JoinedRecords":
         """Join records; what is known stays so within `jax.jit`."""
         sizes = np.array([record.samples.size for record in records])
         places, owners = roomy(int(sizes.sum())), roomy(len(records))
@@ -61,37 +61,37 @@ class _InPlace(Straight):
     No array depends on which of them that is.
     """
 
-    together: Together
+    joined: JoinedRecords
     record: Int[Array, ""]
     sure: Scalar
 
     @property  # type: ignore[misc]
     def samples(self) -> Inexact[Array, " places"]:  # type: ignore[override]
-        return self.together.samples
+        return self.joined.samples
 
     @property  # type: ignore[misc]
     def dt(self) -> Scalar:  # type: ignore[override]
-        return self.sure * self.together.dt[self.record]  # which makes slopes no numbers, at no cost in a step
+        return self.sure * self.joined.dt[self.record]  # which makes slopes no numbers, at no cost in a step
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
-        many = self.together
+        many = self.joined
         return many.dt[many.owner] * jnp.minimum(many.place, many.count[many.owner] - 1)
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
-        many = self.together
+        many = self.joined
         return jnp.where(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
 
     @property
     def _left(self) -> Int[Array, " places"]:
         """Pieces from each place on to the end of its record."""
-        many = self.together
+        many = self.joined
         return jnp.maximum(many.count[many.owner] - 1 - many.place, 0)
 
     @property
     def envelope(self) -> Envelope:
-        many, values = self.together, self.bounds
+        many, values = self.joined, self.bounds
         values = jnp.where(self._left[:-1] > 0, values, 0.0)
         peaks = jax.ops.segment_max(values, many.owner[:-1], many.dt.size, indices_are_sorted=True)
         return Envelope(Bounds(values, self.sure, left=self._left[:-1], peak=peaks[self.record]), None)
@@ -100,14 +100,14 @@ class _InPlace(Straight):
 class Chosen(AbstractChosen):
     """One of many records, by its number, which may be traced: what `suite[number]` is."""
 
-    together: Together
-    record: Int[Array, "..."] = parameter("-", is_free=False)
+    joined: JoinedRecords
+    record: Int[Array, "..."] = parameter("-", is_free=False, is_whole=True)
     sure: Inexact[Array, "..."] = parameter("-", is_free=False)  # 1; what is not a number where there is no such record
 
     @property
     def alone(self) -> Padded:
         """The record with samples of its own."""
-        many, places = self.together, jnp.arange(self.together.longest)
+        many, places = self.joined, jnp.arange(self.joined.longest)
         first, count, dt = (x[self.record] for x in (many.first, many.count, many.dt))
         samples = many.samples[jnp.minimum(first + places, many.samples.size - 1)]
         return Padded(self.sure * jnp.where(places < count, samples, 0.0), dt, dt * (count - 1))
@@ -151,7 +151,7 @@ def in_place(motion: AbstractMotion) -> Stretch:
         return isinstance(part, Chosen)
 
     (chosen,) = filter(is_chosen, jax.tree.leaves(motion, is_leaf=is_chosen))
-    many, record = chosen.together, chosen.record
-    place = _InPlace(together=many, record=record, sure=chosen.sure)  # type: ignore[call-arg]
+    many, record = chosen.joined, chosen.record
+    place = _InPlace(joined=many, record=record, sure=chosen.sure)  # type: ignore[call-arg]
     whole = jax.tree.map(lambda part: place if is_chosen(part) else part, motion, is_leaf=is_chosen)
     return Stretch(whole, many.first[record], many.first[record] + many.count[record] - 1, many.longest - 1)
