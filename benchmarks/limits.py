@@ -18,6 +18,7 @@ from peers_solvers.report import surroundings
 
 import jaxrock as rk
 from jaxrock.engines.taylor import expansion, fast
+from jaxrock.engines.taylor.follow import most_steps
 from jaxrock.responses import outcome
 from references import peer_problems as problems
 from references.in_jaxrock import MODELS
@@ -77,7 +78,7 @@ def steps(problem):
             return after, rocking + ~rests, waiting + rests, eventful + ends
 
         zero = jnp.int32(0)
-        limit = fast.most_steps(stepper.scene.most_pieces)
+        limit = most_steps(stepper.scene.most_pieces)
         going = lambda carry: ~carry[0].done & (carry[0].steps < limit)  # noqa: E731
         return jax.lax.while_loop(going, step, (state, zero, zero, zero))[1:]
 

@@ -65,7 +65,6 @@ class Scene(eqx.Module):
     far_reset: Reset  # on the other
     motion: AbstractMotion
     knots: Inexact[Array, " knots"]
-    lengths: Inexact[Array, " knots"]
     scales: Inexact[Array, " knots"] | None  # None: straight lines
     count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
     outlook: Outlook
@@ -110,7 +109,6 @@ class Scene(eqx.Module):
             far_reset=far_reset,
             motion=motion,
             knots=knots,
-            lengths=_endless(lengths, None if stretch else count),
             scales=None if motion.scales is None else _endless(motion.scales, None if stretch else count),
             count=count,
             outlook=Outlook.of(envelope, _least_threshold(moments, far)),
@@ -176,6 +174,10 @@ class Scene(eqx.Module):
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
         """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
         return jnp.minimum(self.outlook.after_quiet(piece), self.pieces)
+
+    def length(self, piece: Int[Array, ""]) -> Scalar:
+        """How long a piece lasts [s]; the quiet after the motion has no end."""
+        return jnp.where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
 
     def scale(self, piece: Int[Array, ""]) -> Scalar | float:
         """Time in which the acceleration of a piece changes [s]."""

@@ -102,7 +102,7 @@ class AbstractStepper(eqx.Module):
         return jnp.maximum(room, 0.0)
 
     def _to_knot(self, state: State) -> Scalar:
-        return pick(self.scene.lengths, state.piece) - state.local
+        return self.scene.length(state.piece) - state.local
 
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
         """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""

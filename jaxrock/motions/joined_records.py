@@ -83,6 +83,9 @@ class _InPlace(Straight):
         many = self.joined
         return jnp.where(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
 
+    def length(self, piece: Piece) -> Scalar:
+        return self.joined.dt[self.record]
+
     @property
     def _left(self) -> Int[Array, " places"]:
         """Pieces from each place on to the end of its record."""

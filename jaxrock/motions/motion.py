@@ -19,7 +19,7 @@ from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
-from jaxrock.numerics.lookup import count_up_to
+from jaxrock.numerics.lookup import count_up_to, pick
 
 Scalar = Inexact[Array, ""]
 Piece = Int[Array, ""]  # number of a smooth piece
@@ -40,6 +40,10 @@ class AbstractMotion(Owner):
         """How long each piece lasts [s]. Blocks are followed by the time since the last knot: a motion that begins late
         tells lengths that differences of rounded knots would not."""
         return jnp.diff(self.knots)
+
+    def length(self, piece: Piece) -> Scalar:
+        """How long one piece lasts [s]."""
+        return pick(self.lengths, piece)
 
     @property
     def lateness(self) -> Scalar | None:
@@ -170,6 +174,9 @@ class Scaled(_Changed):
     def lengths(self) -> Inexact[Array, " pieces"]:
         return self.motion.lengths
 
+    def length(self, piece: Piece) -> Scalar:
+        return self.motion.length(piece)
+
     @property
     def lateness(self) -> Scalar | None:
         return self.motion.lateness
@@ -210,6 +217,9 @@ class Shifted(_Changed):
     def lengths(self) -> Inexact[Array, " pieces"]:
         inner = self.motion.lengths
         return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
+
+    def length(self, piece: Piece) -> Scalar:
+        return jnp.where(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
 
     @property
     def lateness(self) -> Scalar | None:

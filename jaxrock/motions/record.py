@@ -112,6 +112,14 @@ class Record(Straight):
             return jnp.zeros(2, self.samples.dtype)
         return self.dt * jnp.arange(self.samples.shape[-1])
 
+    @property
+    def lengths(self) -> Inexact[Array, " pieces"]:
+        count = self.samples.shape[-1]
+        return jnp.zeros(1, self.samples.dtype) if count == 1 else jnp.full(count - 1, self.dt, self.samples.dtype)
+
+    def length(self, piece: Piece) -> Scalar:
+        return self.lengths[0]
+
 
 class AbstractChosen(AbstractMotion):
     """A record whose samples lie among those of others."""
@@ -132,6 +140,13 @@ class Padded(Straight):
     @property
     def knots(self) -> Inexact[Array, " knots"]:
         return jnp.minimum(self.dt * jnp.arange(self.samples.shape[-1]), self.finish)
+
+    @property
+    def lengths(self) -> Inexact[Array, " pieces"]:
+        return self.length(jnp.arange(self.samples.shape[-1] - 1))
+
+    def length(self, piece: Piece) -> Scalar:
+        return jnp.where(self.dt * piece < self.finish, self.dt, 0.0)
 
 
 def padded(motion: AbstractMotion) -> AbstractMotion:

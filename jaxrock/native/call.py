@@ -93,8 +93,7 @@ _DEAR = {"div", "sqrt", "rsqrt", "exp", "expm1", "log", "sin", "cos", "tan", "as
 
 def _is_before_loops(equation) -> bool:
     """Whether what stays the same in a loop is computed before it, once for each scene."""
-    is_dear = equation.primitive.name in _DEAR and bool(__import__("os").environ.get("DEAR","1")=="1")
-    return is_dear or not is_known(equation) or any(map(_is_large, equation.outvars))
+    return equation.primitive.name in _DEAR or not is_known(equation) or any(map(_is_large, equation.outvars))
 
 
 def _is_large(variable) -> bool:

@@ -9,7 +9,7 @@ from jaxrock.native.partition import needed_by, part_of
 
 
 def hoisted(program: ClosedJaxpr, is_left: Callable, constants: Sequence[int] = ()) -> ClosedJaxpr:
-    """The program with all that stays the same in its loops, and `is_left` to what is before them, with what that needs.
+    """The program with what stays the same in its loops, and `is_left` to what is before them, with what that needs.
 
     `constants`: places of its inputs that stay the same in all turns of a loop around it: what only depends on these
     comes out of the cases of its conditions, too.

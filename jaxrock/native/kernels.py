@@ -229,9 +229,13 @@ class Refilled:
         """What stands for the constants of the loop."""
         rooms = iter([room for *_, room in self.own])
         values = dict(self.known)
+
+        def starts(size):
+            return self._starts(take, size)
+
         for v in self.consts:
             if self._is_given(v) and v not in values:
-                values[v] = self.f.argument(v, self.of[v], False, lambda *_: take(next(rooms)), lambda size: self._starts(take, size))
+                values[v] = self.f.argument(v, self.of[v], False, lambda *_: take(next(rooms)), starts)
         return [values[v] if self._is_given(v) else self.e.known(self._constant(v), kind_of(v)) for v in self.consts]
 
     def _starts(self, take: Callable, size: int) -> list:

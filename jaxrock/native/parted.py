@@ -1,9 +1,9 @@
-"""A loop whose lanes do different things: each case of its step is done for as many lanes as wait for it. Needs llvmlite.
+"""A loop whose lanes do different things: each case of its step is done for many lanes that wait for it.
 
 Of a step that ends with conditions on `apart` the first case is the cheap and frequent one. Many more scenes than a
 vector has lanes are under way, in slots on the stack, and groups of neighbouring slots take turns to go on with that
 case. A lane that needs another is put down in the list of those who do; when a list fills a vector, they are collected
-from their slots, do it together, and are put back.
+from their slots, do it together, and are put back. Needs llvmlite.
 """
 
 from typing import Any
@@ -75,7 +75,9 @@ class _Parted(Refilled):
 
     def _before(self, program, inputs: list, mask) -> tuple[dict, list, Any, Any]:
         """Values before the last condition of a step, its operands, flag and equation."""
-        before, condition = _condition(program)
+        found = _condition(program)
+        assert found is not None  # or it is a case
+        before, condition = found
         used = dict.fromkeys(v for v in [*condition.invars, *program.jaxpr.outvars] if not hasattr(v, "val"))
         own = [v for v in used if v not in condition.outvars]
         part = part_of(program, before, own)
@@ -188,9 +190,10 @@ class _Parted(Refilled):
 
         active, waiting, consts = take(self.active), take(self.waiting), self._consts(take)
         active = b.and_(active, b.not_(waiting))
-        state, going, masks, turns = self._glide(consts, self._state(take), active)
-        for value, (_, _, room) in zip(flat(state), self.changing, strict=True):
-            f.store(value, room, first)
+        changed, going, masks, turns = self._glide(consts, self._state(take), active)
+        for value, (_, _, room) in zip(changed, self.changing, strict=True):
+            if value is not None:
+                f.store(value, room, first)
         ready = b.and_(active, b.not_(going))
         f.store(ready, self.ready, first)
         f.store(b.or_(waiting, self._listed(masks[1:], first)), self.waiting, first)
@@ -198,7 +201,8 @@ class _Parted(Refilled):
         b.store(b.select(moved, _I64(0), b.add(b.load(self.idle), _I64(1))), self.idle)
 
     def _glide(self, consts: list, carry: list, active) -> tuple:
-        """The state after the first case as long as many lanes are in it; who goes on, in which cases, and the turns."""
+        """What changes of the state (None: nothing) in the first case, as long as many lanes are in it; who goes on, in
+        which cases, and the turns."""
         b, e = self.b, self.e
         before, firsts = b.block, flat(carry)
         head, inside, after = (b.append_basic_block(name) for name in ("head", "glide", "after"))
@@ -225,7 +229,8 @@ class _Parted(Refilled):
         b.branch(head)
         b.position_at_end(after)
         e.before.pop()
-        return state, going, masks, turns
+        found = [None if new is phi else phi for new, phi in zip(changed, phis)]
+        return found, going, masks, turns
 
     def _number(self, mask):
         """How many lanes are set."""
@@ -257,7 +262,7 @@ class _Parted(Refilled):
         return total
 
     def _choose(self, visit, choose, end) -> None:
-        """A case that fills a vector; or, where no group moves any more, one that somebody waits for; or the next group."""
+        """A case that fills a vector; or, where no group moves any more, one that some wait for; or the next group."""
         b, e = self.b, self.e
         stuck = b.icmp_signed(">=", b.load(self.idle), b.load(self.groups))
         for number, count in enumerate(self.counts, 1):

@@ -15,7 +15,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.engines.taylor.fast import follow, most_steps
+from jaxrock.engines.taylor.follow import follow, most_steps
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.flexible.response import outcome_flexible
 from jaxrock.flexible.stepper import FlexibleOutcome

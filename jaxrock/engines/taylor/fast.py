@@ -1,4 +1,4 @@
-"""The fast pass: Taylor steps in one flat loop, for the many scenes that need no care.
+"""The fast pass: Taylor steps for the many scenes that need no care.
 
 A step is a series, a certificate of its shape, the turning point within it if there is one, and the first level that
 it meets (ground or saddle), where it is cut. What has no certificate is postponed: the series engine, which takes every
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Inexact, Int
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.engines.bookkeeping import checked, errors_after, escaped, note
 from jaxrock.engines.events import Events, landed
@@ -21,9 +21,7 @@ from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
-from jaxrock.engines.taylor.glide import Glide, onward, settled
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.numerics.apart import apart, lanes_part
 from jaxrock.numerics.newton import root_between
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
@@ -356,51 +354,3 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
         share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
     steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
     return jnp.where(steady, 1.0, share)
-
-
-def most_steps(pieces: int) -> int:
-    """After how many steps a scene is left to the careful engine."""
-    return POLICY.fast_steps + 3 * pieces
-
-
-def _follow_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
-    """Lanes glide while nothing happens, and part with the others where something may: that takes many times as long."""
-
-    strongest = stepper.scene.outlook.strongest_drive
-
-    def step(carry):
-        s, glide = carry
-
-        def of(step):
-            def stepped():
-                after = step(stepper, settled(stepper, s, glide, strongest))
-                return after, Glide.of(after)
-
-            return stepped
-
-        def careful():
-            return jax.lax.cond(apart(s.side == 0), of(wait), of(advance))
-
-        return jax.lax.cond(apart(lanes_part() & glide.goes), lambda: onward(stepper, s, glide), careful)
-
-    def going(carry):
-        return ~carry[0].done & (carry[0].steps < limit)
-
-    return settled(stepper, *jax.lax.while_loop(going, step, (state, Glide.of(state))), strongest)
-
-
-def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
-    """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
-    limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
-
-    def until(condition, step):
-        return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
-
-    def resting(state):
-        return state.side == 0
-
-    if POLICY.is_record(stepper.scene.most_pieces):
-        return _follow_record(stepper, state, limit)
-    rest = until(resting, lambda s: wait(stepper, s))
-    rock = until(lambda s: ~resting(s), lambda s: advance(stepper, s))
-    return until(lambda s: True, lambda s: rock(rest(s)))(state)

@@ -15,6 +15,8 @@ from jaxrock.engines.bookkeeping import rounded
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import expand
+from jaxrock.engines.uncertainty import Spread
+from jaxrock.numerics.apart import lanes_part
 from jaxrock.numerics.polynomial import horner
 from jaxrock.numerics.xla_cpu import keep_by
 
@@ -44,13 +46,15 @@ def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scala
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
     per_time = 1 / jnp.where(count > 0, time, 1.0)
-    missed = glide.missed + count * (stepper.rounding * stepper.scene.alpha) ** 2
     largest = replace(state, opening=jnp.maximum(state.opening, glide.opening), velocity=state.fastest)
     angle, velocity = rounded(stepper, largest, strongest, 2 * time / jnp.maximum(count, 1.0))
+    least = 2 * stepper.rounding * stepper.scene.alpha
+    missed, faster = 4 * glide.missed, stepper.order * count * per_time
     spread = state.spread.plus_variance(
-        4 * missed + count * angle**2, 4 * missed * (stepper.order * count * per_time) ** 2 + count * velocity**2
+        missed + count * (angle + least) ** 2, missed * faster**2 + count * (velocity + least) ** 2
     )
-    return replace(state, spread=spread.after_flow(glide.repulsion * per_time, time))
+    spread = spread.after_flow(glide.repulsion * per_time, time)
+    return replace(state, spread=Spread.where(lanes_part(), spread, state.spread))  # else there are no glides
 
 
 def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, Glide]:

@@ -1,0 +1,66 @@
+"""The loop of the fast pass: a lane glides, steps or waits, until its motion is over or a step is not certain."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from jaxrock.engines.state import State
+from jaxrock.engines.taylor.careful import TaylorStepper
+from jaxrock.engines.taylor.fast import advance, wait
+from jaxrock.engines.taylor.glide import Glide, onward, settled
+from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.numerics.apart import apart, lanes_part
+
+
+def most_steps(pieces: int) -> int:
+    """After how many steps a scene is left to the careful engine."""
+    return POLICY.fast_steps + 3 * pieces
+
+
+def follow(stepper: TaylorStepper, state: State, limit: Int[Array, ""] | int) -> State:
+    """Follow a block to the end of the motion, to where it is postponed, or until it has taken `limit` steps in all."""
+    limit = jnp.minimum(limit, most_steps(stepper.scene.most_pieces))
+    is_record = POLICY.is_record(stepper.scene.most_pieces)
+    return (_under_record if is_record else _under_pulse)(stepper, state, limit)
+
+
+def _under_pulse(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
+    """Lanes rest, and rock, together."""
+
+    def until(condition, step):
+        return lambda s: jax.lax.while_loop(lambda s: condition(s) & ~s.done & (s.steps < limit), step, s)
+
+    def resting(state):
+        return state.side == 0
+
+    rest = until(resting, lambda s: wait(stepper, s))
+    rock = until(lambda s: ~resting(s), lambda s: advance(stepper, s))
+    return until(lambda s: True, lambda s: rock(rest(s)))(state)
+
+
+def _under_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -> State:
+    """Lanes glide as long as nothing happens, and part with the others where something may, which takes many times as
+    long."""
+    strongest = stepper.scene.outlook.strongest_drive
+
+    def turn(carry):
+        state, glide = carry
+
+        def of(step):
+            def stepped():
+                after = step(stepper, settled(stepper, state, glide, strongest))
+                return after, Glide.of(after)
+
+            return stepped
+
+        def with_care():
+            return jax.lax.cond(apart(state.side == 0), of(wait), of(advance))
+
+        return jax.lax.cond(apart(lanes_part() & glide.goes), lambda: onward(stepper, state, glide), with_care)
+
+    def going(carry):
+        state, _ = carry
+        return ~state.done & (state.steps < limit)
+
+    last = jax.lax.while_loop(going, turn, (state, Glide.of(state)))
+    return settled(stepper, *last, strongest)
