@@ -143,7 +143,7 @@ class Padded(Straight):
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
-        return self.length(jnp.arange(self.samples.shape[-1] - 1))
+        return jnp.where(self.dt * jnp.arange(self.samples.shape[-1] - 1) < self.finish, self.dt, 0.0)
 
     def length(self, piece: Piece) -> Scalar:
         return jnp.where(self.dt * piece < self.finish, self.dt, 0.0)

@@ -10,7 +10,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from jaxrock.native.emitter import flat, like
+from jaxrock.native.emitter import Emitter, flat, like
 from jaxrock.native.kernels import Frame, Refilled
 from jaxrock.native.partition import part_of
 
@@ -49,29 +49,19 @@ def emit_parted(program, shared: list[bool], lanes: int, name: str) -> ir.Module
     return _Parted(Frame(program.jaxpr, lanes, name), program, shared).module()
 
 
-class _Parted(Refilled):
-    """A loop with more scenes under way than a vector has lanes."""
+class _Step:
+    """The body of a loop, case by case."""
 
-    def __init__(self, frame: Frame, program, shared: list[bool]):
-        # After the last slot there is one for what lanes without a scene leave.
-        super().__init__(frame, program, shared, slots=(_GROUPS + 1) * frame.e.lanes)
-        b, lanes = self.b, self.e.lanes
-        self.step = self.equation.params["body_jaxpr"]
-        self.last = _I64(_GROUPS * lanes)
-        self.waiting = self._room(_I8)  # in a list
-        self.lists = [self._room(_I64) for _ in range(1, _cases(self.step))]
-        self.counts = [b.alloca(_I64) for _ in self.lists]
-        self.group, self.idle = b.alloca(_I64), b.alloca(_I64)
-        # As many groups as this thread's share of the scenes fills.
-        threads = b.sext(b.load(b.gep(frame.sizes, [_I32(2)])), _I64)
-        share = b.sdiv(frame.count, b.select(b.icmp_signed(">", threads, _I64(0)), threads, _I64(1)))
-        full = b.add(b.sdiv(share, _I64(lanes)), _I64(1))
-        self.groups, self.top = b.alloca(_I64), b.alloca(_I64)  # that are visited; the last slot with a scene
-        groups = b.select(b.icmp_signed("<", full, _I64(_GROUPS)), full, _I64(_GROUPS))
-        b.store(groups, self.groups)
-        b.store(b.sub(b.mul(groups, _I64(lanes)), _I64(1)), self.top)
+    def __init__(self, emitter: Emitter, program):
+        self.e, self.b, self.program = emitter, emitter.b, program
 
-    # Steps
+    def masks(self, inputs: list, mask) -> list:
+        """Which lanes are in each of the cases, the first of all being that of the true flags."""
+        return self._masks(self.program, inputs, mask)
+
+    def done(self, inputs: list, mask, number: int) -> list:
+        """The results of a step for lanes that are in one of its cases."""
+        return self._done(self.program, inputs, mask, number)
 
     def _before(self, program, inputs: list, mask) -> tuple[dict, list, Any, Any]:
         """Values before the last condition of a step, its operands, flag and equation."""
@@ -93,7 +83,6 @@ class _Parted(Refilled):
         return values, operands, flag, condition
 
     def _masks(self, program, inputs: list, mask) -> list:
-        """Which lanes are in each of the cases, the first of all being that of the true flags."""
         if _condition(program) is None:
             return [mask]
         _, operands, flag, condition = self._before(program, inputs, mask)
@@ -102,7 +91,6 @@ class _Parted(Refilled):
         return self._masks(yes, operands, self.b.and_(mask, flag)) + self._masks(no, operands, others)
 
     def _done(self, program, inputs: list, mask, number: int) -> list:
-        """The results of a step for lanes that are in one of its cases."""
         if _condition(program) is None:
             return self.e.run(program, inputs, mask)
         values, operands, _, condition = self._before(program, inputs, mask)
@@ -113,12 +101,34 @@ class _Parted(Refilled):
         outputs = program.jaxpr.outvars
         return [self.e.known(v.val, v.aval.dtype) if hasattr(v, "val") else values[v] for v in outputs]
 
+
+class _Parted(Refilled):
+    """A loop with more scenes under way than a vector has lanes."""
+
+    def __init__(self, frame: Frame, program, shared: list[bool]):
+        # After the last slot there is one for what lanes without a scene leave.
+        super().__init__(frame, program, shared, slots=(_GROUPS + 1) * frame.e.lanes)
+        b, lanes = self.b, self.e.lanes
+        program = self.equation.params["body_jaxpr"]
+        self.step = _Step(self.e, program)
+        self.last = _I64(_GROUPS * lanes)
+        self.waiting = self._room(_I8)  # in a list
+        self.lists = [self._room(_I64) for _ in range(1, _cases(program))]
+        self.counts = [b.alloca(_I64) for _ in self.lists]
+        self.group, self.idle = b.alloca(_I64), b.alloca(_I64)
+        # As many groups as this thread's share of the scenes fills.
+        threads = b.sext(b.load(b.gep(frame.sizes, [_I32(2)])), _I64)
+        share = b.sdiv(frame.count, b.select(b.icmp_signed(">", threads, _I64(0)), threads, _I64(1)))
+        full = b.add(b.sdiv(share, _I64(lanes)), _I64(1))
+        self.groups, self.top = b.alloca(_I64), b.alloca(_I64)  # that are visited; the last slot with a scene
+        groups = b.select(b.icmp_signed("<", full, _I64(_GROUPS)), full, _I64(_GROUPS))
+        b.store(groups, self.groups)
+        b.store(b.sub(b.mul(groups, _I64(lanes)), _I64(1)), self.top)
+
     def _operands(self, consts: list, state: list) -> tuple[list, list]:
         """Of the loop's condition, and of its body."""
         count = self.equation.params["cond_nconsts"]
         return consts[:count] + state, consts[count:] + state
-
-    # The function
 
     def module(self) -> ir.Module:
         """The function."""
@@ -215,13 +225,13 @@ class _Parted(Refilled):
         of_condition, of_body = self._operands(consts, state)
         (going,) = e.run(self.equation.params["cond_jaxpr"], of_condition, active)
         going = b.and_(going, active)
-        masks = self._masks(self.step, of_body, going)
+        masks = self.step.masks(of_body, going)
         here, all_ = self._number(masks[0]), self._number(going)
         enough = b.icmp_unsigned(">=", b.mul(here, _I32(100)), b.mul(all_, _I32(round(100 * _ENOUGH))))
         goes = b.or_(enough, b.icmp_signed("==", turns, _I64(0)))
         b.cbranch(b.and_(goes, b.icmp_unsigned(">", here, _I32(0))), inside, after)
         b.position_at_end(inside)
-        changed = flat(self._done(self.step, of_body, masks[0], 0))
+        changed = flat(self.step.done(of_body, masks[0], 0))
         kept = [phi if new is phi else b.select(masks[0], new, phi) for new, phi in zip(changed, phis)]
         for phi, first, later in zip([*phis, turns], [*firsts, _I64(0)], [*kept, b.add(turns, _I64(1))]):
             phi.add_incoming(first, before)
@@ -300,7 +310,7 @@ class _Parted(Refilled):
             return value
 
         consts, carry = self._consts(take), self._state(take)
-        results = flat(self._done(self.step, self._operands(consts, carry)[1], mask, number))
+        results = flat(self.step.done(self._operands(consts, carry)[1], mask, number))
         for old, value, (_, _, room) in zip(flat(carry), results, self.changing, strict=True):
             if value is not old:
                 self._put(value, room, tos)

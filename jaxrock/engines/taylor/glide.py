@@ -32,13 +32,14 @@ class Glide(NamedTuple):
     repulsion: Scalar  # integral over that time
     missed: Scalar  # sum of the squares of what the series left out [rad^2]
     opening: Scalar  # at the beginning
+    velocity: Scalar
     steps: Int[Array, ""]  # taken up to there
 
     @classmethod
     def of(cls, state: State) -> "Glide":
         """One that begins."""
         zero = jnp.zeros_like(state.opening)
-        return cls(state.side != 0, zero, zero, zero, state.opening, state.steps)
+        return cls(state.side != 0, zero, zero, zero, state.opening, state.velocity, state.steps)
 
 
 def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scalar) -> State:
@@ -46,8 +47,10 @@ def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scala
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
     per_time = 1 / jnp.where(count > 0, time, 1.0)
-    largest = replace(state, opening=jnp.maximum(state.opening, glide.opening), velocity=state.fastest)
-    angle, velocity = rounded(stepper, largest, strongest, 2 * time / jnp.maximum(count, 1.0))
+    # Speeds on the way: those at the ends, or twice the mean where it gathers speed and loses it again.
+    speed = jnp.abs(state.velocity) + jnp.abs(glide.velocity) + 2 * jnp.abs(state.opening - glide.opening) * per_time
+    largest = replace(state, opening=jnp.maximum(state.opening, glide.opening), velocity=speed)
+    angle, velocity = rounded(stepper, largest, strongest, time / jnp.maximum(count, 1.0))
     least = 2 * stepper.rounding * stepper.scene.alpha
     missed, faster = 4 * glide.missed, stepper.order * count * per_time
     spread = state.spread.plus_variance(
