@@ -8,7 +8,6 @@ from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
 from jaxrock.blocks.edge import Edge as Edge
 from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
-from jaxrock.blocks.mesh import Rock as Rock
 from jaxrock.blocks.planes import (
     WeakPlane as WeakPlane,
     shared_plane as shared_plane,
@@ -18,6 +17,7 @@ from jaxrock.blocks.random import (
     draw_rocks as draw_rocks,
 )
 from jaxrock.blocks.rigid import Block as Block
+from jaxrock.blocks.rock import Rock as Rock
 
 
 def __dir__() -> list[str]:

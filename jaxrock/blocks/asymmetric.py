@@ -10,10 +10,10 @@ from jaxrock._arguments import arguments, pair, word_of
 from jaxrock._checks import Range, Values, acute, check_shapes, checked, rate, ratio, size, strength, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
-from jaxrock.blocks.mesh import section_of
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
 from jaxrock.blocks.rigid import GRAVITY, Side
+from jaxrock.blocks.rock import section_of
 from jaxrock.numerics.elementary import sine_cosine
 
 Real = Inexact[Array, "..."]

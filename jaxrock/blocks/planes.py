@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Bool, Float
 
 from jaxrock._arguments import arguments, at_least, list_of
 from jaxrock._checks import not_negative, scalar
-from jaxrock.blocks.mesh import Rock
+from jaxrock.blocks.rock import Rock
 
 
 class WeakPlane(NamedTuple):

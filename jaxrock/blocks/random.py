@@ -11,8 +11,8 @@ from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import not_negative, positive, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.mesh import Rock
 from jaxrock.blocks.rigid import Block
+from jaxrock.blocks.rock import Rock
 
 
 def _deviation(name: str, value: ArrayLike) -> float:

@@ -1,16 +1,10 @@
 """How probably a rock topples: fragilities, fitted or simulated, hazard curves, and files of OpenQuake.
 
-Imports `studies`, `responses`, `sweeps`. Start with `fragility`, then `curves`.
+Imports `studies`, `responses`, `sweeps`. Start with `fragility`, then `curves` and `survival`.
 """
 
 from jaxrock._surface import shown as _shown
-from jaxrock.hazard.curves import (
-    HazardCurve as HazardCurve,
-    allowed_scale as allowed_scale,
-    branch_weights as branch_weights,
-    survival_probability as survival_probability,
-    toppling_rate as toppling_rate,
-)
+from jaxrock.hazard.curves import HazardCurve as HazardCurve
 from jaxrock.hazard.explanation import compare_measures as compare_measures
 from jaxrock.hazard.fragility import (
     AbstractFragility as AbstractFragility,
@@ -48,6 +42,12 @@ from jaxrock.hazard.surfaces import (
     fit_surface as fit_surface,
     simulated_surface as simulated_surface,
     surface_of as surface_of,
+)
+from jaxrock.hazard.survival import (
+    allowed_scale as allowed_scale,
+    branch_weights as branch_weights,
+    survival_probability as survival_probability,
+    toppling_rate as toppling_rate,
 )
 
 

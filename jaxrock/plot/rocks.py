@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.mesh import Rock
+from jaxrock.blocks.rock import Rock
 from jaxrock.plot.style import BLUE, RED
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from jaxrock._described import described
 from jaxrock._parameters import broadcast, check_single, one_of_many
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.mesh import Rock
 from jaxrock.blocks.rigid import Block
+from jaxrock.blocks.rock import Rock
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner

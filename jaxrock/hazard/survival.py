@@ -1,0 +1,228 @@
+"""How often shakings of a hazard curve topple rocks, and what the survival of precariously balanced rocks says of it.
+
+A shaking topples a rock with the probability that its fragility gives. Rocks at one site share their shakings: given
+the intensity they topple independently, but what spares one is likely to spare the others, so that their joint survival
+is more probable than the product of the single ones.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+from jaxrock._arguments import arguments, list_of
+from jaxrock._checks import Values, checked, inner_share, not_negative, scalar, share
+from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled, shakings
+from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility
+from jaxrock.numerics.roots import search_root
+
+Number = Inexact[Array, ""]
+_each = list_of(AbstractFragility, "fragilities")
+
+
+def _one_or_many(name: str, value: Any) -> tuple[AbstractFragility, ...]:
+    return (value,) if isinstance(value, AbstractFragility) else tuple(_each(name, value))
+
+
+Fragilities = Annotated[AbstractFragility | Sequence[AbstractFragility], _one_or_many]
+
+# Where `allowed_scale` looks for its factor: 20 steps a decade.
+_FACTORS = np.geomspace(1e-4, 1e4, 161)
+
+
+@arguments
+def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
+    """Annual rate of shakings that topple a rock: the fragility integrated over the rates of the hazard curve.
+
+    **Arguments:**
+
+    - `fragility`: of the rock, over the measure and in the unit of the curve.
+    - `curve`: a `HazardCurve`; under `jax.vmap` for many.
+
+    **Returns:** the rate [1/year]. A lognormal fragility is integrated in closed form over each power law, any other
+    by Gauss-Legendre quadrature between levels and knots.
+
+    **Raises:** ValueError for several curves or fragilities in one.
+
+    **Source:** Cornell, Jalayer, Hamburger & Foutch (2002), the integral, and its closed form over one power law.
+    """
+    check_one(curve)
+    _rocks(fragility, 0.0)
+    return _toppling_rate(fragility, curve)
+
+
+@arguments
+def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCurve) -> Number:
+    """Probability that all rocks of a site have stood since they became fragile, under the shakings they share.
+
+    At each time before present only the rocks that were fragile already count: the rate of shakings that topple at
+    least one of them is the integral of 1 - (1 - F1)(1 - F2)... over the curve.
+
+    **Arguments:**
+
+    - `fragilities`: of a rock, or of each.
+    - `ages`: for how long each rock has been fragile [years], (rocks,), or one number for all; 0 or more. Where ages
+      are uncertain: the mean over samples, by `jax.vmap`.
+    - `curve`: a `HazardCurve`; under `jax.vmap` for many.
+
+    **Returns:** the probability.
+
+    **Raises:** ValueError for ages outside their range, or not as many as rocks.
+    """
+    check_one(curve)
+    return jnp.exp(-_topplings(*_rocks(fragilities, ages), curve))
+
+
+@arguments
+def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches"]:
+    """Weights of the branches of a logic tree after rocks were found standing (Bayes).
+
+    **Arguments:**
+
+    - `prior`: (branches,) weights, 0 or more; they need not add to 1.
+    - `survival`: (branches,) probability under each branch that the rocks have stood, in [0, 1].
+
+    **Returns:** (branches,) weights that add to 1.
+
+    **Raises:** ValueError for values outside their ranges or of different shapes, and if under every branch that has
+    weight the rocks must have toppled: then none of the branches explains them.
+    """
+    prior = not_negative("prior", prior)
+    survival = share("survival", survival)
+    if prior.ndim != 1 or prior.shape != survival.shape:
+        both = f"{prior.shape} and {survival.shape}"
+        raise ValueError(f"Arguments `prior` and `survival` must be lists of one length, but have shapes {both}.")
+    weights = prior * survival
+    total = jnp.sum(weights)
+    return weights / checked("survival", total, "be above 0 for a branch that has weight", lambda x: x > 0)
+
+
+@arguments
+def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, probability: ArrayLike = 0.05) -> Number:
+    """The factor on the intensity of every shaking at which the survival of all rocks falls to a given probability.
+
+    Larger factors are rejected with the confidence 1 - `probability`. The levels of the curve are scaled; its rates
+    stay.
+
+    **Arguments:**
+
+    - `fragilities`, `ages`, `curve`: as in `survival_probability`.
+    - `probability`: of survival, in (0, 1).
+
+    **Returns:** the smallest such factor between 1e-4 and 1e4, with derivatives of every order; 0 if
+    survival is less probable under the smallest one already, infinite if more probable under all. Survival is looked
+    up at 20 factors a decade: where a fragility that rises and falls makes it dip for less than that, the dip may be
+    missed. A large factor brings the weakest shakings into play: compare with that of `curve.extended`.
+
+    **Raises:** ValueError for arguments outside their ranges.
+
+    **Source:** Anderson & Brune (1999), the rule of rejection.
+    """
+    check_one(curve)
+    probability = scalar("probability", inner_share("probability", probability))
+    return _allowed_scale(*_rocks(fragilities, ages), curve, -jnp.log(probability))
+
+
+def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragility, ...], Inexact[Array, " rocks"]]:
+    """The rocks, all with fragilities of one kind stacked into one, and an age for each in the order of the stacks."""
+    rocks = _one_or_many("fragilities", fragilities)
+    ages = not_negative("ages", ages)
+    if ages.shape not in ((), (len(rocks),)) or not rocks:
+        raise ValueError(f"Argument `ages` must be one for each of {len(rocks)} rocks, but has shape {ages.shape}.")
+    ages = jnp.broadcast_to(ages, len(rocks))
+    kinds = {}
+    for index, rock in enumerate(rocks):
+        numbers, rest = eqx.partition(rock, eqx.is_array_like)
+        kind = jax.tree.structure(rock), *map(jnp.shape, jax.tree.leaves(numbers)), *jax.tree.leaves(rest)
+        kinds.setdefault(kind, []).append(index)
+    for first, *_ in kinds.values():
+        shape = jax.eval_shape(rocks[first], jax.ShapeDtypeStruct((), ages.dtype)).shape
+        if shape:
+            raise ValueError(f"Argument `fragilities` must each be of one rock, but one has shape {shape}.")
+    # A hundred rocks of one kind are compiled as one.
+    stacks = []
+    for members in kinds.values():
+        numbers, rest = eqx.partition([rocks[index] for index in members], eqx.is_array_like)
+        stacks.append(eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *numbers), rest[0]))
+    return tuple(stacks), ages[np.concatenate(list(kinds.values()))]
+
+
+@eqx.filter_jit
+def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
+    if isinstance(fragility, LogNormalFragility):
+        return _lognormal_rate(fragility, curve)
+    levels, rates = shakings(curve, fragility.knots)
+    return rates @ fragility(levels)
+
+
+def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number:
+    """The rate by parts: that at the first known level, and the integral of the rate over the fragility.
+
+    Over a power law with exponent k, and with z = ln(level/median)/dispersion, that is
+    rate(start) exp(a^2/2 - z(start)^2/2) [Phi(b) - Phi(a)], where a and b are z + k dispersion at start and end.
+    """
+    known, exponents = power_laws(curve)
+    z = jnp.log(curve.levels / fragility.median) / fragility.dispersion
+    start, end = z[:-1] + exponents * fragility.dispersion, z[1:] + exponents * fragility.dispersion
+    # Both in the lower tail, where their difference keeps its digits.
+    upper = start + end > 0
+    low, high = jnp.where(upper, -end, start), jnp.where(upper, -start, end)
+    logarithm = log_ndtr(high) + jnp.log(-jnp.expm1(log_ndtr(low) - log_ndtr(high)))
+    rates = jnp.where(known, curve.rates[:-1], 0.0)
+    within = rates @ jnp.exp((start - z[:-1]) * (start + z[:-1]) / 2 + logarithm)
+    first = jnp.isfinite(curve.rates) & ~jnp.append(False, jnp.isfinite(curve.rates[:-1]))
+    return within + jnp.where(first, curve.rates, 0.0) @ fragility(curve.levels)
+
+
+@eqx.filter_jit
+def _topplings(rocks: tuple[AbstractFragility, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
+    """Expected number of shakings that topple at least one of the rocks that are fragile by then."""
+    knots = [eqx.filter_vmap(lambda rock: rock.knots)(rock).ravel() for rock in rocks]
+    levels, rates = shakings(curve, jnp.concatenate(knots))
+    # With the oldest rock first, the first k rocks count from the age of rock k to that of the next.
+    order = jnp.argsort(-ages)
+    ages = ages[order]
+    single = jnp.concatenate([eqx.filter_vmap(lambda rock: rock(levels))(rock) for rock in rocks])[order]
+    # 1 - (1 - F)(1 - G), in which small probabilities do not cancel.
+    joint = jax.lax.associative_scan(lambda f, g: f + g * (1 - f), single)
+    return (ages - jnp.append(ages[1:], 0.0)) @ (joint @ rates)
+
+
+@eqx.filter_jit
+def _allowed_scale(rocks, ages, curve, most: Number) -> Number:
+    """As `allowed_scale`, at which `most` topplings are expected."""
+    numbers, rest = eqx.partition((rocks, ages, curve, most), eqx.is_array)
+
+    def excess(logarithm, numbers):
+        rocks, ages, curve, most = eqx.combine(numbers, rest)
+        return _topplings(rocks, ages, scaled(curve, jnp.exp(logarithm))) - most
+
+    return _first_factor(excess, numbers)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _first_factor(excess: Callable, numbers: PyTree) -> Number:
+    """The first factor at which `excess(ln factor, numbers)` is not negative."""
+    grid = jnp.log(jnp.asarray(_FACTORS, jnp.result_type(float)))
+    reached = jax.lax.map(lambda logarithm: excess(logarithm, numbers), grid) >= 0
+    at = jnp.argmax(reached)
+    logarithm = search_root(lambda x: excess(x, numbers), grid[jnp.maximum(at - 1, 0)], grid[at])
+    factor = jnp.where(jnp.any(reached), jnp.exp(logarithm), jnp.inf)
+    return jnp.where(reached[0], 0.0, factor)
+
+
+@_first_factor.defjvp
+def _first_factor_jvp(excess, primals, tangents):
+    (numbers,), (changes,) = primals, tangents
+    factor = _first_factor(excess, numbers)
+    exists = (factor > 0) & (factor < jnp.inf)
+    logarithm = jnp.log(jnp.where(exists, factor, 1.0))
+    _, slope = jax.jvp(lambda x: excess(x, numbers), (logarithm,), (jnp.ones_like(logarithm),))
+    _, change = jax.jvp(lambda n: excess(logarithm, n), (numbers,), (changes,))
+    return factor, change * jnp.where(exists, -jnp.exp(logarithm) / jnp.where(exists, slope, 1.0), 0.0)
