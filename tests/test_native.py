@@ -22,6 +22,7 @@ import jaxrock as rk  # noqa: E402
 from jaxrock import _foreign  # noqa: E402
 from jaxrock.native import plain as plain_programs  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
+from jaxrock.numerics.apart import apart  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of  # noqa: E402
 
@@ -210,6 +211,46 @@ def test_lanes_are_filled_again(count):
     expected = jax.vmap(function, in_axes=(0, 0, 0, 0, None))(*values)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-14)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("count", [1, 16, 40, 3001])
+def test_lanes_part_where_they_need_other_steps(count, threads):
+    """Three kinds of steps, the first of them frequent, with a list of all lanes and one of their own: whole numbers,
+    so that every lane has taken its own steps in their order."""
+
+    def function(leaves):
+        number, turns, own, table = leaves
+
+        def step(s):
+            i, number, few, fewer = s
+
+            def frequent():
+                return i + 1, (number * 77 + table[number % 9]) % 1009, few, fewer
+
+            def rare():
+                return i + 1, (number * 5 + own[number % 11]) % 1009, few + 1, fewer
+
+            def rarer():
+                return i + 1, (number + 1) % 1009, few, fewer + number
+
+            def other():
+                return jax.lax.cond(apart(number % 2 == 0), rare, rarer)
+
+            return jax.lax.cond(apart(number % 7 > 0), frequent, other)
+
+        return jax.lax.while_loop(lambda s: s[0] < turns, step, (jnp.int32(0), number, jnp.int32(0), jnp.int32(0)))
+
+    random = np.random.default_rng(count)
+    shapes = (count,), (count,), (count, 11), (9,)
+    leaves = [jnp.asarray(random.integers(0, 1009, shape), jnp.int32) for shape in shapes]
+    leaves[1] = leaves[1] // 10 * (leaves[1] % 3 > 0)  # some take no step at all
+    flags = [False, False, False, True]
+    found = run(lambda leaves: list(function(leaves)), leaves, flags, refilled=True, threads=threads)
+    expected = jax.vmap(lambda *x: function(x), in_axes=(0, 0, 0, None))(*leaves)
+    for one, same in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, same)
+    assert np.min(np.sum(np.asarray(expected[2:]), axis=-1)) > 0 or count == 1
 
 
 @pytest.mark.parametrize("refilled", [False, True], ids=["in step", "refilled"])

@@ -83,6 +83,51 @@ def test_many_blocks_in_an_earthquake_are_as_each_alone():
     compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), alpha)
 
 
+def noise(count, dt, seed=0):
+    """A record of smoothed noise."""
+    samples = np.convolve(np.random.default_rng(seed).normal(size=count), np.ones(5) / 5, "same")
+    return rk.Record(0.6 * samples / np.abs(samples).max(), dt)
+
+
+GLIDES = {
+    "asymmetric, with a vertical record": (noise(500, 0.01).with_vertical(0.5 * noise(300, 0.02, 1)), rk.Housner()),
+    "linear, samples far apart": (noise(80, 0.15), rk.Linear()),
+    "a record and a pulse": (noise(300, 0.01) + rk.SinePulse(0.3, 1.0), rk.Housner()),
+    "a spring": (noise(500, 0.01), rk.Spring("SM1")),
+}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(name, marks=() if "linear" in name else pytest.mark.slow) for name in GLIDES],
+)
+def test_gliding_blocks_are_as_each_alone(case):
+    """Tilted, moving or at rest at first, gentle to violent, under long pieces and short ones: to the errors told."""
+    motion, model = GLIDES[case]
+    alpha, p, restitution, *_ = scenes(200, seed=3)
+    random = np.random.default_rng(5)
+    tilt = np.where(random.random(200) < 0.4, random.uniform(-0.9, 0.9, 200) * alpha, 0.0)
+
+    def one(alpha, p, restitution, scale, tilt, speed):
+        block = rk.Block(alpha, p, restitution)
+        if "asymmetric" in case:
+            block = rk.AsymmetricBlock(alpha, 1.2 * alpha, p, restitution=(restitution, 0.9 * restitution))
+        return rk.outcome(block, scale * motion, model, initial=(tilt, speed))
+
+    points = alpha, p, np.minimum(restitution, 0.95), random.uniform(0.1, 1.5, 200), tilt, 0.3 * tilt * p
+    quick = jax.jit(jax.vmap(one))(*points)
+    careful = jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points)
+    np.testing.assert_array_equal(quick.status._value, careful.status._value)
+    for name in ("overturned", "impact_count"):
+        np.testing.assert_array_equal(getattr(quick, name), getattr(careful, name), name)
+    safe = ~np.asarray(quick.overturned) & np.asarray(quick.status == rk.Status.successful)
+    assert 30 < safe.sum() < 200
+    apart = np.abs(quick.max_rotation - careful.max_rotation)[safe]
+    assert np.all(apart <= (quick.error + careful.error)[safe] + 1e-14 * alpha[safe])
+    # What the one and the other tell of errors is alike.
+    assert np.median((quick.error / np.maximum(careful.error, 1e-15 * alpha))[safe]) < 30
+
+
 @pytest.mark.parametrize("model", ["nonlinear", pytest.param("linear", marks=pytest.mark.slow)])
 def test_few_scenes_are_postponed(model):
     """Otherwise the quick pass would be right, and slow."""
