@@ -141,9 +141,9 @@ def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
         fit = rk.inverse.calibrate_block(make, motions()[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
         assert set(fit.values) == {"alpha", "p"}
         assert np.isfinite(fit.probability).all()
-    first = motions()[:12]
-    turned = rk.inverse.calibrate_block(make, [-m for m in first], fell, unknowns, {"alpha": 0.3}, facing=-ways, **given)
-    known = rk.inverse.calibrate_block(make, first, fell, unknowns, {"alpha": 0.3}, facing=ways, **given)
+    first, scatter = motions()[:12], {"alpha": 0.3}
+    turned = rk.inverse.calibrate_block(make, [-m for m in first], fell, unknowns, scatter, facing=-ways, **given)
+    known = rk.inverse.calibrate_block(make, first, fell, unknowns, scatter, facing=ways, **given)
     np.testing.assert_allclose(turned.probability, known.probability, atol=1e-6)
     step = 1e-5
     point = {"alpha": 0.21, "p": 2.7}
