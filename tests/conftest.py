@@ -7,11 +7,14 @@ JAXROCK_CHECK_ALL=1 they are checked everywhere.
 XLA compiles as after `keep_compiled`, which takes a quarter less time; with `XLA_FLAGS=` as it does by itself.
 """
 
+import ctypes
 import gc
 import importlib
 import importlib.util
 import json
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -39,13 +42,23 @@ gc.set_threshold(200_000, 10, 10)
 if "XLA_FLAGS" not in os.environ:
     importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
 os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
+# But a worker does so once, also after it has forgotten programs. Others do not read there: JAX's files have their
+# names before they are whole.
+_COMPILED = tempfile.mkdtemp(prefix="jaxrock-tests-")
+jax.config.update("jax_compilation_cache_dir", _COMPILED)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
 
 
-_MOST_GROWTH = 2.5e9  # bytes of compiled programs
-_held = [0.0]  # by the process when they were last forgotten
+_MOST = 1.2e9  # bytes that a worker holds before it forgets compiled programs,
+_LEAST_GROWTH = 3e8  # if it has grown by so many since it last did
+_MOST_MAPS = 30_000
+_TESTS = 10  # after so many it is looked how many maps there are, for to read them takes as long as a small test
+_held, _left = [0.0], [_TESTS]  # bytes after they were last forgotten; tests until maps are looked at
+_OF_C = ctypes.CDLL(None) if os.name == "posix" else None
 
 
 def _memory() -> float:
@@ -54,17 +67,36 @@ def _memory() -> float:
     return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0.0
 
 
+def _has_many_maps() -> bool:
+    _left[0] -= 1
+    maps = Path("/proc/self/maps")
+    if _left[0] or not maps.exists():
+        return False
+    _left[0] = _TESTS
+    return maps.read_bytes().count(b"\n") > _MOST_MAPS
+
+
 @pytest.fixture(autouse=True)
 def few_compiled_programs():
     """Forget compiled programs before they are too many: each takes memory, and maps pages, and past 65,530 maps XLA
     crashes on Linux."""
     yield
-    maps = Path("/proc/self/maps")
-    many = maps.exists() and maps.read_bytes().count(b"\n") > 30_000
-    if many or _memory() > _held[0] + _MOST_GROWTH:
+    if _has_many_maps() or _memory() > max(_MOST, _held[0] + _LEAST_GROWTH):
         jax.clear_caches()
         gc.collect()
+        if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
+            _OF_C.malloc_trim(0)
         _held[0] = _memory()
+
+
+def pytest_unconfigure():
+    shutil.rmtree(_COMPILED, ignore_errors=True)
+
+
+def pytest_collection_finish():
+    """What all modules have made by now stays: the collector need not look at it again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

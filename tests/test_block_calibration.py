@@ -1,5 +1,7 @@
 """A block from verdicts under known motions: the truth is found again, and the likelihood is smooth."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -10,33 +12,40 @@ import jaxrock as rk
 
 RANDOM = np.random.default_rng(1)
 COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
-MOTIONS = [rk.SinePulse(a, t) for a, t in zip(RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT))]
-SUITE = rk.motions.Suite(MOTIONS)
+PULSES = np.stack([RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT)], axis=1)  # amplitude and period
 TRUE = ALPHA * np.exp(SCATTER * RANDOM.normal(size=COUNT))
 UNKNOWN, SPREAD = rk.inverse.Unknown(0.05, 0.5), rk.inverse.Unknown(0.05, 0.8)
 POINT = {"alpha": 0.18, "alpha_sd": 0.2}
 
 
-def verdicts(seed):
+@functools.cache
+def motions():
+    return [rk.SinePulse(*each) for each in PULSES]
+
+
+@functools.cache
+def suite():
+    return rk.motions.Suite(motions())
+
+
+@functools.cache
+def verdicts():
     """What blocks do, each drawn for its test: peak rotation over its slenderness too."""
-    true = ALPHA * np.exp(SCATTER * np.random.default_rng(seed).normal(size=COUNT))
+    true = ALPHA * np.exp(SCATTER * np.random.default_rng(5).normal(size=COUNT))
 
     def one(alpha, amplitude, period):
         result = rk.outcome(rk.Block(alpha, P), rk.SinePulse(amplitude, period))
         return result.overturned, result.max_rotation / alpha
 
-    amplitudes, periods = np.array([[m.amplitude, m.period] for m in MOTIONS]).T
-    fell, rotation = jax.jit(jax.vmap(one))(true, amplitudes, periods)
+    fell, rotation = jax.jit(jax.vmap(one))(true, *PULSES.T)
     return np.asarray(fell), np.asarray(rotation)
-
-
-FELL, ROTATION = verdicts(5)
 
 
 @pytest.fixture(scope="module")
 def found():
     make = lambda alpha: rk.Block(alpha, P)
-    return rk.inverse.calibrate_block(make, SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=512, folds=10,
+    fell, _ = verdicts()
+    return rk.inverse.calibrate_block(make, suite(), fell, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=512, folds=10,
                               progress=False)  # fmt: skip
 
 
@@ -61,8 +70,8 @@ def test_a_probability_is_the_share_of_the_distribution_that_topples(found, abou
     """By intervals whose ends are found by halving: the grid knows them to half a cell."""
     test = int(np.abs(np.asarray(found.probability) - about).argmin())
     alphas = np.linspace(0.03, 0.8, 400)
-    fell = lambda alpha: bool(rk.outcome(rk.Block(alpha, P), MOTIONS[test]).overturned)
-    lost = np.asarray(jax.jit(jax.vmap(lambda a: rk.outcome(rk.Block(a, P), MOTIONS[test]).overturned))(alphas))
+    fell = lambda alpha: bool(rk.outcome(rk.Block(alpha, P), motions()[test]).overturned)
+    lost = np.asarray(jax.jit(jax.vmap(lambda a: rk.outcome(rk.Block(a, P), motions()[test]).overturned))(alphas))
     law, share = scipy.stats.lognorm(float(found.values["alpha_sd"]), scale=float(found.values["alpha"])), 0.0
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     share = law.cdf(alphas[0]) if lost[0] else 0.0
@@ -90,10 +99,11 @@ def test_diagnostics(found):
 
 
 def test_rotations_say_more_than_verdicts(found):
-    noisy = ROTATION * np.exp(0.2 * RANDOM.normal(size=COUNT))
-    seen = np.where(FELL, np.nan, np.where(noisy < 0.01, 0.0, noisy))
+    fell, rotation = verdicts()
+    noisy = rotation * np.exp(0.2 * RANDOM.normal(size=COUNT))
+    seen = np.where(fell, np.nan, np.where(noisy < 0.01, 0.0, noisy))
     more = rk.inverse.calibrate_block(
-        lambda alpha: rk.Block(alpha, P), SUITE, FELL, {"alpha": UNKNOWN}, {"alpha": SPREAD},
+        lambda alpha: rk.Block(alpha, P), suite(), fell, {"alpha": UNKNOWN}, {"alpha": SPREAD},
         cells=128, rotation=seen, rotation_sd=0.2, progress=False,
     )  # fmt: skip
     assert more.status == rk.inverse.CalibrationStatus.successful
@@ -106,9 +116,10 @@ def test_names_in_any_order():
     """Two parameters and a scatter: where the likelihood is largest does not hang on the order of their names."""
     unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}
     given = {"cells": {"alpha": 32, "p": 8}, "progress": False}
+    fell, _ = verdicts()
     found = [
         rk.inverse.calibrate_block(
-            rk.Block, SUITE, FELL, {name: unknowns[name] for name in order}, {"alpha": SPREAD}, **given
+            rk.Block, suite(), fell, {name: unknowns[name] for name in order}, {"alpha": SPREAD}, **given
         )
         for order in (("alpha", "p"), ("p", "alpha"))
     ]
@@ -123,16 +134,16 @@ def test_names_in_any_order():
 def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
     make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)
     ways = np.where(np.random.default_rng(2).random(12) < 0.5, 1, -1)
-    fell = [bool(rk.outcome(make(TRUE[k], P), int(way) * MOTIONS[k]).overturned) for k, way in enumerate(ways)]
+    fell = [bool(rk.outcome(make(TRUE[k], P), int(way) * motions()[k]).overturned) for k, way in enumerate(ways)]
     unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}
     given = {"cells": {"alpha": 24, "p": 8}, "progress": False}
     for facing in (ways, 0):
-        fit = rk.inverse.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
+        fit = rk.inverse.calibrate_block(make, motions()[:12], fell, unknowns, {"alpha": 0.3}, facing=facing, **given)
         assert set(fit.values) == {"alpha", "p"}
         assert np.isfinite(fit.probability).all()
-    turned = rk.inverse.calibrate_block(make, [-m for m in MOTIONS[:12]], fell, unknowns, {"alpha": 0.3}, facing=-ways,
-                                **given)  # fmt: skip
-    known = rk.inverse.calibrate_block(make, MOTIONS[:12], fell, unknowns, {"alpha": 0.3}, facing=ways, **given)
+    first, scatter = motions()[:12], {"alpha": 0.3}
+    turned = rk.inverse.calibrate_block(make, [-m for m in first], fell, unknowns, scatter, facing=-ways, **given)
+    known = rk.inverse.calibrate_block(make, first, fell, unknowns, scatter, facing=ways, **given)
     np.testing.assert_allclose(turned.probability, known.probability, atol=1e-6)
     step = 1e-5
     point = {"alpha": 0.21, "p": 2.7}
@@ -160,7 +171,7 @@ def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
     ],
 )
 def test_what_is_refused(given, message):
-    good = {"block": lambda alpha: rk.Block(alpha, P), "motions": MOTIONS[:1], "toppled": [1],
+    good = {"block": lambda alpha: rk.Block(alpha, P), "motions": motions()[:1], "toppled": [1],
             "unknowns": {"alpha": UNKNOWN}, "scatter": {"alpha": SPREAD}, "progress": False}  # fmt: skip
     with pytest.raises(ValueError, match=message):
         rk.inverse.calibrate_block(**good | given)

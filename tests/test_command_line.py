@@ -120,7 +120,8 @@ def test_run_on_files(command, at2, column, tmp_path):
 
 
 def test_run_of_a_block_that_overturns(command, at2, tmp_path):
-    status, table, _ = command("run", at2, *GIVEN, "--scale", "8", "--animate")
+    # It has overturned after a second: a short film.
+    status, table, _ = command("run", at2, *GIVEN, "--duration", "1.5", "--scale", "8", "--animate")
     assert status == 0
     assert (tmp_path / "out" / "animation.gif").read_bytes().startswith(b"GIF89a")
     assert table["verdict"] == "OVERTURNS"

@@ -43,12 +43,18 @@ def right():
     return damage.bits(run())
 
 
-@pytest.fixture
-def store(tmp_path):
-    """One that is finished: five blocks, the last of them smaller."""
-    path = tmp_path / "a.zarr"
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A store of five blocks, the last of them smaller."""
+    path = tmp_path_factory.mktemp("finished") / "a.zarr"
     run(path, load=False)
     return path
+
+
+@pytest.fixture
+def store(finished, tmp_path):
+    """A copy, which may be damaged."""
+    return shutil.copytree(finished, tmp_path / "a.zarr")
 
 
 @pytest.fixture(scope="module")

