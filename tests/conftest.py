@@ -13,8 +13,6 @@ import importlib
 import importlib.util
 import json
 import os
-import shutil
-import tempfile
 from pathlib import Path
 
 import jax
@@ -42,12 +40,6 @@ gc.set_threshold(200_000, 10, 10)
 if "XLA_FLAGS" not in os.environ:
     importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
 os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
-# But a worker does so once, also after it has forgotten programs. Others do not read there: JAX's files have their
-# names before they are whole.
-_COMPILED = tempfile.mkdtemp(prefix="jaxrock-tests-")
-jax.config.update("jax_compilation_cache_dir", _COMPILED)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
@@ -87,10 +79,6 @@ def few_compiled_programs():
         if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
             _OF_C.malloc_trim(0)
         _held[0] = _memory()
-
-
-def pytest_unconfigure():
-    shutil.rmtree(_COMPILED, ignore_errors=True)
 
 
 def pytest_collection_finish():
