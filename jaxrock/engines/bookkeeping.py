@@ -22,7 +22,11 @@ _LOST = 1e-2  # standard error over the saddle's angle beyond which a state mean
 def checked(stepper: AbstractStepper, before: State, after: State) -> State:
     """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-    undecided = (after.side != 0) & is_lost(stepper, before, after) & (after.status == Status.successful)
+    lost = (after.side != 0) & ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
+    if not stepper.history:
+        # In the free stage only the next peak or passage counts, which `note` judges.
+        lost = lost & (before.piece < stepper.scene.pieces)
+    undecided = lost & (after.status == Status.successful)
     status = Status.where(undecided, Status.undecided, after.status)
     return replace(
         after,
@@ -30,13 +34,6 @@ def checked(stepper: AbstractStepper, before: State, after: State) -> State:
         status=Status.where(good, status, Status.not_finite),
         done=after.done | ~good,
     )
-
-
-def is_lost(stepper: AbstractStepper, before: State, after: State) -> Flag:
-    """Whether the error of a block off the ground has outgrown its state."""
-    lost = ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
-    # In the free stage only the next peak or passage counts, which `note` judges.
-    return lost if stepper.history else lost & (before.piece < stepper.scene.pieces)
 
 
 def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
