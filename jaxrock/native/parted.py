@@ -186,12 +186,13 @@ class _Parted(Refilled):
         b, e, f = self.b, self.e, self.f
         group = b.load(self.group)
         first = b.mul(group, _I64(e.lanes))
-        following = b.add(group, _I64(1))
-        b.store(b.select(b.icmp_signed("<", following, b.load(self.groups)), following, _I64(0)), self.group)
         self._each_lane(self._exchange, first)
         with b.if_then(b.icmp_signed(">=", b.load_atomic(f.next, "monotonic", 8), f.count)):
             self._each_lane(self._closed_up, first)
             b.store(b.add(b.sdiv(b.load(self.top), _I64(e.lanes)), _I64(1)), self.groups)
+        # Only now it is known how many groups there are: a turn of one that is gone would count as idle.
+        following = b.add(group, _I64(1))
+        b.store(b.select(b.icmp_signed("<", following, b.load(self.groups)), following, _I64(0)), self.group)
 
         def take(room):
             value = f.load(room, first)
