@@ -16,13 +16,13 @@ from jaxrock.status import Status
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
-_LOST = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
+MOST_OFF = 1e-2  # standard error over the saddle's angle beyond which a state means nothing
 
 
 def checked(stepper: AbstractStepper, before: State, after: State) -> State:
     """Count the step; stop where the state is not finite, and tell where its error has outgrown it."""
     good = jnp.isfinite(after.opening) & jnp.isfinite(after.velocity) & jnp.isfinite(after.local)
-    lost = (after.side != 0) & ~(after.spread.square <= (_LOST * stepper.scene.moments.saddle) ** 2)
+    lost = (after.side != 0) & ~(after.spread.square <= (MOST_OFF * stepper.scene.moments.saddle) ** 2)
     if not stepper.history:
         # In the free stage only the next peak or passage counts, which `note` judges.
         lost = lost & (before.piece < stepper.scene.pieces)

@@ -186,8 +186,14 @@ class Coefficients(AbstractMoments):
         moment = self.restoring_terms
         if not self.sinusoidal:
             return jnp.asarray(-_or_zero(moment.line))
-        height = jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine))
+        height = self.steepest
         return height if moment.constant is None else jnp.sqrt((height - moment.constant) * (height + moment.constant))
+
+    @property
+    def steepest(self) -> Scalar:
+        """Bound of how fast the restoring moment changes with the angle."""
+        moment = self.restoring_terms
+        return jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine)) if self.sinusoidal else jnp.abs(moment.line)
 
     @property
     def skew(self) -> Scalar | None:

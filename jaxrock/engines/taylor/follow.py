@@ -49,7 +49,7 @@ def _under_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -
         def of(step):
             def stepped():
                 after = step(stepper, settled(stepper, state, glide, strongest))
-                return after, Glide.of(after)
+                return after, Glide.of(stepper, after)
 
             return stepped
 
@@ -62,5 +62,5 @@ def _under_record(stepper: TaylorStepper, state: State, limit: Int[Array, ""]) -
         state, _ = carry
         return ~state.done & (state.steps < limit)
 
-    last = jax.lax.while_loop(going, turn, (state, Glide.of(state)))
+    last = jax.lax.while_loop(going, turn, (state, Glide.of(stepper, state)))
     return settled(stepper, *last, strongest)
