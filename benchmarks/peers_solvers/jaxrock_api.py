@@ -15,11 +15,11 @@ def exponential(amplitude, duration):
 
 def surface(problem, engine):
     """A map, one restitution after the other, as a flat array of peaks over alpha."""
-    pulse = rk.SinePulse if problem.motion == "sine" else exponential
+    pulse = {"pulse": rk.SinePulse} if problem.motion == "sine" else {"pulse": rk.ExponentialPulse, "shape": problems.SHAPE}
     maps = [
         rk.overturning_map(
-            problem.rates, problem.intensities, alpha=problems.ALPHA, restitution=restitution, pulse=pulse,
-            model=MODELS[problem.model], engine=engine, progress=False,
+            problem.rates, problem.intensities, alpha=problems.ALPHA, restitution=restitution,
+            model=MODELS[problem.model], engine=engine, progress=False, **pulse,
         )
         for restitution in problem.restitutions
     ]  # fmt: skip

@@ -24,7 +24,7 @@ from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
 from jaxrock.sweeps.sweep import surface
-from jaxrock.transforms.user_function import current_function
+from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
 
 class Spectrum(AbstractTable):
@@ -266,12 +266,19 @@ def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
     block, lists = Block(alpha, 1.0, restitution), tuple(axes.lists)
     numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
-
-    def given(size, extent, *listed):
-        return pulse(size, extent, **numbers, **dict(zip(lists, listed)))
-
-    made = current_function(given if axes.parameters else pulse, number, number, *(number for _ in lists))
+    made = _Family(current_function(pulse, number, number, **dict.fromkeys(axes.parameters, number)), numbers, lists)
     return block.alpha, scaled_law(block), made, current_model(model, block, axes.ratio, axes.intensity), engine
+
+
+class _Family(eqx.Module):
+    """Pulses of some size and extent, with parameters that are numbers, and others that are listed at each point."""
+
+    pulse: UserFunction | ByIdentity
+    numbers: dict[str, Array]
+    lists: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, size, extent, *listed):
+        return self.pulse(size, extent, **self.numbers, **dict(zip(self.lists, listed)))
 
 
 def _over_pulses(function, axes: _PulseAxes, scene: tuple, label: str, progress: bool | None) -> dict:
