@@ -1,4 +1,4 @@
-"""jaxrock by its public functions: overturning maps, and a sweep of blocks under a record."""
+"""jaxrock by its public functions: overturning maps, and outcomes of many blocks under a record."""
 
 import jax
 import numpy as np
@@ -15,7 +15,8 @@ def exponential(amplitude, duration):
 
 def surface(problem, engine):
     """A map, one restitution after the other, as a flat array of peaks over alpha."""
-    pulse = {"pulse": rk.SinePulse} if problem.motion == "sine" else {"pulse": rk.ExponentialPulse, "shape": problems.SHAPE}
+    is_sine = problem.motion == "sine"
+    pulse = {"pulse": rk.SinePulse} if is_sine else {"pulse": rk.ExponentialPulse, "shape": problems.SHAPE}
     maps = [
         rk.overturning_map(
             problem.rates, problem.intensities, alpha=problems.ALPHA, restitution=restitution,
@@ -26,40 +27,45 @@ def surface(problem, engine):
     return np.concatenate([np.where(m.status == rk.Status.successful, m.max_rotation, np.nan).ravel() for m in maps])
 
 
-def blocks(problem, engine, chosen):
-    """The blocks under the record, or one block under it at many scales."""
+def under_record(problem, engine):
+    """The blocks under the record, or one block under it at many scales: a function of which scenes, compiled once."""
     record, model = rk.Record(problem.samples, problem.dt), MODELS[problem.model]
 
-    def one(alpha, p):
+    @jax.jit
+    @jax.vmap
+    def each(alpha, p):
         return rk.outcome(rk.Block(alpha, p, problems.RESTITUTION), record, model, engine=engine)
 
+    @jax.jit
+    @jax.vmap
     def of_scale(scale):
         block = rk.Block(problem.alpha[0], problem.p[0], problems.RESTITUTION)
         return rk.outcome(block, scale * record, model, engine=engine)
 
-    alpha, p, _, scale, _ = problem.columns(chosen)
-    if problem.name == "P7":
-        found = rk.sweep(of_scale, outer=False, progress=False, scale=scale).values
-        return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / problem.alpha[0]
-    if hasattr(rk, "sweep"):
-        found = rk.sweep(one, outer=False, progress=False, alpha=alpha, p=p).values
-    else:
-        found = jax.jit(jax.vmap(one))(alpha, p)
-    return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / alpha
+    def solve(chosen=slice(None)):
+        alpha, p, _, scale, _ = problem.columns(chosen)
+        found = of_scale(scale) if problem.name == "P7" else each(alpha, p)
+        return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / alpha
+
+    return solve
 
 
-def scenes(problem, engine, chosen):
-    """Single scenes of a map, side by side."""
+def under_pulses(problem, engine):
+    """Single scenes of a map, side by side: a function of which, compiled once."""
 
-    def one(restitution, amplitude, rate):
+    @jax.jit
+    @jax.vmap
+    def each(restitution, amplitude, rate):
         block = rk.Block(problems.ALPHA, 1.0, restitution)
         pulse = rk.SinePulse if problem.motion == "sine" else exponential
         return rk.outcome(block, pulse(amplitude, 2 * np.pi / rate), MODELS[problem.model], engine=engine)
 
-    alpha, _, *rest = problem.columns(chosen)
-    names = ("restitution", "amplitude", "rate")
-    found = rk.sweep(one, outer=False, progress=False, **dict(zip(names, rest))).values
-    return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / alpha
+    def solve(chosen=slice(None)):
+        alpha, _, *rest = problem.columns(chosen)
+        found = each(*rest)
+        return np.where(found.status == rk.Status.successful, found.max_rotation, np.nan) / alpha
+
+    return solve
 
 
 SETTINGS = {
@@ -69,8 +75,8 @@ SETTINGS = {
         (1e-12, "default", {}),
     ),
     "record": (
-        (1e-6, "tolerance 1e-6", {"tolerance": 1e-6}),
-        (1e-10, "tolerance 1e-8", {"tolerance": 1e-8}),
+        (1e-6, "tolerance 1e-8", {"tolerance": 1e-8}),
+        (1e-10, "tolerance 1e-10", {"tolerance": 1e-10}),
         (1e-12, "default", {}),
     ),
 }
@@ -81,7 +87,7 @@ def ways(problem):
 
     def made(engine):
         if problem.motion == "record":
-            return lambda chosen=slice(None): blocks(problem, engine, chosen)
+            return under_record(problem, engine)
         return lambda chosen=slice(None): surface(problem, engine)[chosen]
 
     settings = SETTINGS["record" if problem.motion == "record" else "pulse"]

@@ -10,9 +10,5 @@ SETTINGS = ((1e-6, 1e-7), (1e-12, 1e-12))
 
 def ways(problem):
     """The ways to solve a problem: (goal of the error, label, function of the chosen scenes)."""
-    solve = jaxrock_api.blocks if problem.motion == "record" else jaxrock_api.scenes
-
-    def made(rtol):
-        return lambda chosen: solve(problem, rk.Diffrax(rtol=rtol), chosen)
-
-    return [(goal, f"rtol {rtol:g}", made(rtol)) for goal, rtol in SETTINGS]
+    solver = jaxrock_api.under_record if problem.motion == "record" else jaxrock_api.under_pulses
+    return [(goal, f"rtol {rtol:g}", solver(problem, rk.Diffrax(rtol=rtol))) for goal, rtol in SETTINGS]
