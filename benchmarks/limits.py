@@ -19,6 +19,7 @@ from peers_solvers.report import surroundings
 import jaxrock as rk
 from jaxrock.engines.taylor import expansion, fast
 from jaxrock.engines.taylor.follow import most_steps
+from jaxrock.engines.taylor.glide import Glide, onward, settled
 from jaxrock.responses import outcome
 from references import peer_problems as problems
 from references.in_jaxrock import MODELS
@@ -65,22 +66,36 @@ def begun(problem, columns):
 
 
 def steps(problem):
-    """Mean numbers of steps of a scene: rocking, at rest, and of the first those that an event ends."""
+    """Mean numbers of steps of a scene: rocking, at rest, and of the first those that take care: under a record those
+    that do not glide, else those that an event ends."""
+    is_record = problem.motion == "record"
 
     def one(columns):
         stepper, state = begun(problem, columns)
+        strongest = stepper.scene.outlook.strongest_drive
 
-        def step(carry):
-            state, rocking, waiting, eventful = carry
+        def cared(state, glide):
+            state = settled(stepper, state, glide, strongest)
             rests = state.side == 0
             after = jax.lax.cond(rests, lambda: fast.wait(stepper, state), lambda: fast.advance(stepper, state))
-            ends = ~rests & ((after.impacts > state.impacts) | (after.piece == state.piece))
-            return after, rocking + ~rests, waiting + rests, eventful + ends
+            return after, Glide.of(stepper, after)
+
+        def step(carry):
+            (state, glide), rocking, waiting, careful = carry
+            if is_record:
+                after = jax.lax.cond(glide.goes, lambda: onward(stepper, state, glide), lambda: cared(state, glide))
+                moved, cares = after[0].steps > state.steps, ~glide.goes
+            else:
+                after = cared(state, glide)
+                moved, cares = True, (after[0].impacts > state.impacts) | (after[0].piece == state.piece)
+            rests = state.side == 0
+            return after, rocking + (moved & ~rests), waiting + rests, careful + (cares & ~rests)
 
         zero = jnp.int32(0)
         limit = most_steps(stepper.scene.most_pieces)
-        going = lambda carry: ~carry[0].done & (carry[0].steps < limit)  # noqa: E731
-        return jax.lax.while_loop(going, step, (state, zero, zero, zero))[1:]
+        going = lambda carry: ~carry[0][0].done & (carry[0][0].steps < limit)  # noqa: E731
+        first = (state, Glide.of(stepper, state))
+        return jax.lax.while_loop(going, step, (first, zero, zero, zero))[1:]
 
     drawn = np.random.default_rng(0).choice(problem.size, min(SAMPLE, problem.size), replace=False)
     columns = tuple(jnp.asarray(values) for values in problem.columns(np.sort(drawn)))
@@ -88,7 +103,8 @@ def steps(problem):
 
 
 def counts(problem):
-    """Operations of a rocking step: of its series, of what it always does, and with all that it may do."""
+    """Operations of a rocking step: of its series, of what it always does (under a record: of a glide over a piece),
+    and with all that it may do."""
     columns = tuple(jnp.asarray(values[0]) for values in problem.columns(slice(1)))
     stepper, state = begun(problem, columns)
     state = jax.tree.map(jnp.asarray, state)
@@ -97,9 +113,13 @@ def counts(problem):
         shaking, unit = stepper.shaking(state.piece, state.local)
         return expansion.expand(stepper.start(state, shaking, unit), stepper.order).opening
 
+    def glided(state):
+        return onward(stepper, state, Glide.of(stepper, state))
+
     whole = functools.partial(fast.advance, stepper)
     of_series, of_step = (jax.make_jaxpr(f)(state).jaxpr for f in (series, whole))
-    return [operations(of_series), operations(of_step), operations(of_step, branches=True)]
+    always = jax.make_jaxpr(glided)(state).jaxpr if problem.motion == "record" else of_step
+    return [operations(of_series), operations(always), operations(of_step, branches=True)]
 
 
 def peak():
@@ -117,7 +137,7 @@ def number(count):
 
 def row(problem, most):
     """One line of the table."""
-    rocking, waiting, eventful = steps(problem)
+    rocking, waiting, careful = steps(problem)
     (series, _), (always, slow), (possible, _) = map(number, counts(problem))
     (_, _, solve), *_ = [way for way in jaxrock_api.ways(problem) if way[1] == "default"]
     solve()
@@ -125,13 +145,13 @@ def row(problem, most):
     rate = problem.size / least_time(solve, 30, 3.0)
     done, bound = rate * rocking * always, most / (rocking * series)
     return [
-        problem.name, f"{rocking:.3g}", f"{eventful:.3g}", f"{waiting:.3g}", f"{series}", f"{always}", f"{slow}",
+        problem.name, f"{rocking:.3g}", f"{careful:.3g}", f"{waiting:.3g}", f"{series}", f"{always}", f"{slow}",
         f"{possible}", f"{rate:.3g}", f"{done / most:.0%}", f"{bound:.3g}", f"{bound / rate:.2g}",
     ]  # fmt: skip
 
 
 HEADER = (
-    "problem", "steps, rocking", "of them shorter than the piece", "at rest", "+ and x of the series",
+    "problem", "steps, rocking", "of them with care", "at rest", "+ and x of the series",
     "+ and x always done", "divisions and roots always done", "+ and x with all that a step may do", "scenes/s",
     "of the peak", "limit [scenes/s]", "limit over speed",
 )  # fmt: skip
@@ -142,14 +162,17 @@ Written by `python benchmarks/limits.py`, {machine}.
 
 The problems of [peers](peers.md), by default settings (errors below 1e-11). Steps are means of {sample} scenes,
 operations are counted in the program of one step (multiplications and additions; a product that is added at once counts
-as two, as it does in the peak). Peak: {peak:.3g} multiplications and additions a second, of all cores in a product of
-matrices. "Of the peak": what all steps always do. The limit: nothing but the series of these steps, at the peak.
+as two, as it does in the peak). With care: under a record those that do not glide, else those that an event ends. What
+a step always does: under a record what a glide does. Peak: {peak:.3g} multiplications and additions a second, of all
+cores in a product of matrices. "Of the peak": what all steps always do. The limit: nothing but the series of these
+steps, at the peak.
 
 {table}
 
-What is between the limit and the speed: an event in some lane of a vector makes all of its 16 wait for its root; a
-series is a chain in which every coefficient waits for the one before; signs are certified, errors are carried along,
-and divisions and roots take as long as ten products.
+What is between the limit and the speed: under pulses an event in some lane of a vector makes all of its 16 wait for
+its root; under records lanes part for that, and are collected and put back, by code that does not fit the first cache
+of instructions; a series is a chain in which every coefficient waits for the one before; signs are certified, errors
+are carried along, and divisions and roots take as long as ten products.
 """
 
 

@@ -56,7 +56,7 @@ class Done(ctypes.Structure):
 
 class Interface(ctypes.Structure):
     _fields_ = [("struct_size", ctypes.c_size_t), ("extension_start", ctypes.c_void_p), ("api_version", Version),
-                ("internal", ctypes.c_void_p), ("create_error", _Complain), ("get_message", ctypes.c_void_p),
+                ("internal", ctypes.c_void_p), ("create_error", _Complain), ("tell_error", ctypes.c_void_p),
                 ("destroy_error", ctypes.c_void_p), ("others", ctypes.c_void_p * 8),
                 ("schedule", ctypes.c_void_p)]  # fmt: skip
 

@@ -289,8 +289,7 @@ def test_functions_of_xla_are_where_its_header_has_them():
         pytest.skip("a jaxlib without headers")
     order = re.findall(r"^ *_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_(\w+)\);", header.read_text(), re.MULTILINE)
     first, size = _foreign.Interface.create_error.offset, ctypes.sizeof(ctypes.c_void_p)
-    fields = {"create_error": "Error_Create", "get_message": "Error_GetMessage", "destroy_error": "Error_Destroy",
-              "schedule": "ThreadPool_Schedule"}  # fmt: skip
+    fields = {"create_error": "Error_Create", "destroy_error": "Error_Destroy", "schedule": "ThreadPool_Schedule"}
     for own, name in fields.items():
         assert getattr(_foreign.Interface, own).offset == first + size * order.index(name)
 

@@ -317,6 +317,9 @@ MOVES: dict[str, Callable] = {
     "pad": _pad,
     "split": lambda parameters, x: np.split(x, np.cumsum(parameters["sizes"])[:-1], parameters["axis"]),
     "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
+    "unstack": lambda parameters, x: [
+        part.squeeze(parameters["axis"]) for part in np.split(x, x.shape[parameters["axis"]], parameters["axis"])
+    ],
     "stack": lambda parameters, *xs: np.stack(xs, parameters["axis"]),
 }
 
