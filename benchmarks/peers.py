@@ -125,8 +125,8 @@ def parts(options):
     problems = [name for name in options.problems if name != "one"]
     own = [name for name in options.peers if name in ONE_DEVICE]
     others = [name for name in options.peers if name not in ONE_DEVICE]
-    found = [(["one"], options.peers)] if "one" in options.problems else []
-    return found + [(problems, peers) for peers in (own, others) if problems and peers]
+    last = [(["one"], options.peers)] if "one" in options.problems else []
+    return [(problems, peers) for peers in (own, others) if problems and peers] + last
 
 
 def main():
