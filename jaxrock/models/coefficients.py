@@ -193,7 +193,11 @@ class Coefficients(AbstractMoments):
     def steepest(self) -> Scalar:
         """Bound of how fast the restoring moment changes with the angle."""
         moment = self.restoring_terms
-        return jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine)) if self.sinusoidal else jnp.abs(moment.line)
+        return (
+            jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine))
+            if self.sinusoidal
+            else jnp.abs(_or_zero(moment.line))
+        )
 
     @property
     def skew(self) -> Scalar | None:

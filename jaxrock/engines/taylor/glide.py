@@ -6,7 +6,7 @@ its series, and nothing else: no root, no certificate. What errors grow to is to
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
@@ -40,7 +40,8 @@ class Glide(NamedTuple):
     @classmethod
     def of(cls, stepper: TaylorStepper, state: State) -> "Glide":
         """One that begins."""
-        zero, moments = jnp.zeros_like(state.opening), stepper.on(state.side).scene.moments
+        zero = jnp.zeros_like(state.opening)
+        moments: Any = stepper.on(state.side).scene.moments  # `Coefficients`: this engine solves no others
         # Not so near to balance that it could matter how far off the state is (see `note`).
         doubt = 1.5 * stepper.doubt * MOST_OFF * moments.saddle
         pull = jnp.maximum(jnp.sqrt(state.closeness) * moments.restoring_at_rest, doubt)
