@@ -13,7 +13,9 @@ from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
 
-_SETTLED, _MORE = 1e-8, 6  # changes of a root, as a share of it, after which there are no more; and no more than these
+# Changes of a root, as a share of it, after which there are no more: the next is its square, times what may be 1e4 where
+# the slope is small. And no more changes than these.
+_SETTLED, _MORE = 1e-10, 6
 
 
 def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
