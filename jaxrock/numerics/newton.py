@@ -13,8 +13,8 @@ from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
 
-# Changes of a root, as a share of it, after which there are no more: the next is its square, times what may be 1e4 where
-# the slope is small. And no more changes than these.
+# Changes of a root, as a share of it, after which there are no more: the next is its square, times what may be 1e4
+# where the slope is small. And no more changes than these.
 _SETTLED, _MORE = 1e-10, 6
 
 
