@@ -75,6 +75,17 @@ def test_many_scenes_are_as_each_alone(pulse, model):
     compare(jax.jit(jax.vmap(one))(*points), jax.jit(lambda *x: jax.lax.map(lambda p: one(*p), x))(*points), points[0])
 
 
+def test_a_dip_within_a_step_counts():
+    """A small hop turns back twice within a step, out and in, before the highest peak: its least height is noted."""
+    alpha, p, restitution, intensity, ratio = (points[169] for points in scenes(400))
+    block = rk.Block(alpha, p, restitution)
+    pulse = rk.RickerPulse(intensity * np.tan(alpha), 2 * np.pi / (ratio * p))
+    rotation, _ = jax.vmap(rk.simulate(block, pulse))(jnp.linspace(1.0498, 1.1, 20001))
+    dip = np.abs(rotation).min()
+    assert 5e-4 < dip < abs(rotation[0])
+    np.testing.assert_allclose(rk.outcome(block, pulse).clearance, dip, rtol=1e-6)
+
+
 def test_many_blocks_in_an_earthquake_are_as_each_alone():
     """In rounds: some are lost long before others; many come to rest and uplift again."""
     alpha, p, restitution, *_ = scenes(100)

@@ -264,7 +264,7 @@ class TaylorStepper(AbstractStepper):
         one = jnp.ones_like(length)
         signs = Events(one, *step.signs, jnp.where(state.beyond, 1.0, -1.0), -one)
         below = state.opening < jnp.pi / 2 if self.history else None  # an outcome needs no fall down to the ground
-        wanted = Events(True, self._matters(state, scaled), step.faster, True, below)
+        wanted = Events(True, ~step.monotone | self._matters(state, scaled), step.faster, True, below)
         watches = [
             Watch(watched.derivative, sign, watched.level(self.scene), active)
             for watched, sign, active in zip(WATCHED, signs, wanted)
@@ -292,7 +292,7 @@ class TaylorStepper(AbstractStepper):
         return impact(self, noted, hits.impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
-        """Whether a turning point in this step could be a new peak, or closer to overturning than before."""
+        """Whether the only turning point of this step could be a new peak, or closer to overturning than before."""
         always = jnp.ones_like(state.beyond)
         if self.history:
             return always
@@ -325,6 +325,7 @@ class _Step(NamedTuple):
     rounded: Scalar  # errors of its end [rad]
     missed: Scalar
     signs: tuple[Scalar, Scalar]  # with which velocity and acceleration start
+    monotone: Flag  # the acceleration keeps its sign: one turning point at most
     faster: Flag  # the velocity may become the largest so far within it
     eventful: Flag
     whole: _Cut  # its end, if nothing happens
@@ -360,6 +361,7 @@ class _Step(NamedTuple):
             rounded=stepper.rounding * size,
             missed=last_size(coefficients) * length**order,
             signs=signs,
+            monotone=monotone,
             faster=faster,
             eventful=eventful & rocking & (length > 0),
             whole=_Cut(length, opening, speed, jnp.zeros_like(speed), Events(*[jnp.zeros_like(full)] * 5)),
