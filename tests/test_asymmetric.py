@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.engines.scene import uplift_threshold
 
 FOLDER = Path(__file__).parents[1] / "references" / "asymmetric"
 CASES = json.loads((FOLDER / "asymmetric.json").read_text())["cases"] if FOLDER.exists() else []
@@ -194,13 +195,10 @@ def test_critical_amplitudes():
             continue
         case = {**entry, "horizontal": ["sine", 1.0, entry["motion"][2]], "vertical": None, "initial": [0, 0]}
         block, motion, model, _ = scene(case)
-        low, high = sorted(entry["bracket"])
-        sign = np.sign(low)
-        found = rk.critical_amplitudes(
-            block, sign * motion, model, low=min(abs(low), abs(high)), high=max(abs(low), abs(high))
-        )
-        ends = np.asarray(found.amplitudes)
-        assert np.min(np.abs(sign * ends[np.isfinite(ends)] - float(entry["amplitude"]))) < 1e-10
+        sign, ends = np.sign(entry["bracket"][0]), np.sort(np.abs(entry["bracket"]))
+        intensity = tuple(ends / float(uplift_threshold(block, model)))
+        found = rk.critical_amplitudes(block, sign * motion, model, intensity=intensity)
+        assert np.min(np.abs(sign * np.asarray(found.value) - float(entry["amplitude"]))) < 1e-10
 
 
 OUTLINES = json.loads((FOLDER / "geometry.json").read_text()) if CASES else {}
