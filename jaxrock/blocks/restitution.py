@@ -26,6 +26,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 from jaxrock._checks import Range, check_shapes, checked, not_negative, share, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 
 __all__ = ["AbstractRestitution", "AngularMomentum", "Constant", "Corners", "Housner", "PerSide", "SpeedDependent"]
@@ -190,7 +191,7 @@ class PerSide(AbstractRestitution):
         check_shapes(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
         product = checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
-        self.first = jnp.where(jnp.isnan(product), product, self.first)
+        self.first = where(jnp.isnan(product), product, self.first)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """That of the side."""
@@ -290,7 +291,7 @@ class Reset(eqx.Module):
         if self.corners is None or self.p is None:
             return self._number
         ratio = self.law.ratio(self.corners, speed * self.p)
-        return jnp.where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
+        return where((ratio >= 0) & (ratio <= 1), ratio, jnp.nan)
 
     def slope(self, speed: Real) -> Real:
         """How the speed after an impact changes with that before it."""

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
@@ -10,6 +9,8 @@ from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.engines.uncertainty import GRAZING, Spread
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.xla_cpu import keep
 from jaxrock.status import Status
 
@@ -45,7 +46,7 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
     moments = stepper.scene.moments
     ceiling, weight = stepper.scene.outlook.most_helpful(state.piece)
     hold = -moments.acceleration(angle, state.velocity, ceiling, weight)
-    needed = jnp.where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
+    needed = where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
     certain = state.velocity - needed > stepper.doubt * state.spread.error_of(1.0, 1.0)
     return state.beyond & (state.velocity >= 0) & certain
 
@@ -56,7 +57,7 @@ def errors_after(
     """Errors after `elapsed` seconds of rocking; `ground`: acceleration [g] and weight (`Shaking.at`); `step`: what
     the engine's own approximation adds to the errors of angle and velocity [rad]. Rounding is added here."""
     given = stepper, state, angle, ground, elapsed, step
-    stepper, state, angle, (acceleration, weight), elapsed, step = jax.lax.stop_gradient(given)
+    stepper, state, angle, (acceleration, weight), elapsed, step = fixed(given)
     push = state.side * acceleration
     moments, time = stepper.scene.moments, stepper.scene.p * elapsed  # an error has no derivative
     of_angle, of_velocity = rounded(stepper, state, jnp.abs(push), time)
@@ -84,34 +85,34 @@ def note(stepper: AbstractStepper, state: State, outward, turning, crossing, ope
     per_rest = 1 / moments.restoring_at_rest**2  # the same at every step: computed once
     stillness = keep((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)
     turn = turning & (outward | state.beyond)
-    closeness = jnp.where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
-    closeness = jnp.where(crossing, jnp.minimum(closeness, stillness), closeness)
-    beyond = jnp.where(crossing, jnp.where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
-    beyond = jnp.where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
+    closeness = where(turn, jnp.minimum(state.closeness, stillness), state.closeness)
+    closeness = where(crossing, jnp.minimum(closeness, stillness), closeness)
+    beyond = where(crossing, where(state.beyond, stillness, jnp.inf), state.closeness_beyond)
+    beyond = where(turning & state.beyond, jnp.minimum(beyond, stillness), beyond)
     higher = turning & outward
     first = higher & surpasses(opening, state.peak)
     # Turning back just above the ground, within the error of the angle: there may have been an impact.
     angle = state.spread.angle
     off = jnp.abs(opening) + angle
     grazing = turning & ~outward & (off <= GRAZING * angle)
-    graze = jnp.where(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
+    graze = where(grazing, 8 * jnp.abs(acceleration) * off, 0.0)
     # Standing still in balance, within the error of the state along which it leaves.
     balanced = (turning | crossing) & (speed**2 + pull**2 <= stepper.doubt**2 * state.spread.variance(1.0, 1.0))
     if stepper.scene.falls_flat:
         balanced = balanced | (higher & (jnp.abs(opening - jnp.pi / 2) <= stepper.doubt * angle))
     undecided = balanced & (state.status == Status.successful)
     highest = higher & (opening > state.peak)
-    clearance = jnp.where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
+    clearance = where(turning & ~outward, jnp.minimum(state.clearance, opening), state.clearance)
     return replace(
         state,
-        peak=jnp.where(highest, opening, state.peak),
-        second=jnp.where(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
+        peak=where(highest, opening, state.peak),
+        second=where(higher, jnp.maximum(state.second, jnp.minimum(opening, state.peak)), state.second),
         clearance=clearance,
-        peak_clearance=jnp.where(highest, clearance, state.peak_clearance),
-        peak_time=jnp.where(first, stepper.time(state), state.peak_time),
-        error=jnp.where(first, jax.lax.stop_gradient(angle), state.error),
+        peak_clearance=where(highest, clearance, state.peak_clearance),
+        peak_time=where(first, stepper.time(state), state.peak_time),
+        error=where(first, fixed(angle), state.error),
         closeness=closeness,
         closeness_beyond=beyond,
-        spread=jax.lax.stop_gradient(state.spread.plus_variance(0.0, graze)),
+        spread=fixed(state.spread.plus_variance(0.0, graze)),
         status=Status.where(undecided, Status.undecided, state.status),
     )

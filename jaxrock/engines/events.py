@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.engines.scene import Scene
+from jaxrock.numerics.choice import where
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -43,10 +44,10 @@ WATCHED = Events(
 
 def level_of(scene: Scene, hits: Events) -> Scalar:
     """The opening angle at which a step ends, if it ends at one."""
-    return jnp.where(hits.saddle, scene.moments.saddle, jnp.where(hits.flat, jnp.pi / 2, 0.0))
+    return where(hits.saddle, scene.moments.saddle, where(hits.flat, jnp.pi / 2, 0.0))
 
 
 def landed(scene: Scene, hits: Events, opening: Scalar, velocity: Scalar) -> tuple[Scalar, Scalar]:
     """Opening angle and velocity at the end of a step, exact where its event sets them; at an impact `impact` does."""
-    opening = jnp.where(hits.flat, jnp.pi / 2, jnp.where(hits.saddle, scene.moments.saddle, opening))
-    return opening, jnp.where(hits.turning, 0.0, velocity)
+    opening = where(hits.flat, jnp.pi / 2, where(hits.saddle, scene.moments.saddle, opening))
+    return opening, where(hits.turning, 0.0, velocity)

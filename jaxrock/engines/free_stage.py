@@ -20,6 +20,8 @@ from jaxrock.engines.state import surpasses
 from jaxrock.models import free_swing as skewed
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.compound import compound
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -57,22 +59,28 @@ class FreeStage(eqx.Module):
         )
 
 
-@jax.jit
 def carlson_rf(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Carlson's elliptic integral R_F by duplication (Carlson 1979; DLMF 19.36.1)."""
+    return _carlson_rf(x, y, z)[0]
 
+
+def _carlson_rf_written(x, y, z):
     def doubled(carry):
         left, x, y, z = carry
         roots = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
         shift = roots[0] * roots[1] + roots[1] * roots[2] + roots[2] * roots[0]
         return left - 1, (x + shift) / 4, (y + shift) / 4, (z + shift) / 4
 
-    _, x, y, z = jax.lax.while_loop(lambda carry: carry[0] > 0, doubled, (14, x, y, z))
+    start = 14, *jnp.broadcast_arrays(x, y, z)
+    _, x, y, z = jax.lax.while_loop(lambda carry: carry[0] > 0, doubled, start)
     mean = (x + y + z) / 3
     dx, dy = 1 - x / mean, 1 - y / mean
     dz = -(dx + dy)
     e2, e3 = dx * dy - dz * dz, dx * dy * dz
-    return (1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)
+    return [(1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)]
+
+
+_carlson_rf = compound("carlson_rf", _carlson_rf_written)
 
 
 def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:
@@ -146,7 +154,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
         rebound = ratio * arrival
         share = share * jnp.abs(ratio * reset.slope(arrival))  # of a change of the energy
         stay = _after_impact(visit.moments, rebound, happens)
-        lost, impacts = lost | stay.lost, jnp.where(stay.lost, i, impacts)
+        lost, impacts = lost | stay.lost, where(stay.lost, i, impacts)
         arrival = rebound
         found.append(stay)
         shares.append(share)
@@ -159,23 +167,23 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     for stay, share in zip(found, shares):
         higher = stay.safe & surpasses(stay.peak, peak)
         highest.append(stay.safe & surpasses(stay.peak, best))
-        best = jnp.where(highest[-1], stay.peak, best)
-        steepness = jnp.where(higher, stay.steepness, steepness)
-        peak_share = jnp.where(higher, share, peak_share)
-        peak = jnp.where(stay.safe & (stay.peak > peak), stay.peak, peak)
-        fastest = jnp.where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
-        closeness = jnp.where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
+        best = where(highest[-1], stay.peak, best)
+        steepness = where(higher, stay.steepness, steepness)
+        peak_share = where(higher, share, peak_share)
+        peak = where(stay.safe & (stay.peak > peak), stay.peak, peak)
+        fastest = where(stay.safe, jnp.maximum(fastest, stay.arrival), fastest)
+        closeness = where(stay.lost, stay.closeness, jnp.minimum(closeness, stay.closeness))
         # In terms of the present energy.
-        missing = jnp.abs(stay.deficit) / jnp.where(share > 0, share, 1.0)
+        missing = jnp.abs(stay.deficit) / where(share > 0, share, 1.0)
         narrow = stay.decides & (missing < narrowest)
-        deficit, decisive = jnp.where(narrow, stay.deficit, deficit), jnp.where(narrow, share, decisive)
-        narrowest = jnp.where(narrow, missing, narrowest)
+        deficit, decisive = where(narrow, stay.deficit, deficit), where(narrow, share, decisive)
+        narrowest = where(narrow, missing, narrowest)
 
     def time():
         at = since = zero
         for stay, higher in zip(found, highest):
             top, since = stay.times(since)
-            at = jnp.where(higher, top, at)
+            at = where(higher, top, at)
         return at
 
     # Elliptic integrals cost more than all the rest: most peaks come before the free stage.
@@ -183,11 +191,11 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     return FreeStage(
         overturned=lost,
         impacts=impacts.astype(jnp.int32),
-        peak=jnp.where(lost, 0.0, peak),
+        peak=where(lost, 0.0, peak),
         peak_time=peak_time,
         peak_steepness=steepness,
         peak_share=peak_share,
-        fastest=jnp.where(lost, 0.0, fastest),
+        fastest=where(lost, 0.0, fastest),
         closeness=closeness,
         deficit=deficit,
         share=decisive,
@@ -246,33 +254,33 @@ def _present(moments: Coefficients, opening: Scalar, velocity: Scalar, moving: F
     rises, falls = safe & outward, safe & ~outward
 
     def times(_):
-        out = _time_to_peak(moments, gap, jnp.where(rises, manifold, base), jnp.where(rises, speed, 0.0))
-        back = _time_to_peak(moments, moments.saddle, base, jnp.where(rises, arrival, 0.0)) if comes_back else jnp.inf
+        out = _time_to_peak(moments, gap, where(rises, manifold, base), where(rises, speed, 0.0))
+        back = _time_to_peak(moments, moments.saddle, base, where(rises, arrival, 0.0)) if comes_back else jnp.inf
         falling = _time_to_impact(
             moments,
-            jnp.where(falls, gap, moments.saddle),
-            jnp.where(falls, manifold, base),
-            jnp.where(falls, -speed, 0.0),
+            where(falls, gap, moments.saddle),
+            where(falls, manifold, base),
+            where(falls, -speed, 0.0),
             base,
-            jnp.where(falls, arrival, 0.0),
+            where(falls, arrival, 0.0),
         )
-        return out / rate, jnp.where(outward, out + back, falling) / rate
+        return out / rate, where(outward, out + back, falling) / rate
 
     # Closeness: crossing the saddle at a speed, or turning at an acceleration.
     crossing, turning = -deficit * _weight(moments), _turning_closeness(moments, jnp.abs(deficit))
     past_inward = (gap < 0) & (speed < 0)
-    beyond = jnp.where(past_inward, _turning_closeness(moments, jnp.abs(deficit), beyond=True), jnp.inf)
-    lost_closeness = jnp.where(gap > 0, crossing, beyond)
-    safe_closeness = jnp.where(outward, turning, jnp.where(past_inward, crossing, jnp.inf))
-    peak = _peak_of(moments, jnp.where(rises, deficit, base**2))
+    beyond = where(past_inward, _turning_closeness(moments, jnp.abs(deficit), beyond=True), jnp.inf)
+    lost_closeness = where(gap > 0, crossing, beyond)
+    safe_closeness = where(outward, turning, where(past_inward, crossing, jnp.inf))
+    peak = _peak_of(moments, where(rises, deficit, base**2))
     return _Stay(
         lost=lost,
         safe=safe,
         decides=moving & (outward | past_inward),
         deficit=deficit * moments.stiffness,
-        peak=jnp.where(rises, peak, 0.0),
+        peak=where(rises, peak, 0.0),
         steepness=_steepness(moments, peak),
-        closeness=jnp.where(lost, lost_closeness, jnp.where(safe, safe_closeness, jnp.inf)),
+        closeness=where(lost, lost_closeness, where(safe, safe_closeness, jnp.inf)),
         arrival=arrival * rate,
         times=times,
     )
@@ -287,10 +295,10 @@ def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag) -> _Sta
     safe = happens & ~lost
 
     def times(since):
-        out = _time_to_peak(moments, moments.saddle, base, jnp.where(safe, speed, 0.0)) / rate
+        out = _time_to_peak(moments, moments.saddle, base, where(safe, speed, 0.0)) / rate
         return since + out, since + 2 * out
 
-    peak = _peak_of(moments, jnp.where(safe, deficit, base**2))
+    peak = _peak_of(moments, where(safe, deficit, base**2))
     turning = _turning_closeness(moments, jnp.abs(deficit))
     crossing = -deficit * _weight(moments)
     return _Stay(
@@ -300,7 +308,7 @@ def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag) -> _Sta
         deficit=deficit * moments.stiffness,
         peak=peak,
         steepness=_steepness(moments, peak),
-        closeness=jnp.where(lost, crossing, jnp.where(safe, turning, jnp.inf)),
+        closeness=where(lost, crossing, where(safe, turning, jnp.inf)),
         arrival=rebound,
         times=times,
     )

@@ -20,7 +20,9 @@ from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.engines.uncertainty import Spread
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import logarithm
+from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.xla_cpu import keep_flag
 
 Scalar = Inexact[Array, ""]
@@ -47,18 +49,18 @@ def impact(
     rebound = _rebound(stepper, state, speed, ground)
     slowed = hit & (rebound.there < 0)  # by the forcing, before it hit the ground: else it would have turned back
     depth = jax.lax.cond(
-        slowed, lambda: speed**2 / (2 * jnp.where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
+        slowed, lambda: speed**2 / (2 * where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
     )
     rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
     return replace(
         state,
         impacts=state.impacts + (hit & (speed < 0)) + more,
-        impact_time=jnp.where(hit, stepper.time(state), state.impact_time),
-        impact_velocity=jnp.where(hit, state.side * speed, state.impact_velocity),
-        side=jnp.where(rests, 0.0, jnp.where(hit, -state.side, state.side)),
-        clearance=jnp.where(slowed, jnp.minimum(state.clearance, depth), state.clearance),
-        opening=jnp.where(hit, 0.0, state.opening),
-        velocity=jnp.where(rests, 0.0, jnp.where(hit, rebound.speed, state.velocity)),
+        impact_time=where(hit, stepper.time(state), state.impact_time),
+        impact_velocity=where(hit, state.side * speed, state.impact_velocity),
+        side=where(rests, 0.0, where(hit, -state.side, state.side)),
+        clearance=where(slowed, jnp.minimum(state.clearance, depth), state.clearance),
+        opening=where(hit, 0.0, state.opening),
+        velocity=where(rests, 0.0, where(hit, rebound.speed, state.velocity)),
         spread=Spread.where(rests, Spread.none(speed), Spread.where(hit, rebound.spread, state.spread)),
         local=state.local + wait,
         beyond=state.beyond & ~hit,
@@ -76,7 +78,7 @@ def _rebound(stepper: AbstractStepper, state: State, speed: Scalar, ground: tupl
     here = -ahead.acceleration(rest, rebound, side * ground[0], ground[1])
     there = -moments.acceleration(rest, speed, state.side * ground[0], ground[1])
     spread = state.spread.after_impact(speed, -there, -here, ratio, scene.reset.slope(before))
-    return _Rebound(rebound, here, there, jax.lax.stop_gradient(spread))
+    return _Rebound(rebound, here, there, fixed(spread))
 
 
 def _rests_if_soon(
@@ -84,7 +86,7 @@ def _rests_if_soon(
 ) -> tuple[Flag, Int[Array, ""], Scalar]:
     """As `_rests`, which is not asked where the next hop alone takes too long for that."""
     given = stepper, state, hit, after, steepest, reach
-    stepper, state, hit, after, steepest, reach = jax.lax.stop_gradient(given)
+    stepper, state, hit, after, steepest, reach = fixed(given)
     soon = hit & ((8 * after.speed <= reach * stepper.scene.p * after.here) | (after.speed == 0))
 
     def never():
@@ -101,8 +103,8 @@ def _rests(
     e, back = scene.reset.most(rebound), scene.far_reset.most(rebound)
     weaker = jnp.minimum(after.here, after.there)
     held = (weaker > 0) & (e * back < 1)
-    here, there = jnp.where(held, after.here, 1.0), jnp.where(held, after.there, 1.0)
-    remaining = 2 * rebound * (1 / here + back / there) / jnp.where(held, 1 - e * back, 1.0)
+    here, there = where(held, after.here, 1.0), where(held, after.there, 1.0)
+    remaining = 2 * rebound * (1 / here + back / there) / where(held, 1 - e * back, 1.0)
     window = 4 * remaining / scene.p
     change = functools.reduce(jnp.maximum, [m.change_at_rest(*steepest) for m in scene.different_moments])
     dies = held & (change * window <= weaker / 2) & (window <= reach)
@@ -120,5 +122,5 @@ def _rests(
     rests = keep_flag(hit & (dies | (rebound == 0)), state.local)
     slower = e if scene.far is None else jnp.sqrt(e * back)  # from hop to hop, in the mean
     more = logarithm(low / jnp.maximum(rebound, low)) / logarithm(jnp.clip(slower, 1e-3, 1 - 1e-9))
-    more = jnp.where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
-    return rests, more, jnp.where(rests & (rebound > 0), remaining / scene.p, 0.0)
+    more = where(rests, jnp.ceil(more).astype(state.impacts.dtype), 0)
+    return rests, more, where(rests & (rebound > 0), remaining / scene.p, 0.0)

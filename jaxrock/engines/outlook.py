@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.motions.shaking import Bounds, Envelope
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
@@ -77,7 +78,7 @@ class Outlook(eqx.Module):
         if self.horizontal.near.size <= _NEAR:
             return piece
         far, near = (self._drive(piece, which) < self.threshold for which in ("far", "near"))
-        return piece + jnp.where(far, _FAR, jnp.where(near, _NEAR, 0))
+        return piece + where(far, _FAR, where(near, _NEAR, 0))
 
     def most_helpful(self, piece: Int[Array, ""]) -> tuple[Scalar, Scalar | None]:
         """The forcing [g] and weight still to come that do most for a block past its saddle."""
@@ -106,7 +107,7 @@ def _doubled(values: Inexact[Array, " n"], times: int, left: Int[Array, " m"] | 
     def wider(values, reach):
         beyond = jnp.concatenate([values, jnp.zeros_like(values)])
         more = jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size)
-        return jnp.maximum(values, more if room is None else jnp.where(reach < room, more, 0.0))
+        return jnp.maximum(values, more if room is None else where(reach < room, more, 0.0))
 
     room = None if left is None else jnp.pad(left, (0, values.size - left.size))
     if values.size <= _NEAR and left is None:

@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool, Inexact
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.motions.shaking import Shaking
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.polynomial import Watch, first_event, meet, step_length
 
 Scalar = Inexact[Array, ""]
@@ -24,40 +26,40 @@ def wait(
     length = longest_wait(stepper, shaking, room, order, tolerance)
     never = scene.outlook.is_over(state.piece)
     # How far a step goes changes nothing: it has no derivative.
-    room, length = jax.lax.stop_gradient((room, jnp.where(jnp.isfinite(length), length, 0.0)))
+    room, length = fixed((room, where(jnp.isfinite(length), length, 0.0)))
     zero = jnp.zeros_like(length)
     lifted, found = [], []
     for drive, level in scene.drives_of(shaking.rescaled(length)):
-        fixed, high = jax.lax.stop_gradient((drive, level))
-        slope = fixed[1] if len(fixed) > 1 else zero
+        held, high = fixed((drive, level))
+        slope = held[1] if len(held) > 1 else zero
         slack = 8 * eps * high
-        touching = jnp.abs(high - fixed[0]) <= slack
-        lifts = (high - fixed[0] < -slack) | (touching & (slope > 0))
+        touching = jnp.abs(high - held[0]) <= slack
+        lifts = (high - held[0] < -slack) | (touching & (slope > 0))
         # A threshold that is touched already counts as passed when it is left behind by more than rounding.
-        least = high + jnp.where(touching, 2 * slack, 0.0)
+        least = high + where(touching, 2 * slack, 0.0)
 
-        def search(found, needed, inside, fixed=fixed, least=least):
-            series = [inside(c) for c in fixed] + [zero] * (2 - len(fixed))
+        def search(found, needed, inside, held=held, least=least):
+            series = [inside(c) for c in held] + [zero] * (2 - len(held))
             watch = Watch(0, -jnp.ones_like(zero), least, True)
             landing = first_event(series, [watch], zero, needed)
             return landing.x, landing.hits[0] & (landing.jet[1] > 0)
 
-        reachable = ~lifts & ~never & (state.side == 0) & (sum(jnp.abs(c) for c in fixed) >= high)
+        reachable = ~lifts & ~never & (state.side == 0) & (sum(jnp.abs(c) for c in held) >= high)
         x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
-        found.append((jnp.where(met, meet(x, drive, level), x), met, x))
+        found.append((where(met, meet(x, drive, level), x), met, x))
         lifted.append((lifts, touching))
     (x, met, at), (x2, met2, at2) = found
     second = met2 & (~met | (at2 < at))
     met, early = met | met2, jnp.minimum(at, at2) < 1
-    x = jnp.where(second, x2, jnp.where(met, x, jnp.minimum(at, at2)))
+    x = where(second, x2, where(met, x, jnp.minimum(at, at2)))
     full = (length >= room) & ~early
     piece, local, over = stepper.move_on(state, x * length * unit, full)
-    piece = jnp.where(full & ~over & (not stepper.history), scene.after_quiet(piece), piece)
+    piece = where(full & ~over & (not stepper.history), scene.after_quiet(piece), piece)
     waited = replace(state, piece=piece, local=local, done=over | (never & ~early))
-    waited = lift(waited, jnp.where(second, -1.0, 1.0), met, met)
+    waited = lift(waited, where(second, -1.0, 1.0), met, met)
     (first, touching), (other, touching2) = lifted
-    at_once = lift(state, jnp.where(first, 1.0, -1.0), first | other, jnp.where(first, touching, touching2))
-    return jax.tree.map(lambda a, b: jnp.where(first | other, a, b), at_once, waited)
+    at_once = lift(state, where(first, 1.0, -1.0), first | other, where(first, touching, touching2))
+    return jax.tree.map(lambda a, b: where(first | other, a, b), at_once, waited)
 
 
 def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:
@@ -74,8 +76,8 @@ def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag) -> State:
     """Leave rest to a side where `lifts`; `continuous`: with zero acceleration."""
     return replace(
         state,
-        side=jnp.where(lifts, side, state.side),
-        uplifting=jnp.where(lifts, continuous, state.uplifting),
-        beyond=jnp.where(lifts, False, state.beyond),
-        extremal=jnp.where(lifts, False, state.extremal),
+        side=where(lifts, side, state.side),
+        uplifting=where(lifts, continuous, state.uplifting),
+        beyond=where(lifts, False, state.beyond),
+        extremal=where(lifts, False, state.extremal),
     )

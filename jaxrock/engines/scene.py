@@ -12,10 +12,12 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.outlook import Outlook
+from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking, sum_of_series
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
@@ -30,7 +32,8 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
 def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
     if isinstance(block, Block):
-        return model.moments(block), None
+        moments = model.moments(block)
+        return moments.balanced if isinstance(moments, Coefficients) else moments, None
     both = zip(model.moments_of_sides(block), block.sides)
     return tuple(moments.times((side.p / block.p1) ** 2) for moments, side in both)
 
@@ -42,7 +45,7 @@ def _least_threshold(moments: AbstractMoments, far: AbstractMoments | None) -> S
 def _endless(values: Inexact[Array, " pieces"], count: Int[Array, ""] | None) -> Inexact[Array, " knots"]:
     """Values of pieces, and infinity for what comes after the last."""
     values = jnp.concatenate([values, jnp.full(1, jnp.inf, values.dtype)])
-    return values if count is None else jnp.where(jnp.arange(values.size) < count, values, jnp.inf)
+    return values if count is None else where(jnp.arange(values.size) < count, values, jnp.inf)
 
 
 def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) -> Scalar:
@@ -88,7 +91,7 @@ class Scene(eqx.Module):
         if stretch is not None:
             count = stretch.end
         else:  # up to the last piece with a length: a late motion's knots may all be one number
-            lasting = jnp.where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
+            lasting = where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
             count = jnp.max(lasting) if knots.size > _MANY else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
@@ -133,7 +136,7 @@ class Scene(eqx.Module):
             return self
 
         def of(here, there):
-            return jax.tree.map(lambda a, b: jnp.where(side < 0, b, a), here, there)
+            return jax.tree.map(lambda a, b: where(side < 0, b, a), here, there)
 
         return replace(
             self,
@@ -177,7 +180,7 @@ class Scene(eqx.Module):
 
     def length(self, piece: Int[Array, ""]) -> Scalar:
         """How long a piece lasts [s]; the quiet after the motion has no end."""
-        return jnp.where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
+        return where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
 
     def scale(self, piece: Int[Array, ""]) -> Scalar | float:
         """Time in which the acceleration of a piece changes [s]."""
@@ -191,4 +194,4 @@ class Scene(eqx.Module):
         shaking = Shaking(
             self.motion.series(inner, local, unit, order), self.motion.vertical_series(inner, local, unit, order)
         )
-        return shaking.each(lambda terms: [jnp.where(during, u, 0.0) for u in terms]), unit
+        return shaking.each(lambda terms: [where(during, u, 0.0) for u in terms]), unit

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.uncertainty import Spread
 from jaxrock.models.equation import Angle
+from jaxrock.numerics.choice import where
 from jaxrock.status import Status
 
 Scalar = Inexact[Array, ""]
@@ -50,7 +51,7 @@ _MOST = 1e30  # [g], [rad/s], [s]
 def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
-    side = jnp.where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
+    side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
     opening, outward = jnp.abs(rotation), side * velocity
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
@@ -85,8 +86,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         impacts=count,
         impact_time=zero,
         impact_velocity=zero,
-        closeness=jnp.where(side == 0, unlifted, jnp.where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
-        closeness_beyond=jnp.where(beyond, stillness, jnp.inf),
+        closeness=where(side == 0, unlifted, where(outward == 0, jnp.minimum(stillness, 1.0), 1.0)),
+        closeness_beyond=where(beyond, stillness, jnp.inf),
         clearance=jnp.full_like(opening, jnp.inf),
         peak_clearance=jnp.full_like(opening, jnp.inf),
         second=zero,

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
@@ -109,4 +110,4 @@ class AbstractStepper(eqx.Module):
         ends = full if self.stop is None else full & (self._to_knot(state) <= self.stop - self.time(state))
         piece = state.piece + ends
         over = piece >= self.scene.pieces if self.stop is None else full & ~ends
-        return piece, jnp.where(ends, 0.0, state.local + elapsed), over
+        return piece, where(ends, 0.0, state.local + elapsed), over

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import count_up_to
 
 
@@ -68,11 +69,11 @@ class Trajectory(eqx.Module):
 
 @jax.jit
 def _in_order(happened, order, values) -> tuple[tuple, Int[Array, ""]]:
-    order = jnp.argsort(jnp.where(happened, order, jnp.inf), stable=True)
+    order = jnp.argsort(where(happened, order, jnp.inf), stable=True)
     found = []
     for value, filling in values:
         here = happened.reshape(happened.shape + (1,) * (value.ndim - 1))
-        found.append(jnp.where(here, value, filling)[order])
+        found.append(where(here, value, filling)[order])
     return tuple(found), happened.sum()
 
 
@@ -99,4 +100,4 @@ def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> t
 def times_of(time: Callable, nodes: PyTree, last: PyTree) -> Inexact[Array, " nodes"]:
     """Times of the nodes up to the last state; infinite past it."""
     number = jnp.arange(nodes.steps.size)
-    return jnp.where(number <= last.steps, jax.vmap(time)(nodes), jnp.inf)
+    return where(number <= last.steps, jax.vmap(time)(nodes), jnp.inf)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.polynomial import horner
 
 Scalar = Inexact[Array, ""]
@@ -41,7 +42,7 @@ class Spread(eqx.Module):
     @classmethod
     def where(cls, condition: Bool[Array, ""], one: "Spread", other: "Spread") -> "Spread":
         """`one` where the condition holds, else `other`."""
-        return cls(*(jnp.where(condition, a, b) for a, b in zip(one._parts, other._parts)))
+        return cls(*(where(condition, a, b) for a, b in zip(one._parts, other._parts)))
 
     @property
     def _parts(self) -> tuple[Scalar, Scalar, Scalar]:
@@ -112,4 +113,4 @@ class Spread(eqx.Module):
         bounded = jnp.minimum(jnp.minimum(speed, -fallen), -1e-18)
         missed = (before > 0) & ~(speed**4 > (2 * GRAZING * before) ** 2 * self.xx)
         spread = self._through(ratio, 0.0, kick / bounded, slope)
-        return spread.plus(0.0, jnp.where(missed, (1 + ratio) * jnp.abs(speed), 0.0))
+        return spread.plus(0.0, where(missed, (1 + ratio) * jnp.abs(speed), 0.0))

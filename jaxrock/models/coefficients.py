@@ -8,6 +8,8 @@ acceleration u (g), every model of a rigid block reads
 A coefficient that a model does not have is None, so that nothing is computed for it.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -19,7 +21,9 @@ from jaxtyping import Array, Inexact
 
 from jaxrock.models import free_swing
 from jaxrock.models.equation import AbstractMoments, Angle
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
+from jaxrock.numerics.polynomial import sum_of_products
 
 Scalar = Inexact[Array, ""]
 
@@ -28,6 +32,11 @@ _ONE = 1.0
 
 def _or_zero(coefficient: Scalar | float | None) -> Scalar | float:
     return 0.0 if coefficient is None else coefficient
+
+
+def _length(sine: Any, cosine: Any) -> Scalar:
+    """Amplitude of a sine and a cosine together; moments over m g R neither overflow nor vanish when squared."""
+    return jnp.abs(sine) if cosine is None else jnp.sqrt(sum_of_products([sine, cosine], [sine, cosine]))
 
 
 def _weighed(weight: Scalar | None, moment: Scalar) -> Scalar:
@@ -86,8 +95,13 @@ class Terms(eqx.Module):
 
     def summed(self, basis: Basis, empty: Any = 0.0) -> Any:
         """The sum of coefficients times functions; `empty` where there is none."""
-        products = self.products(basis)
-        return sum(products, start=0.0) if products else empty
+        pairs = [(c, f) for c, f in zip(self.coefficients, basis) if c is not None and f is not None]
+        alone, pairs = [c for c, f in pairs if f is _ONE], [pair for pair in pairs if pair[1] is not _ONE]
+        if len(pairs) > 1:
+            alone.append(sum_of_products(*map(list, zip(*pairs))))
+        elif pairs:
+            alone.append(pairs[0][0] * pairs[0][1])
+        return functools.reduce(operator.add, alone) if alone else empty
 
     def products(self, basis: Basis, sign: Scalar | None = None) -> list:
         """Coefficients times functions, where there are both; `sign`: of all of them."""
@@ -123,7 +137,7 @@ class Coefficients(AbstractMoments):
 
     restoring_terms: Terms
     arm_terms: Terms
-    known_saddle: Scalar | None = None  # where it is known beforehand, because the coefficients change on the way
+    known_saddle: Scalar | None = None  # where it is known beforehand: it is asked for often
 
     def __check_init__(self) -> None:
         moment = self.restoring_terms
@@ -138,6 +152,11 @@ class Coefficients(AbstractMoments):
     def bare(self) -> "Coefficients":
         """The coefficients alone."""
         return self if self.known_saddle is None else replace(self, known_saddle=None)
+
+    @property
+    def balanced(self) -> "Coefficients":
+        """The same, with the balance computed, once for all who ask for it."""
+        return replace(self, known_saddle=self.saddle)
 
     def times(self, factor: Scalar | float) -> "Coefficients":
         """All accelerations times a factor: of a side whose own frequency parameter is not that of the scene."""
@@ -193,11 +212,7 @@ class Coefficients(AbstractMoments):
     def steepest(self) -> Scalar:
         """Bound of how fast the restoring moment changes with the angle."""
         moment = self.restoring_terms
-        return (
-            jnp.hypot(_or_zero(moment.sine), _or_zero(moment.cosine))
-            if self.sinusoidal
-            else jnp.abs(_or_zero(moment.line))
-        )
+        return _length(moment.sine, moment.cosine) if self.sinusoidal else jnp.abs(_or_zero(moment.line))
 
     @property
     def skew(self) -> Scalar | None:
@@ -236,7 +251,7 @@ class Coefficients(AbstractMoments):
                 Terms(*pair).summed(Basis(factor, push, None, None))
                 for pair in ((moment.sine, arm.sine), (moment.cosine, arm.cosine))
             )
-            return jnp.sqrt(2 * jnp.maximum(jnp.hypot(sines, cosines) - self.repulsion(angle, push, weight), 0.0))
+            return jnp.sqrt(2 * jnp.maximum(_length(sines, cosines) - self.repulsion(angle, push, weight), 0.0))
         if arm.sine is not None:
             return jnp.full_like(hold, jnp.inf)
         if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent
@@ -248,4 +263,4 @@ class Coefficients(AbstractMoments):
             slope = slope + push * _or_zero(arm.cosine) * angle.sine
         # Without weight the forcing alone brings it back.
         light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
-        return jnp.where(light, jnp.inf, hold / jnp.sqrt(jnp.where(light, 1.0, slope)))
+        return where(light, jnp.inf, hold / jnp.sqrt(where(light, 1.0, slope)))

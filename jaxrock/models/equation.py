@@ -16,6 +16,7 @@ from jaxtyping import Array, Inexact
 from jaxrock._parameters import Owner
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
 
@@ -165,9 +166,9 @@ def first_zero(moment: Callable, like: Scalar) -> Scalar:
         low, high = bracket
         middle = (low + high) / 2
         above = jax.lax.stop_gradient(moment(middle)) > 0
-        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+        return where(above, middle, low), where(above, high, middle)
 
     low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
     low = jax.lax.stop_gradient(low)
     root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
-    return jnp.where(jnp.any(falls), root, jnp.pi / 2)
+    return where(jnp.any(falls), root, jnp.pi / 2)

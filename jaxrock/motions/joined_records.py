@@ -17,6 +17,7 @@ from jaxrock._parameters import Owner, parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
 from jaxrock.motions.record import AbstractChosen, Padded, Record, Straight, roomy
 from jaxrock.motions.shaking import Bounds, Envelope
+from jaxrock.numerics.choice import where
 
 
 class JoinedRecords(Owner):
@@ -81,7 +82,7 @@ class _InPlace(Straight):
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
         many = self.joined
-        return jnp.where(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
+        return where(self._left > 0, many.dt[many.owner], jnp.inf)[:-1]
 
     def length(self, piece: Piece) -> Scalar:
         return self.joined.dt[self.record]
@@ -95,7 +96,7 @@ class _InPlace(Straight):
     @property
     def envelope(self) -> Envelope:
         many, values = self.joined, self.bounds
-        values = jnp.where(self._left[:-1] > 0, values, 0.0)
+        values = where(self._left[:-1] > 0, values, 0.0)
         peaks = jax.ops.segment_max(values, many.owner[:-1], many.dt.size, indices_are_sorted=True)
         return Envelope(Bounds(values, self.sure, left=self._left[:-1], peak=peaks[self.record]), None)
 
@@ -113,7 +114,7 @@ class Chosen(AbstractChosen):
         many, places = self.joined, jnp.arange(self.joined.longest)
         first, count, dt = (x[self.record] for x in (many.first, many.count, many.dt))
         samples = many.samples[jnp.minimum(first + places, many.samples.size - 1)]
-        return Padded(self.sure * jnp.where(places < count, samples, 0.0), dt, dt * (count - 1))
+        return Padded(self.sure * where(places < count, samples, 0.0), dt, dt * (count - 1))
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:

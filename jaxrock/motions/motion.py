@@ -19,6 +19,7 @@ from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import count_up_to, pick
 
 Scalar = Inexact[Array, ""]
@@ -105,7 +106,7 @@ class AbstractMotion(Owner):
         def at(t):
             piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
             value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
-            return jnp.where((t >= 0) & (t < knots[-1]), value, 0.0)
+            return where((t >= 0) & (t < knots[-1]), value, 0.0)
 
         return jax.vmap(at)(time.ravel()).reshape(time.shape)
 
@@ -219,7 +220,7 @@ class Shifted(_Changed):
         return jnp.concatenate([jnp.full_like(inner[:1], self.delay), inner])
 
     def length(self, piece: Piece) -> Scalar:
-        return jnp.where(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
+        return where(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
 
     @property
     def lateness(self) -> Scalar | None:
@@ -239,11 +240,11 @@ class Shifted(_Changed):
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         inner = self.motion.series(jnp.maximum(piece - 1, 0), local, unit, order)
-        return [jnp.where(piece > 0, u, 0.0) for u in inner]
+        return [where(piece > 0, u, 0.0) for u in inner]
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         inner = self.motion.vertical_series(jnp.maximum(piece - 1, 0), local, unit, order)
-        return None if inner is None else [jnp.where(piece > 0, v, 0.0) for v in inner]
+        return None if inner is None else [where(piece > 0, v, 0.0) for v in inner]
 
 
 class _Pieces(NamedTuple):
@@ -263,7 +264,7 @@ class _Pieces(NamedTuple):
     def spread(self, values: Inexact[Array, " pieces"], quiet: float) -> Inexact[Array, " finer"]:
         """Values of the motion's pieces for the finer ones; `quiet` where it does not move."""
         piece, moving = self.inside((self.knots[:-1] + self.knots[1:]) / 2)
-        return jnp.where(moving, values[piece], quiet)
+        return where(moving, values[piece], quiet)
 
     def spread_bounds(self, bounds: Bounds) -> Bounds:
         """Bounds of the motion's pieces for the finer ones."""
@@ -274,7 +275,7 @@ class _Pieces(NamedTuple):
         inner, moving = self.inside((self.knots[piece] + self.knots[piece + 1]) / 2)
         offset = self.knots[piece] - self.motion.knots[inner] + local
         terms = series(inner, offset, unit, order)
-        return None if terms is None else [jnp.where(moving, u, 0.0) for u in terms]
+        return None if terms is None else [where(moving, u, 0.0) for u in terms]
 
 
 def _shortest_scales(parts: tuple[_Pieces, ...]) -> Inexact[Array, " finer"] | None:

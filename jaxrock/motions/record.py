@@ -14,6 +14,7 @@ from jaxrock._checks import Values, is_traced, not_negative, size, strength, wit
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
+from jaxrock.numerics.choice import where
 
 _SHORT = 64  # samples of a record that is a program of its own
 
@@ -143,10 +144,10 @@ class Padded(Straight):
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
-        return jnp.where(self.dt * jnp.arange(self.samples.shape[-1] - 1) < self.finish, self.dt, 0.0)
+        return where(self.dt * jnp.arange(self.samples.shape[-1] - 1) < self.finish, self.dt, 0.0)
 
     def length(self, piece: Piece) -> Scalar:
-        return jnp.where(self.dt * piece < self.finish, self.dt, 0.0)
+        return where(self.dt * piece < self.finish, self.dt, 0.0)
 
 
 def padded(motion: AbstractMotion) -> AbstractMotion:

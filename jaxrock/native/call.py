@@ -21,6 +21,7 @@ from jaxrock.native.parted import emit_parted, has_parts
 from jaxrock.native.partition import Part, ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
+from jaxrock.native.unmarked import unmarked
 
 
 class _Piece(NamedTuple):
@@ -39,7 +40,7 @@ class Plan:
     """
 
     def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
-        program = plain(program) if has_foreign(program.jaxpr) else program
+        program = unmarked(plain(program) if has_foreign(program.jaxpr) else program)
         program = hoisted(program, _is_before_loops)
         self._program, self._shared, self._alone = program, shared, alone
         self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)

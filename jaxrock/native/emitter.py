@@ -18,6 +18,7 @@ from llvmlite import ir
 from jaxrock.native.arrays import OF_FEW, is_one_place
 from jaxrock.native.lists import Memory, boxed, of_memory, unboxed
 from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
+from jaxrock.numerics.compound import is_compound, written
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
@@ -125,8 +126,11 @@ class Emitter:
 
     def _place(self, equation, inputs: list, active) -> list:
         """Apply an operation, before the loops that do not change its operands."""
-        if equation.primitive.name in WITH_PROGRAMS:
+        name = equation.primitive.name
+        if name in WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
+        if is_compound(name):
+            return self.run(written(name, [x.aval for x in equation.invars], equation.params), inputs, active)
         vectors = flat([x for x in inputs if not isinstance(x, Memory)])
         vectors += [start for x in inputs if isinstance(x, Memory) for start in x.starts or ()]
         depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
@@ -284,7 +288,7 @@ def is_known(equation) -> bool:
             return math.prod(shape) <= (SMALL if len(shape) == 1 else SMALL**2)
         if name in OF_FEW and name != "dynamic_slice":
             return is_one_place(equation) and all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
-        return name in OPERATIONS | MOVES | OF_FEW
+        return name in OPERATIONS | MOVES | OF_FEW or is_compound(name)
     programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
     return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
 

@@ -6,6 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.compound import compound
+
 Real = Inexact[Array, "..."]
 
 # Coefficients in x^2 of sin(x)/x and cos(x): interpolation at Chebyshev points of x^2 in [0, 3.2], errors below 3e-17.
@@ -67,11 +70,24 @@ def _horner(coefficients: tuple[float, ...], x: Real) -> Real:
     return total
 
 
-@jax.jit
 def sine_cosine(x: Real) -> tuple[Real, Real]:
     """Sine and cosine to rounding for |x| <= 1.78; beyond, the error grows (1e-11 at 3)."""
+    sine, cosine = _sine_cosine(x)
+    return sine, cosine
+
+
+def _near(x):
     square = x * x
-    return x * _horner(_SINE, square), _horner(_COSINE, square)
+    return [x * _horner(_SINE, square), _horner(_COSINE, square)]
+
+
+def _turned(operation, numbers, changes):
+    """The change of sine and cosine, as an operation gives both."""
+    (sine, cosine), (moved,) = operation(*numbers), changes
+    return [sine, cosine], [cosine * moved, -sine * moved]
+
+
+_sine_cosine = compound("sine_cosine", _near, _turned, results=2)
 
 
 @jax.jit
@@ -86,19 +102,28 @@ def sine_lag(x: Real) -> Real:
     return -_horner(_SINE[1:], x * x)
 
 
-@jax.jit
 def sine_cosine_of_any(x: Real) -> tuple[Real, Real]:
     """Sine and cosine of any angle, as exact as the angle itself is rounded."""
+    sine, cosine = _sine_cosine_of_any(x)
+    return sine, cosine
+
+
+def _anywhere(x):
     half_turns = jnp.round(x * (1 / math.pi))
-    sine, cosine = sine_cosine((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the rest of pi
+    sine, cosine = _near((x - half_turns * math.pi) - half_turns * 1.2246467991473532e-16)  # the rest of pi
     sign = 1 - 2 * jnp.abs(half_turns - 2 * jnp.round(half_turns / 2))
-    return sign * sine, sign * cosine
+    return [sign * sine, sign * cosine]
 
 
-@jax.jit
+_sine_cosine_of_any = compound("sine_cosine_of_any", _anywhere, _turned, results=2)
+
+
 def logarithm(x: Real) -> Real:
     """Natural logarithm of a positive normal number, to a few units of rounding."""
-    x = jnp.asarray(x)
+    return _logarithm(x)[0]
+
+
+def _logarithm_written(x):
     info = jnp.finfo(x.dtype)
     one, bias = 1 << info.nmant, info.maxexp - 1
     bits = jax.lax.bitcast_convert_type(x, jnp.int64 if info.bits == 64 else jnp.int32)
@@ -107,13 +132,22 @@ def logarithm(x: Real) -> Real:
     part = jax.lax.bitcast_convert_type(bits - power * one, x.dtype)
     ratio = (part - 1) / (part + 1)
     square = ratio * ratio
-    return power.astype(x.dtype) * math.log(2) + 2 * ratio * _horner(_LOGARITHM, square)
+    return [power.astype(x.dtype) * math.log(2) + 2 * ratio * _horner(_LOGARITHM, square)]
 
 
-@jax.jit
+def _logarithm_changed(operation, numbers, changes):
+    return operation(*numbers), [changes[0] / numbers[0]]
+
+
+_logarithm = compound("logarithm", _logarithm_written, _logarithm_changed)
+
+
 def exponential(x: Real) -> Real:
     """exp(x), to a few units of rounding; zero where it is no normal number."""
-    x = jnp.asarray(x)
+    return _exponential(x)[0]
+
+
+def _exponential_written(x):
     info = jnp.finfo(x.dtype)
     power = jnp.round(jnp.clip(x / math.log(2), info.minexp - 1, info.maxexp))
     # ln 2 in two parts: the products with the first are exact.
@@ -126,7 +160,15 @@ def exponential(x: Real) -> Real:
     # In two parts: 2^1024 is no number, but exp(709) is.
     half = jnp.floor(power * 0.5)
     value = _horner(_EXPONENTIAL, rest) * power_of_two(half) * power_of_two(power - half)
-    return jnp.where(power < info.minexp, 0.0, jnp.where(x > math.log(2) * info.maxexp, jnp.inf, value))
+    return [where(power < info.minexp, 0.0, where(x > math.log(2) * info.maxexp, jnp.inf, value))]
+
+
+def _exponential_changed(operation, numbers, changes):
+    (value,) = operation(*numbers)
+    return [value], [value * changes[0]]
+
+
+_exponential = compound("exponential", _exponential_written, _exponential_changed)
 
 
 @jax.jit
@@ -134,7 +176,7 @@ def exponential_less_one(x: Real) -> Real:
     """exp(x) - 1, to a few units of rounding of the result."""
     x = jnp.asarray(x)
     near = x * _horner(tuple(c / (k + 1) for k, c in enumerate(_EXPONENTIAL)), x)
-    return jnp.where(jnp.abs(x) < 0.346, near, exponential(x) - 1)
+    return where(jnp.abs(x) < 0.346, near, exponential(x) - 1)
 
 
 @jax.jit
@@ -155,17 +197,17 @@ def arctangent_of(y: Real, x: Real) -> Real:
     """The angle of the point (x, y), in [-pi, pi], to a few units of rounding; zeros have signs, as in C."""
     high, wide = jnp.abs(y), jnp.abs(x)
     steep = high > wide
-    small, large = jnp.where(steep, wide, high), jnp.where(steep, high, wide)
-    share = jnp.where(small == large, jnp.where(large > 0, 1.0, 0.0), small / large)
+    small, large = where(steep, wide, high), where(steep, high, wide)
+    share = where(small == large, where(large > 0, 1.0, 0.0), small / large)
     beyond = share > 0.41421356237309503  # tan(pi/8)
-    part = jnp.where(beyond, (share - 1) / (share + 1), share)
+    part = where(beyond, (share - 1) / (share + 1), share)
     angle = part * _horner(_ARCTANGENT, part * part)
     # Quarters of pi, and what they lack.
-    angle = jnp.where(beyond, (angle + 3.061616997868383e-17) + math.pi / 4, angle)
-    angle = jnp.where(steep, (6.123233995736766e-17 - angle) + math.pi / 2, angle)
-    angle = jnp.where(_is_negative(x), (1.2246467991473532e-16 - angle) + math.pi, angle)
-    angle = jnp.where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, angle)
-    return jnp.where(_is_negative(y), -angle, angle)
+    angle = where(beyond, (angle + 3.061616997868383e-17) + math.pi / 4, angle)
+    angle = where(steep, (6.123233995736766e-17 - angle) + math.pi / 2, angle)
+    angle = where(_is_negative(x), (1.2246467991473532e-16 - angle) + math.pi, angle)
+    angle = where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, angle)
+    return where(_is_negative(y), -angle, angle)
 
 
 @jax.jit
@@ -179,10 +221,10 @@ def hyperbolic_arctangent(x: Real) -> Real:
     """artanh(x), to a few units of rounding; infinite at the ends."""
     size = jnp.abs(x)
     near = size * _horner(_LOGARITHM, x * x)
-    inside = 0.5 * logarithm((1 + size) / (1 - jnp.where(size < 1, size, 0.0)))
-    far = jnp.where(size < 1, inside, jnp.where(size == 1, jnp.inf, jnp.nan))
-    value = jnp.where(size < 0.17, near, far)
-    return jnp.where(x < 0, -value, value)
+    inside = 0.5 * logarithm((1 + size) / (1 - where(size < 1, size, 0.0)))
+    far = where(size < 1, inside, where(size == 1, jnp.inf, jnp.nan))
+    value = where(size < 0.17, near, far)
+    return where(x < 0, -value, value)
 
 
 @jax.jit
@@ -192,16 +234,16 @@ def hyperbolic_arcsine(x: Real) -> Real:
     inside = jnp.minimum(size, 1e9)  # beyond, arsinh is log(2 x) to rounding
     root = jnp.sqrt(inside * inside + 1)
     near = hyperbolic_arctangent(jnp.minimum(inside, 0.2) / root)
-    finite = jnp.where(size < jnp.inf, jnp.maximum(size, 1e9), 1.0)
-    far = jnp.where(size < jnp.inf, logarithm(jnp.where(size < 1e9, inside + root, finite)), jnp.inf)
-    far = far + jnp.where(size < 1e9, 0.0, math.log(2))
-    value = jnp.where(size < 0.17, near, far)
-    value = jnp.where(x < 0, -value, value)
-    return jnp.where(x == x, value, jnp.nan)
+    finite = where(size < jnp.inf, jnp.maximum(size, 1e9), 1.0)
+    far = where(size < jnp.inf, logarithm(where(size < 1e9, inside + root, finite)), jnp.inf)
+    far = far + where(size < 1e9, 0.0, math.log(2))
+    value = where(size < 0.17, near, far)
+    value = where(x < 0, -value, value)
+    return where(x == x, value, jnp.nan)
 
 
 @jax.jit
 def hyperbolic_tangent(x: Real) -> Real:
     """tanh(x), to a few units of rounding."""
     grown = exponential_less_one(2 * jnp.minimum(jnp.abs(x), 30.0))
-    return jnp.where(x < 0, -grown, grown) / (grown + 2)
+    return where(x < 0, -grown, grown) / (grown + 2)

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Int, Shaped
 
+from jaxrock.numerics.choice import where
+
 _FEW = 8
 
 
@@ -13,7 +15,7 @@ def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Arr
         return values[index]
     value = values[0]
     for i in range(1, values.shape[0]):
-        value = jnp.where(index >= i, values[i], value)
+        value = where(index >= i, values[i], value)
     return value
 
 
@@ -27,7 +29,7 @@ def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Ar
         low, high = carry
         middle = (low + high) >> 1
         below = values[middle] <= x
-        return jnp.where(below, middle + 1, low), jnp.where(below, high, middle)
+        return where(below, middle + 1, low), where(below, high, middle)
 
     ends = jnp.int32(0), jnp.int32(values.shape[0])
     return jax.lax.while_loop(lambda carry: carry[0] < carry[1], halved, ends)[0]

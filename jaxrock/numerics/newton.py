@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.polynomial import jet, tangent
 from jaxrock.numerics.xla_cpu import keep
 
@@ -20,11 +21,11 @@ _SETTLED, _MORE = 1e-10, 6
 
 def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
     """The root in [0, 1] of a parabola or, if the `slopes` at both ends are known, of a cubic (about)."""
-    sign = jnp.where(values[0] > 0, 1.0, -1.0)
+    sign = where(values[0] > 0, 1.0, -1.0)
     value, slope, fall = sign * values[0], sign * slopes[0], sign * values[1]
     curvature = fall - value - slope
     root = jnp.sqrt(jnp.maximum(slope * slope - 4 * value * curvature, 0.0))
-    share = jnp.where(slope > 0, slope + root, 2 * value) / jnp.where(slope > 0, -2 * curvature, root - slope)
+    share = where(slope > 0, slope + root, 2 * value) / where(slope > 0, -2 * curvature, root - slope)
     share = jnp.clip(share, 0.0, 1.0)
     if slopes[1] is None:
         return share

@@ -1,17 +1,20 @@
 """Polynomials on [0, 1] as lists of coefficients, and their first sign change, certified.
 
-A list entry is a scalar (or, under vmap, one per lane); the lists have fixed length, so that every
-operation unrolls into straight-line code that vectorises over lanes.
+A list entry is a scalar (or, under vmap, one per lane). What is done with all coefficients of a list is one operation
+of JAX (`compound`), which is written out where it is compiled.
 """
 
 import functools
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Inexact
 
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.compound import Zero, compound
 from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
@@ -20,6 +23,10 @@ Flag = Bool[Array, ""]
 
 def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
     """Coefficients in x/length from those in x."""
+    return _rescaled(length, *coefficients)
+
+
+def _rescaled_written(length, *coefficients):
     scaled, power = [coefficients[0]], length
     for c in coefficients[1:]:
         scaled.append(c * power)
@@ -27,19 +34,77 @@ def rescaled(coefficients: list[Scalar], length: Scalar) -> list[Scalar]:
     return scaled
 
 
-@functools.partial(jax.jit, static_argnums=2)
+_rescaled = compound("rescaled", _rescaled_written, results=lambda count: count - 1)
+
+
+def _polynomial(x, *coefficients, derivatives: int):
+    """Value and derivatives; those of a degree that it does not have are zero."""
+    *lower, first = coefficients or [jnp.zeros_like(x)]
+    values = [first]
+    for c in reversed(lower):
+        higher = [value * x for value in values]
+        values = [higher[0] + c, *(a + b for a, b in zip(higher[1:], values)), *values[-1:]][: derivatives + 1]
+    values = [math.factorial(j) * value if j > 1 else value for j, value in enumerate(values)]
+    return values + [jnp.zeros_like(first)] * (derivatives + 1 - len(values))
+
+
+def _polynomial_changed(polynomial, numbers, changes, derivatives: int):
+    (x, *coefficients), (moved, *others) = numbers, changes
+    still = type(moved) is Zero
+    values = polynomial(x, *coefficients, derivatives=derivatives if still else derivatives + 1)
+    change = [0.0] * (derivatives + 1) if still else [moved * slope for slope in values[1:]]
+    while others and type(others[-1]) is Zero:
+        others.pop()
+    if others:
+        others = [jnp.zeros_like(c) if type(d) is Zero else d for c, d in zip(coefficients, others)]
+        own = polynomial(x, *others, derivatives=derivatives)
+        change = own if still else [a + b for a, b in zip(change, own)]
+    values = values[: derivatives + 1]
+    return values, [jnp.broadcast_to(d, value.shape) for d, value in zip(change, values)]
+
+
+polynomial = compound("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
+
+
 def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
     """Value and the first derivatives of a polynomial at x."""
-    values = [jnp.zeros_like(x)] * (derivatives + 1)
-    for c in reversed(coefficients):
-        for j in range(derivatives, 0, -1):
-            values[j] = values[j] * x + values[j - 1]
-        values[0] = values[0] * x + c
-    factorial = 1
-    for j in range(2, derivatives + 1):
-        factorial *= j
-        values[j] = factorial * values[j]
-    return values
+    return polynomial(x, *coefficients, derivatives=derivatives)
+
+
+def _total(terms: list) -> Any:
+    """Their sum, from the middle outwards: in products of series the outer terms are the newest, and the sum of the
+    others need not wait for them."""
+    middle = (len(terms) - 1) / 2
+    first, *rest = sorted(range(len(terms)), key=lambda place: abs(place - middle))
+    return sum((terms[place] for place in rest), start=terms[first])
+
+
+def _sum_of_products(*factors):
+    half = len(factors) // 2
+    return [_total([a * b for a, b in zip(factors[:half], factors[half:])])]
+
+
+def _sum_of_products_changed(operation, numbers, changes):
+    half, moved = len(numbers) // 2, []
+    for here, there in ((0, half), (half, 0)):
+        pairs = [(changes[here + k], numbers[there + k]) for k in range(half) if type(changes[here + k]) is not Zero]
+        moved += operation(*(x for x, _ in pairs), *(y for _, y in pairs)) if pairs else []
+    (value,) = operation(*numbers)
+    return [value], [jnp.broadcast_to(sum(moved[1:], start=moved[0]), value.shape)]
+
+
+_products = compound("sum_of_products", _sum_of_products, _sum_of_products_changed)
+
+
+def sum_of_products(first: list, second: list) -> Scalar:
+    """The sum of the products of numbers of two lists of one length."""
+    return _products(*first, *second)[0]
+
+
+def product_term(first: list, second: list, k: int) -> Any:
+    """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
+    pairs = [(first[j], second[k - j]) for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
+    return sum_of_products(*map(list, zip(*pairs))) if pairs else 0.0
 
 
 def tangent(coefficients: list[Scalar], x: Scalar) -> tuple[Scalar, Scalar]:
@@ -65,46 +130,49 @@ def derivative(coefficients: list[Scalar]) -> list[Scalar]:
     return [k * c for k, c in enumerate(coefficients)][1:]
 
 
-@jax.jit
 def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
     """Value of a polynomial at x."""
-    total = coefficients[-1]
-    for c in reversed(coefficients[:-1]):
-        total = total * x + c
-    return total
+    return polynomial(x, *coefficients, derivatives=0)[0]
 
 
-@jax.jit
 def keeps_sign(coefficients: list[Scalar], sign: Scalar, length: Scalar) -> Scalar:
     """Positive only if sign times the polynomial is certainly positive on (0, length].
 
     As long as the leading coefficients are not negative, x^m times their sum is a lower bound of
     their part; every later negative coefficient takes away at most its size times x^m.
     """
+    return _keeps_sign(length, sign, *coefficients)[0]
+
+
+def _keeps_sign_written(length, sign, *coefficients):
     leading, kept = jnp.ones_like(sign, bool), []
     for k, c in enumerate(coefficients):
         term = sign * c
-        leading = leading & (term >= 0) if k < 4 else jnp.zeros_like(leading)
-        kept.append(jnp.where(leading, term, jnp.minimum(term, 0.0)) if k < 4 else jnp.minimum(term, 0.0))
-    return horner(kept, length)
+        least = jnp.minimum(term, 0.0)
+        if k < 4:
+            leading = leading & (term >= 0)
+            least = where(leading, term, least)
+        kept.append(least)
+    return _polynomial(length, *kept, derivatives=0)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _falls(coefficients: list[Scalar], sign: Scalar, order: int) -> list[Scalar]:
-    """Coefficients of a bound of how negative this derivative of sign times the polynomial can be from 0 on."""
-    falls = []
-    for k, c in enumerate(coefficients[order:], start=order):
-        weight = 1
-        for j in range(order):
-            weight *= k - j
-        falls.append(weight * jnp.maximum(-sign * c, 0.0))
-    return falls or [jnp.zeros_like(sign)]
+_keeps_sign = compound("keeps_sign", _keeps_sign_written)
 
 
-@functools.partial(jax.jit, static_argnums=2)
 def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
     """How negative the derivative of this order of sign times the polynomial can be on [0, length] at most."""
-    return horner(_falls(coefficients, sign, order), length)
+    if len(coefficients) <= order:
+        return jnp.zeros_like(sign)
+    return _fall_bound(length, sign, *coefficients[order:], order=order)[0]
+
+
+def _fall_bound_written(length, sign, *coefficients, order: int):
+    weights = (math.perm(k, order) for k in range(order, order + len(coefficients)))
+    falls = [weight * jnp.maximum(-sign * c, 0.0) for weight, c in zip(weights, coefficients)]
+    return _polynomial(length, *falls, derivatives=0)
+
+
+_fall_bound = compound("fall_bound", _fall_bound_written)
 
 
 def last_size(coefficients: list[Scalar]) -> Scalar:
@@ -122,7 +190,7 @@ def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -
     order, last = len(coefficients) - 1, last_size(coefficients)
     tiny = jnp.finfo(last.dtype).tiny
     ratio = size / jnp.maximum(last, tiny)
-    return jnp.minimum(jnp.where(last > tiny, root_of(ratio, order), jnp.inf), cap)
+    return jnp.minimum(where(last > tiny, root_of(ratio, order), jnp.inf), cap)
 
 
 def root_of(value: Scalar, degree: int) -> Scalar:
@@ -158,17 +226,19 @@ class Landing(NamedTuple):
     hits: list[Flag]
 
 
-@jax.jit
-def _clear_length(value: Scalar, slope: Scalar, fall: Scalar) -> Scalar:
+def _clear_length_written(value, slope, fall):
     """Length on which value + slope x - fall x^2/2 stays positive: no zero can hide there."""
     root = jnp.sqrt(jnp.maximum(slope * slope + 2 * fall * value, 0.0))
     rising = slope > 0
     # The zero of the parabola without cancellation: of its two forms the one that adds.
-    sum_ = keep(jnp.where(rising, slope + root, slope - root), fall)
-    above, below = jnp.where(rising, sum_, 2 * value), jnp.where(rising, fall, -sum_)
+    sum_ = keep(where(rising, slope + root, slope - root), fall)
+    above, below = where(rising, sum_, 2 * value), where(rising, fall, -sum_)
     # Nothing pulls it down: clear for ever, unless it is at zero and does not rise.
-    endless = jnp.where((value > 0) | rising, jnp.inf, 0.0)
-    return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), endless)
+    endless = where((value > 0) | rising, jnp.inf, 0.0)
+    return [where(below > 0, above / where(below > 0, below, 1.0), endless)]
+
+
+_clear_length = compound("clear_length", _clear_length_written)
 
 
 def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
@@ -181,7 +251,6 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     march together under vmap, as long as the slowest). It has no derivatives.
     """
     highest = max(w.derivative for w in watches) + 1
-    falls = [_falls(coefficients, w.sign, w.derivative + 2) for w in watches]
     eps = jnp.finfo(start.dtype).eps
 
     def clear(x, radius):
@@ -189,11 +258,13 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
         values, end = jet(coefficients, x, highest), jnp.minimum(x + radius, 1.0)
         lengths = [
             _clear_length(
-                w.sign * (values[w.derivative] - w.offset), w.sign * values[w.derivative + 1], horner(fall, end)
-            )
-            for w, fall in zip(watches, falls)
+                w.sign * (values[w.derivative] - w.offset),
+                w.sign * values[w.derivative + 1],
+                fall_bound(coefficients, w.sign, w.derivative + 2, end),
+            )[0]
+            for w in watches
         ]
-        return [jnp.where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
+        return [where(w.active, length, jnp.inf) for w, length in zip(watches, lengths)]
 
     def march(carry):
         x, radius, _, count = carry
@@ -223,4 +294,4 @@ def _(primals, tangents):
     moved = [jnp.zeros_like(x) if isinstance(d, SymbolicZero) else d for d in d_forcing]
     slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
     lack = (0.0 if isinstance(d_level, SymbolicZero) else d_level) - horner(moved, x)
-    return x, jnp.where(slope == 0, 0.0, lack / jnp.where(slope == 0, 1.0, slope))
+    return x, where(slope == 0, 0.0, lack / where(slope == 0, 1.0, slope))

@@ -3,21 +3,41 @@
 On CPUs, XLA computes a cheap value again in every loop that uses it, so that a series, whose terms each use all before,
 would be computed dozens of times a step. A division is never repeated: what many use is divided by a one that the
 compiler cannot see. Both are primitives of JAX, which become operations where XLA lowers them for a CPU; everywhere
-else, and in machine code of our own, they are the value itself.
+else they are the value itself, and where it is known that a program is for machine code of our own, it has none.
 """
 
-import jax
+import contextlib
+import contextvars
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 _one_p, _keep_p = Primitive("unseen_one"), Primitive("keep")
+_marks = contextvars.ContextVar("marks", default=True)
+
+
+def are_marked() -> bool:
+    """Whether values are marked in what is traced now."""
+    return _marks.get()
+
+
+@contextlib.contextmanager
+def marking(wanted: bool) -> Iterator[None]:
+    """Within it values are marked, or are not."""
+    before = _marks.set(wanted)
+    try:
+        yield
+    finally:
+        _marks.reset(before)
 
 
 def unseen_one(witness):
     """The number one, in a way that the compiler cannot see; `witness`: a number that is known at run time only and
     never negative."""
-    return _one_p.bind(jax.lax.stop_gradient(jnp.asarray(witness)))
+    witness = jnp.asarray(witness)
+    return _one_p.bind(witness) if are_marked() else jnp.ones_like(witness)
 
 
 def keep_by(value, one):
@@ -32,11 +52,13 @@ def keep(value, witness):
 
 def keep_flag(flag, witness):
     """As `keep`, of a condition."""
-    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5
+    return keep(jnp.where(flag, 1.0, 0.0).astype(jnp.asarray(witness).dtype), witness) > 0.5 if are_marked() else flag
 
 
 def _marked(value, witness, by_one: bool):
-    value, witness = jnp.asarray(value), jax.lax.stop_gradient(jnp.asarray(witness))
+    if not are_marked():
+        return value
+    value, witness = jnp.asarray(value), jnp.asarray(witness)
     if not jnp.issubdtype(value.dtype, jnp.inexact):
         return value
     witness = jnp.broadcast_to(witness.astype(value.dtype), value.shape)

@@ -23,6 +23,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.joined_records import is_in_place
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
+from jaxrock.numerics.choice import where
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.status import Status, marked_result
@@ -231,18 +232,18 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
     overturned = final.overturned
 
     def unless_overturned(value):
-        return jnp.where(overturned, jnp.inf, value)
+        return where(overturned, jnp.inf, value)
 
     tie = final.peak - final.second <= 1e-9 * final.peak
     # A block that stands still in balance goes nowhere, however many steps it takes.
     eps = jnp.finfo(state.closeness.dtype).eps
     unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
     graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
-    margin = jnp.where(overturned, -final.closeness_beyond, final.closeness)
+    margin = where(overturned, -final.closeness_beyond, final.closeness)
     status = Status.where(state.done, final.status, unfinished)
     return Outcome(
         differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
-        clearance=jnp.where(overturned, final.clearance, final.peak_clearance),
+        clearance=where(overturned, final.clearance, final.peak_clearance),
         max_rotation=unless_overturned(final.peak),
         max_velocity=unless_overturned(final.fastest * stepper.scene.p),
         time_of_max=unless_overturned(final.peak_time),

@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
+from jaxrock.numerics.xla_cpu import marking
 from jaxrock.transforms.recipe import Recipe
 
 native: Any = None
@@ -109,7 +110,8 @@ class Lanes:
         alone = self.size is None
         key = quick, own, alone
         if key not in self.recipe.plans:
-            program = self.recipe.quick if quick else self.recipe.program
+            with marking(False):
+                program = self.recipe.quick if quick else self.recipe.program
             self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled, alone)
         return self.recipe.plans[key]
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Bool, PyTree
 
-from jaxrock.numerics.xla_cpu import keep
+from jaxrock.numerics.xla_cpu import are_marked, keep
 
 Flag = Bool[ArrayLike, ""]
 
@@ -20,8 +20,12 @@ def when(needed: Flag, function: Callable, value: PyTree) -> PyTree:
 
     def body(carry):
         first, value = carry
-        # The flag changes in the loop: what depends on it stays in the loop.
-        return jnp.zeros_like(first), function(value, first, lambda x: keep(x, jnp.where(first, 0.0, -1.0)))
+
+        def inside(x):
+            # The flag changes in the loop: what depends on it stays in the loop.
+            return keep(x, jnp.where(first, 0.0, -1.0)) if are_marked() else x
+
+        return jnp.zeros_like(first), function(value, first, inside)
 
     return jax.lax.while_loop(lambda carry: carry[0], body, (needed, value))[1]
 

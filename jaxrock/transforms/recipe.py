@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.interpreters import partial_eval
 
 from jaxrock._garbage import not_collected
 from jaxrock.keeping.folder import name_of
+from jaxrock.numerics.xla_cpu import are_marked
 from jaxrock.transforms.fingerprint import Program
 
 
@@ -72,32 +74,39 @@ class Recipe:
         self.function, self.structure, self.like, self.order = function, structure, tuple(like), order
         self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
         self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
-        self.plain, self.plans, self._derivatives = plain, {}, {}  # the last two: what has been made of it
+        self.plain = plain
+        self.plans, self._derivatives, self._programs = {}, {}, {}  # what has been made of it
 
-    @functools.cached_property
-    def _traced(self) -> tuple[ClosedJaxpr, Any]:
-        return self._trace(self.function)
+    def _traced(self, quick: bool) -> tuple[ClosedJaxpr, Any]:
+        key = quick, are_marked()
+        if key not in self._programs:
+            self._programs[key] = self._trace(self.passes.at_once if quick and self.passes else self.function)
+        return self._programs[key]
 
     def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
         # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
         # takes those that tell of the mesh of a `shard_map`, and those that do not, for different ones.
         with not_collected(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            return jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)(*self.like)
+            made = jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)
+            program, shapes = made(*self.like)
+        needed, _ = partial_eval.dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
+        return ClosedJaxpr(needed, program.consts), shapes
 
     @property
     def program(self) -> ClosedJaxpr:
-        """The function as JAX traces it, from leaves to leaves."""
-        return self._traced[0]
+        """The function as JAX traces it, from leaves to leaves, without what nobody needs; with marks for XLA on CPUs
+        (`numerics.xla_cpu`) where there are any now."""
+        return self._traced(quick=False)[0]
 
-    @functools.cached_property
+    @property
     def quick(self) -> ClosedJaxpr | None:
         """The quick pass, from leaves to leaves; the last tells whether it is postponed."""
-        return self._trace(self.passes.at_once)[0] if self.passes and self.passes.quickly else None
+        return self._traced(quick=True)[0] if self.passes and self.passes.quickly else None
 
     @property
     def results(self) -> Any:
         """What it returns, a tree of `jax.ShapeDtypeStruct`."""
-        return self._traced[1] if self._results is None else self._results
+        return self._traced(quick=False)[1] if self._results is None else self._results
 
     def __call__(self, leaves: Sequence) -> list:
         """Compute it for one scene."""

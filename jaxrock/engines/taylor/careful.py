@@ -29,14 +29,16 @@ from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
 from jaxrock.engines.taylor.policy import POLICY, exact
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.polynomial import (
     Watch,
     derivative,
-    fall_bound,
     first_event,
     jet,
     keeps_sign,
@@ -133,7 +135,7 @@ class TaylorStepper(AbstractStepper):
         resting = state.side == 0
         waited = wait(self, state, shaking, unit, self.order, self.tolerance, when)
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
-        return checked(self, state, jax.tree.map(lambda a, b: jnp.where(resting, a, b), waited, rocked))
+        return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
 
     def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
@@ -156,25 +158,29 @@ class TaylorStepper(AbstractStepper):
             none = FreeStage.none(state.opening)
             stage = jax.lax.cond(moving, lambda: free_stage(*start), lambda: none)
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
-        beyond = jnp.where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
+        beyond = where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
         # The energy that is missing to the saddle, 2 (E_saddle - E), and what it may be off.
         slope = -2 * moments.restoring(Angle.of(state.opening))
         off = state.spread.error_of(slope, -2 * state.velocity)
         toss_up = moving & (jnp.abs(stage.deficit) <= self.doubt * off * stage.share)
+        # One that stands still in balance, within the error of the state, has no excursion that decides.
+        toss_up = toss_up | (
+            moving & (slope**2 / 4 + state.velocity**2 <= self.doubt**2 * state.spread.variance(1.0, 1.0))
+        )
         toss_up = toss_up & (state.status == Status.successful)
         flat = stage.peak_steepness <= 0
-        error = jnp.where(flat, off, off * stage.peak_share / jnp.where(flat, 1.0, stage.peak_steepness))
+        error = where(flat, off, off * stage.peak_share / where(flat, 1.0, stage.peak_steepness))
         return replace(
             state,
             overturned=state.overturned | stage.overturned,
             closeness=jnp.minimum(state.closeness, stage.closeness),
             closeness_beyond=beyond,
-            peak=jnp.where(stage.peak > state.peak, stage.peak, state.peak),
+            peak=where(stage.peak > state.peak, stage.peak, state.peak),
             second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
-            peak_clearance=jnp.where(stage.peak > state.peak, state.clearance, state.peak_clearance),
-            peak_time=jnp.where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
-            error=jax.lax.stop_gradient(jnp.where(higher, error, state.error)),
+            peak_clearance=where(stage.peak > state.peak, state.clearance, state.peak_clearance),
+            peak_time=where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
+            error=fixed(where(higher, error, state.error)),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
@@ -207,7 +213,7 @@ class TaylorStepper(AbstractStepper):
         # More room than a step can take is as good as endless, and finite.
         start, room = self.start(state, shaking, unit), jnp.minimum(self.room(state), 32 * unit) / unit
         # Where to step to is found without derivatives; then the end moves as the flow and the event tell.
-        stepper, before, begin, reach = jax.lax.stop_gradient((self, state, start, room))
+        stepper, before, begin, reach = fixed((self, state, start, room))
         step = _Step.of(stepper, before, begin, reach, rocking)
         cut = when(step.eventful, lambda cut, *when: stepper._cut(before, step, *when), step.whole)
         hits = cut.hits
@@ -228,9 +234,9 @@ class TaylorStepper(AbstractStepper):
         piece, local, over = self.move_on(state, elapsed, full)
         lost = escaped(self, state, start.angle)
         moved = (step.length > 0) & rocking
-        time = jnp.where(step.length > 0, step.length * start.stretch, jnp.inf)
+        time = where(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
-        exact = landed(self.scene, hits, opening, jnp.where(moved, velocity, state.velocity))
+        exact = landed(self.scene, hits, opening, where(moved, velocity, state.velocity))
         passed = replace(
             state,
             spread=errors_after(self, state, start.angle, shaking.now, elapsed, missed),
@@ -240,8 +246,8 @@ class TaylorStepper(AbstractStepper):
             velocity=exact[1],
             beyond=state.beyond ^ hits.saddle,
             uplifting=state.uplifting & ~moved,
-            extremal=jnp.where(moved, hits.extremum, state.extremal),
-            fastest=jnp.where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
+            extremal=where(moved, hits.extremum, state.extremal),
+            fastest=where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
             done=over,
         )
 
@@ -262,7 +268,7 @@ class TaylorStepper(AbstractStepper):
         length, saddle = inside(step.length), self.scene.moments.saddle
         scaled = [inside(c) for c in rescaled(step.coefficients, length)]
         one = jnp.ones_like(length)
-        signs = Events(one, *step.signs, jnp.where(state.beyond, 1.0, -1.0), -one)
+        signs = Events(one, *step.signs, where(state.beyond, 1.0, -1.0), -one)
         below = state.opening < jnp.pi / 2 if self.history else None  # an outcome needs no fall down to the ground
         wanted = Events(True, ~step.monotone | self._matters(state, scaled), step.faster, True, below)
         watches = [
@@ -270,7 +276,7 @@ class TaylorStepper(AbstractStepper):
             for watched, sign, active in zip(WATCHED, signs, wanted)
             if active is not None
         ]
-        landing = first_event(scaled, watches, _clear_start(state, scaled, saddle), needed)
+        landing = first_event(scaled, watches, clear_start(state, scaled, saddle), needed)
         opening, speed, acceleration = landing.jet[0], landing.jet[1] / length, landing.jet[2] / length**2
         never = [jnp.zeros_like(landing.hits[0])] * (len(Events._fields) - len(watches))
         hits = Events(*landing.hits, *never)
@@ -289,7 +295,7 @@ class TaylorStepper(AbstractStepper):
         unit = start.stretch / self.scene.p
         steepest = jax.tree.map(lambda rate: rate / unit, shaking.steepest(step.length))
         reach = (step.length - length) * unit
-        return impact(self, noted, hits.impact, velocity, ground, *jax.lax.stop_gradient((steepest, reach)))
+        return impact(self, noted, hits.impact, velocity, ground, *fixed((steepest, reach)))
 
     def _matters(self, state: State, scaled) -> Flag:
         """Whether the only turning point of this step could be a new peak, or closer to overturning than before."""
@@ -299,8 +305,8 @@ class TaylorStepper(AbstractStepper):
         # The opening angle stays below c0 + c1 x - fall x^2, whose top is c0 + c1^2/(4 fall).
         moments = self.scene.moments
         fall = -scaled[2] - sum(jnp.maximum(c, 0.0) for c in scaled[3:])
-        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * jnp.where(fall > 0, fall, 1.0))
-        top = jnp.where(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
+        rise = jnp.maximum(scaled[1], 0.0) ** 2 / (4 * where(fall > 0, fall, 1.0))
+        top = where(fall > 0, jnp.minimum(state.opening + rise, moments.saddle), moments.saddle)
         least = (moments.restoring(Angle.of(top)) / moments.restoring_at_rest) ** 2
         inward = state.velocity < 0  # it may graze the ground
         return inward | state.beyond | (top >= 0.999 * state.peak) | (least < state.closeness)  # also a near tie
@@ -340,15 +346,13 @@ class _Step(NamedTuple):
         size = jnp.minimum(scene.alpha, size)
         length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, 16.0))
         full = length >= room * (1 - 1e-9)
-        length = keep(jnp.where(full, room, length), state.local)
+        length = keep(where(full, room, length), state.local)
         opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
 
-        signs = _signs(state, coefficients)
+        signs = signs_at_start(state, coefficients)
         turning = keep(keeps_sign(derivative(coefficients), signs[0], length), state.local) <= 0
         crossing = (opening >= scene.moments.saddle) != state.beyond
-        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(
-            _overshoot(coefficients, length), state.local
-        )
+        top = jnp.maximum(jnp.abs(coefficients[1]), jnp.abs(speed)) + keep(overshoot(coefficients, length), state.local)
         monotone = keep(keeps_sign(derivative(derivative(coefficients)), signs[1], length), state.local) > 0
         faster = (top > state.fastest * start.stretch) & ~monotone
         eventful = turning | crossing | faster | (opening <= 0)
@@ -366,34 +370,3 @@ class _Step(NamedTuple):
             eventful=eventful & rocking & (length > 0),
             whole=_Cut(length, opening, speed, jnp.zeros_like(speed), Events(*[jnp.zeros_like(full)] * 5)),
         )
-
-
-def _signs(state: State, coefficients) -> tuple[Scalar, Scalar]:
-    """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
-
-    def of(value, following):
-        return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
-
-    velocity = jnp.where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
-    acceleration = of(jnp.where(state.extremal, 0.0, coefficients[2]), coefficients[3])
-    return velocity, jnp.where(state.uplifting, 1.0, acceleration)
-
-
-def _overshoot(coefficients: list[Scalar], length: Scalar) -> Scalar:
-    """How far the velocity can exceed its end values within a step (an eighth of its largest second derivative)."""
-    one = jnp.ones_like(length)
-    third = jnp.maximum(fall_bound(coefficients, one, 3, length), fall_bound(coefficients, -one, 3, length))
-    return third * length**2 / 8
-
-
-def _clear_start(state: State, scaled: list[Scalar], saddle: Scalar) -> Scalar:
-    """From where to look for events: a block that leaves rest has opening, velocity and (continuous motion)
-    acceleration zero at its start, and all three are positive up to here."""
-    one, zero = jnp.ones_like(saddle), jnp.zeros_like(saddle)
-    lead = jnp.where(state.uplifting, 3 * scaled[3], scaled[2])
-    rest = [zero, zero, zero, jnp.where(state.uplifting, 0.0, scaled[3]), *scaled[4:]]
-    tiny = jnp.finfo(saddle.dtype).tiny
-    clear = jnp.clip(lead / jnp.maximum(fall_bound(rest, one, 2), tiny), 0.0, 0.5)
-    below_saddle = jnp.sqrt(saddle / (4 * sum(jnp.abs(c) for c in scaled) + tiny))
-    leaving = (state.opening == 0) & (state.velocity == 0)
-    return jnp.where(leaving, jnp.minimum(clear, below_saddle), 0.0)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Inexact
 
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.numerics.choice import where
 
 Scalar = Inexact[Array, ""]
 _BETWEEN = POLICY.between_checkpoints
@@ -34,7 +35,7 @@ def on_tape(advance: Callable, shaking: Callable, state: State, budget: int) -> 
         # The same numbers; but the start of the step moves with what came before.
         moved = terms.shifted((state.local - local) / unit)
         after = advance(state, moved, unit)
-        return jax.tree.map(lambda a, b: jnp.where(state.done, a, b), state, after), state
+        return jax.tree.map(lambda a, b: where(state.done, a, b), state, after), state
 
     @jax.checkpoint
     def stretch(state, here):

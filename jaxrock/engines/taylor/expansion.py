@@ -6,6 +6,7 @@ parameters: derivatives cost a few products each. The end itself moves, too, whe
 """
 
 import functools
+import operator
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,8 @@ from jaxtyping import Array, Bool, Inexact
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.polynomial import product_term
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
 Scalar = Inexact[Array, ""]
@@ -66,20 +69,6 @@ class Expansion(NamedTuple):
     restoring: list[Scalar | None]
 
 
-def _total(terms: list) -> Any:
-    """Their sum, from the middle outwards: in products of series the outer terms are the newest, and the sum of the
-    others need not wait for them."""
-    middle = (len(terms) - 1) / 2
-    first, *rest = sorted(range(len(terms)), key=lambda place: abs(place - middle))
-    return sum((terms[place] for place in rest), start=terms[first])
-
-
-def _product(first: list, second: list, k: int) -> Any:
-    """Coefficient k of a product of series, of which coefficients may be missing (zero)."""
-    terms = [first[j] * second[k - j] for j in range(min(k, len(first) - 1) + 1) if second[k - j] is not None]
-    return _total(terms) if terms else 0.0
-
-
 def expand(start: Start, order: int) -> Expansion:
     """Series of x'' = -stretch^2 [(1 + v) restoring(x) + side u arm(x)].
 
@@ -97,25 +86,25 @@ def expand(start: Start, order: int) -> Expansion:
     now, last = now.plus(scaled), None
     for k in range(order - 1):
         if moments.trigonometric and k > 0:
-            sine.append(keep_by(_product(slopes, cosine, k - 1) * (1 / k), one))
-            cosine.append(keep_by(_product(slopes, sine, k - 1) * (-1 / k), one))
+            sine.append(keep_by(product_term(slopes, cosine, k - 1) * (1 / k), one))
+            cosine.append(keep_by(product_term(slopes, sine, k - 1) * (-1 / k), one))
         basis = Basis.of_term(k, x, sine, cosine)
         arm = moments.arm_terms.summed(basis, empty=None)
         arms.append(arm if arm is None else keep_by(arm, one))
         if straight:
             products = before[0].products(last) if before and last else []
-            moment = sum(products + now.products(basis), start=0.0)
+            moment = functools.reduce(operator.add, products + now.products(basis))
         else:
-            moment = _product(pushes, arms, k)
+            moment = product_term(pushes, arms, k)
             restoring = scaled.summed(basis, empty=None)
             moment = moment if restoring is None else moment + restoring
         last = basis
         if start.shaking.vertical is not None:
             restorings.append(moments.restoring_terms.summed(basis, empty=None))
-            moment = moment + scale * _product(start.shaking.vertical, restorings, k)
+            moment = moment + scale * product_term(start.shaking.vertical, restorings, k)
         slope = keep_by(moment * (1 / (k + 1)), one)
         if k == 0:
-            slope = jnp.where(start.uplifting, 0.0, slope)  # by continuity, exactly
+            slope = where(start.uplifting, 0.0, slope)  # by continuity, exactly
         slopes.append(slope)
         x.append(slope * (1 / (k + 2)))
     return Expansion(x, slopes, sine, cosine, arms, restorings)
@@ -140,7 +129,7 @@ def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like
     """A series times 1 + v, where the model has it."""
     if vertical is None or terms is None or len(terms) < order - 1:
         return terms
-    return [terms[k] + keep(_product(vertical, terms, k), like) for k in range(order - 1)]
+    return [terms[k] + keep(product_term(vertical, terms, k), like) for k in range(order - 1)]
 
 
 class _Sources(NamedTuple):
@@ -156,7 +145,7 @@ class _Sources(NamedTuple):
         arm = start.moments.arm_terms
         needed = arm.line is not None, arm.trigonometric, arm.trigonometric
         pushed = [
-            [keep(_product(horizontal, terms, k), start.stretch) for k in range(order - 1)] if wanted else None
+            [keep(product_term(horizontal, terms, k), start.stretch) for k in range(order - 1)] if wanted else None
             for wanted, terms in zip(needed, (series.opening, series.sine, series.cosine))
         ]
         constant = [jnp.ones_like(like)] + [None if vertical is None else jnp.zeros_like(like)] * (order - 2)
@@ -203,7 +192,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
             of_term[m] = keep(own[m] + sum(later, start=0.0), stretch)
             if m >= 2:
                 source = of_term[m] * scale * (1 / (m * (m - 1)))
-                of_source[m - 2] = keep(jnp.where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
+                of_source[m - 2] = keep(where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
         return of_term, of_source
 
     def of(own):
@@ -253,8 +242,8 @@ def _(order, primals, tangents):
     acceleration = start.stretch**2 * law
     d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinite, for the status to tell.
-    d_length = jnp.where(end.full, d_room, 0.0)
-    d_length = jnp.where(end.turns, -d_speed / jnp.where(end.turns, acceleration, 1.0), d_length)
-    d_length = jnp.where(end.meets, (d_level - d_opening) / jnp.where(end.meets, speed, 1.0), d_length)
+    d_length = where(end.full, d_room, 0.0)
+    d_length = where(end.turns, -d_speed / where(end.turns, acceleration, 1.0), d_length)
+    d_length = where(end.meets, (d_level - d_opening) / where(end.meets, speed, 1.0), d_length)
     moved = d_length, d_opening + speed * d_length, d_speed + acceleration * d_length
     return (length, opening, speed), tuple(jnp.broadcast_to(d, length.shape) for d in moved)

@@ -22,6 +22,7 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.newton import root_between
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
@@ -36,7 +37,7 @@ _FLAT, _TURN, _MEET = (6, 10), (5, 10), (5, 9)
 
 
 def _first_sign(value: Scalar, following: Scalar) -> Scalar:
-    return jnp.where(value != 0, jnp.sign(value), jnp.where(following < 0, -1.0, 1.0))
+    return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
 
 
 def _if(needed: Flag, function: Callable, otherwise):
@@ -60,7 +61,7 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     def shorter():
         share = jnp.zeros_like(length)
         for part in reversed(POLICY.shorter):
-            share = jnp.where(sure(part), part, share)
+            share = where(sure(part), part, share)
         return share
 
     return _if(~sure(1.0), shorter, jnp.ones_like(length))
@@ -88,9 +89,9 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
     short = ~(last_size(terms) * cap ** (len(terms) - 1) <= least)
     longest = _if(short, lambda: step_length(terms, least, cap), cap)
     reaches = longest >= room * (1 - 1e-9)
-    longest = keep_by(jnp.where(reaches, room, longest), one)
-    rises = jnp.where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
-    outward = jnp.where(start.uplifting, 1.0, _first_sign(before, rises))
+    longest = keep_by(where(reaches, room, longest), one)
+    rises = where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
+    outward = where(start.uplifting, 1.0, _first_sign(before, rises))
     share = keep_by(_certified(terms, longest, rises), one)
 
     def extremum(length):
@@ -98,7 +99,7 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
         has_extremum = rises * acceleration < 0
 
         def where_tangents_meet():
-            turn = jnp.where(has_extremum, first - acceleration, 1.0)
+            turn = where(has_extremum, first - acceleration, 1.0)
             return before + first * ((speed - before - acceleration * length) / turn)
 
         bound = _if(has_extremum, where_tangents_meet, before)
@@ -115,7 +116,7 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Pa
 
     def shorter():
         # Where the velocity may turn twice, the part ends about where the acceleration is zero.
-        length = keep_by(share * longest * first / jnp.where(twice, first - slowing, 1.0), one)
+        length = keep_by(share * longest * first / where(twice, first - slowing, 1.0), one)
         return length, *extremum(length)
 
     length, end, has_extremum, bound, still = _if(twice, shorter, whole)
@@ -129,11 +130,11 @@ def _leaving(start: Start, terms: list[Scalar], part: _Part) -> tuple:
     the block stands still there, and by its square where it leaves rest with no acceleration, either."""
     velocity, length = derivative(terms), part.length
     still = velocity[0] == 0
-    later = [jnp.where(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
-    left = [jnp.where(still, b, a) for a, b in zip(velocity, [*later, jnp.zeros_like(length)])]
-    power = jnp.where(start.uplifting, 2.0, jnp.where(still, 1.0, 0.0))
-    per_time = jnp.where(still, 1 / length, 0.0)
-    share = jnp.where(start.uplifting, per_time * per_time, jnp.where(still, per_time, 1.0))
+    later = [where(start.uplifting, b, a) for a, b in zip(velocity[1:], [*velocity[2:], jnp.zeros_like(length)])]
+    left = [where(still, b, a) for a, b in zip(velocity, [*later, jnp.zeros_like(length)])]
+    power = where(start.uplifting, 2.0, where(still, 1.0, 0.0))
+    per_time = where(still, 1 / length, 0.0)
+    share = where(start.uplifting, per_time * per_time, where(still, per_time, 1.0))
     slope = (part.acceleration - power * part.speed * per_time) * share
     return left, jnp.zeros_like(length), length, (left[0], part.speed * share), (left[1], slope)
 
@@ -175,11 +176,11 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     stops = ~early & turns & ((part.opening >= saddle) != (top >= saddle))
     impact = ~crossing & ((top <= 0) | (turns & ~stops & (part.opening <= 0)))
     crossing, impact, stops = (keep_flag(x, state.local) for x in (crossing, impact, stops))
-    level = jnp.where(crossing, saddle, 0.0)
-    low, high = jnp.where(early, 0.0, turn_at), jnp.where(early, turn_at, part.length)
-    at_low = jnp.where(early, terms[0], top) - level
-    at_high = jnp.where(early, top, part.opening) - level
-    slopes = jnp.where(early, terms[1], 0.0), jnp.where(early & turns, 0.0, part.speed)
+    level = where(crossing, saddle, 0.0)
+    low, high = where(early, 0.0, turn_at), where(early, turn_at, part.length)
+    at_low = where(early, terms[0], top) - level
+    at_high = where(early, top, part.opening) - level
+    slopes = where(early, terms[1], 0.0), where(early & turns, 0.0, part.speed)
 
     def meet():
         x, last = root_between(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
@@ -187,7 +188,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
         return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
 
     def at_end(of_turn, of_part):
-        return jnp.where(stops, of_turn, of_part)
+        return where(stops, of_turn, of_part)
 
     otherwise = at_end(turn_at, part.length), at_end(top, part.opening), at_end(zero, part.speed)
     otherwise = *otherwise, at_end(top_acceleration, part.acceleration), certain
@@ -206,7 +207,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
         x, last = root_between(
             _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
         )
-        return jnp.where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | ((last <= 1e-4 * x) & (x > 0))
+        return where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | ((last <= 1e-4 * x) & (x > 0))
 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
@@ -251,7 +252,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     elapsed = keep_by(at * unit, one)
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
-    time = jnp.where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
+    time = where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
     missed = _missed(stepper, terms, at, least)
     errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
@@ -274,9 +275,9 @@ def advance(stepper: TaylorStepper, state: State) -> State:
             part.outward > 0,
             meeting.turned & ~hits.saddle,
             hits.saddle,
-            jnp.where(hits.saddle, scene.moments.saddle, meeting.top),
-            jnp.where(hits.saddle, velocity, 0.0),
-            keep_by(jnp.where(hits.saddle, meeting.acceleration, meeting.top_acceleration) / stretch**2, one),
+            where(hits.saddle, scene.moments.saddle, meeting.top),
+            where(hits.saddle, velocity, 0.0),
+            keep_by(where(hits.saddle, meeting.acceleration, meeting.top_acceleration) / stretch**2, one),
         )
 
     noted = replace(_if(meeting.turned | hits.saddle, noted_now, passed), piece=piece, local=local)
@@ -320,17 +321,17 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     (drive, level), (drive2, level2) = drives
     (lifts, touching, meets, end), (lifts2, touching2, meets2, end2) = of(drive, level), of(drive2, level2)
     second = lifts2 | meets2
-    missing = [jnp.where(second, b, a) for a, b in zip(drive, drive2)]
-    missing[0] = jnp.where(second, drive2[0] - level2, drive[0] - level)
+    missing = [where(second, b, a) for a, b in zip(drive, drive2)]
+    missing[0] = where(second, drive2[0] - level2, drive[0] - level)
     slope = missing[1] if len(missing) > 1 else jnp.zeros_like(length)
-    ending = jnp.where(second, end2 - level2, end - level)
+    ending = where(second, end2 - level2, end - level)
     x, last = root_between(_MEET, missing, jnp.zeros_like(length), length, (missing[0], ending), (slope, None))
     both = (lifts | meets) & second
     lifts, touching, meets = lifts | lifts2, touching | touching2, meets | meets2
-    elapsed = jnp.where(lifts, 0.0, jnp.where(meets, x, length)) * unit
+    elapsed = where(lifts, 0.0, where(meets, x, length)) * unit
     full = full & ~meets & ~lifts
     piece, local, over = stepper.move_on(state, elapsed, full)
-    piece = jnp.where(full & ~over, scene.after_quiet(piece), piece)
+    piece = where(full & ~over, scene.after_quiet(piece), piece)
     never = scene.outlook.is_over(state.piece)
     unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & (last > 1e-7 * x)))
     rested = replace(
@@ -341,7 +342,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         steps=state.steps + 1,
         status=Status.where(unclear, Status.undecided, state.status),
     )
-    side = jnp.where(second, -1.0, 1.0)
+    side = where(second, -1.0, 1.0)
     return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
 
 
@@ -351,6 +352,6 @@ def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
     rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
     for part in (*reversed(POLICY.shorter), 1.0):
-        share = jnp.where(keeps_sign(slope, rises, part * length) > 0, part, share)
+        share = where(keeps_sign(slope, rises, part * length) > 0, part, share)
     steady = horner([jnp.abs(c) for c in slope], length) * length == 0  # or a piece of no length
-    return jnp.where(steady, 1.0, share)
+    return where(steady, 1.0, share)

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int
 from jaxrock._checks import not_nan, size, strength, with_throw
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.motions.pulses.pulse import AbstractPulse, Piece, Real, one_piece
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
 from jaxrock.numerics.polynomial import horner
 
@@ -73,16 +74,16 @@ class TriangularPulse(AbstractPulse):
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         slope = 2 * self.amplitude / self.duration
         rising = piece == 0
-        value = jnp.where(rising, slope * local, self.amplitude - slope * local)
-        return [value, jnp.where(rising, slope, -slope) * unit][: order + 1]
+        value = where(rising, slope * local, self.amplitude - slope * local)
+        return [value, where(rising, slope, -slope) * unit][: order + 1]
 
 
 def _growth_ratio(x: Real) -> Real:
     """(e^x - 1)/x for x <= 0, smooth through 0."""
     small = jnp.abs(x) < 1e-2
-    far = jnp.where(small, -1.0, x)
+    far = where(small, -1.0, x)
     near = horner([jnp.full_like(x, 1 / math.factorial(k + 1)) for k in range(7)], x)
-    return jnp.where(small, near, jnp.expm1(far) / far)
+    return where(small, near, jnp.expm1(far) / far)
 
 
 class ExponentialPulse(AbstractPulse):
@@ -122,25 +123,25 @@ class ExponentialPulse(AbstractPulse):
     @property
     def knots(self) -> Real:
         # The layers of a rectangle-like pulse lie at both ends; those of a spike on both sides of the peak.
-        inner = jnp.where(self.shape > 0, 0.5 - self._layer, self._layer)
+        inner = where(self.shape > 0, 0.5 - self._layer, self._layer)
         zero = jnp.zeros_like(inner)
         return self.duration * jnp.stack([zero, inner, zero + 0.5, 1 - inner, zero + 1])
 
     def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
         """Whether a piece is a layer; one thinner than rounding is left out."""
         middle = (piece == 1) | (piece == 2)
-        in_layer = jnp.where(self.shape > 0, middle, ~middle)
+        in_layer = where(self.shape > 0, middle, ~middle)
         return in_layer & (jnp.abs(self.shape) < 1e24)
 
     @property
     def scales(self) -> Real:
         scale = self.duration / jnp.clip(2 * jnp.abs(self.shape), 1e-3, 1e25)
-        return jnp.where(self._curved(jnp.arange(4)), scale, jnp.inf)
+        return where(self._curved(jnp.arange(4)), scale, jnp.inf)
 
     @property
     def bounds(self) -> Real:
         size = jnp.abs(self.amplitude)
-        outer = jnp.where(self.shape > 40, 0.0, size)
+        outer = where(self.shape > 40, 0.0, size)
         return jnp.stack([outer, size, size, outer])
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
@@ -148,7 +149,7 @@ class ExponentialPulse(AbstractPulse):
         rate = 1 / self.duration  # the same at every step: computed once
         layer, y = self._layer, local * rate
         spiked = shape > 0
-        down, up = jnp.where(spiked, 0.0, shape), jnp.where(spiked, shape, 0.0)
+        down, up = where(spiked, 0.0, shape), where(spiked, shape, 0.0)
         # Distance from the nearer foot and from the peak, each without cancellation where it matters.
         foot = pick(jnp.stack([y, layer + y, 0.5 - y, layer - y]), piece)
         peak = pick(jnp.stack([0.5 - y, layer - y, y, layer + y]), piece)
@@ -159,13 +160,13 @@ class ExponentialPulse(AbstractPulse):
         value_up = (1 - 2 * peak) * rise * _growth_ratio(up * (2 * peak - 1))
         # Far from its peak a spike is zero to rounding; between its layers a rectangle is one.
         flat, middle = layer < 0.5, (piece == 1) | (piece == 2)
-        value_up = jnp.where(~middle & flat, 0.0, value_up)
-        value_down = jnp.where(middle & flat, 1.0, value_down)
-        direction = jnp.where(piece < 2, 1.0, -1.0)
+        value_up = where(~middle & flat, 0.0, value_up)
+        value_down = where(middle & flat, 1.0, value_down)
+        direction = where(piece < 2, 1.0, -1.0)
         step = direction * unit * rate
-        terms = [self.amplitude * jnp.where(spiked, value_up, value_down)]
-        term = self.amplitude * 2 * jnp.where(spiked, rise, fall) * step
-        term, ratio = jnp.where(self._curved(piece), term, 0.0), 2 * shape * step
+        terms = [self.amplitude * where(spiked, value_up, value_down)]
+        term = self.amplitude * 2 * where(spiked, rise, fall) * step
+        term, ratio = where(self._curved(piece), term, 0.0), 2 * shape * step
         for k in range(1, order + 1):
             terms.append(term)
             term = term * ratio * (1 / (k + 1))

@@ -1,0 +1,44 @@
+"""Programs without operations that change no value, which only mark it for JAX or for XLA.
+
+One such operation may mark many values at once, of which some stay the same in a loop and others do not.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from jax.extend.core import ClosedJaxpr, Literal
+
+_MARKS = {"fixed", "stop_gradient", "keep"}
+
+
+def unmarked(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program without marks."""
+    return ClosedJaxpr(_without(program.jaxpr), program.consts)
+
+
+def _without(jaxpr) -> Any:
+    names: dict = {}  # what stands for a variable
+
+    def read(atom):
+        return atom if isinstance(atom, Literal) else names.get(atom, atom)
+
+    equations = []
+    for equation in jaxpr.eqns:
+        given = [read(x) for x in equation.invars]
+        if equation.primitive.name in _MARKS:
+            names.update(zip(equation.outvars, given))  # what tells of a mark comes after the value
+        else:
+            inner = {key: _inside(value) for key, value in equation.params.items()}
+            equations.append(equation.replace(invars=given, params=inner))
+    return jaxpr.replace(eqns=equations, outvars=[read(x) for x in jaxpr.outvars])
+
+
+def _inside(value: Any) -> Any:
+    """A parameter of an operation, which may be a program, or several."""
+    if isinstance(value, ClosedJaxpr):
+        return unmarked(value)
+    if hasattr(value, "eqns"):
+        return _without(value)
+    if isinstance(value, Sequence) and any(isinstance(x, ClosedJaxpr) for x in value):
+        return tuple(map(_inside, value))
+    return value

@@ -1,0 +1,22 @@
+"""One of two values by a condition, as one operation: `jnp.where` is a call of a function, which takes as long to trace
+as ten."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def where(condition: Any, one: Any, other: Any) -> jax.Array:
+    """`one` where a condition holds, else `other`, as `jnp.where` has it."""
+    shape = np.shape(condition)
+    if shape != np.shape(one) or shape != np.shape(other) or (_yields(one) and _yields(other)):
+        return jnp.where(condition, one, other)
+    dtype = jnp.result_type(one, other)
+    return jax.lax.select_n(jnp.asarray(condition), jnp.asarray(other, dtype), jnp.asarray(one, dtype))
+
+
+def _yields(value: Any) -> bool:
+    """Whether the type of a number gives way to that of others."""
+    return isinstance(value, (bool, int, float)) or getattr(jax.typeof(value), "weak_type", False)

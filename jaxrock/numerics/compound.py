@@ -1,0 +1,131 @@
+"""Operations that consist of many: single ones in the programs of JAX, written out where these are compiled.
+
+A polynomial of degree 16 is one operation to trace, to batch and to differentiate, and not 32; its derivative is one
+more, and not three times as many. XLA, and machine code of our own, get what it is `written` as.
+"""
+
+import functools
+from collections.abc import Callable, Hashable
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+from jaxrock._abstract import typed_like
+from jaxrock.numerics.xla_cpu import marking
+
+Zero = ad.Zero
+_FUNCTIONS: dict[str, Callable] = {}  # what each consists of, by the name of the primitive: set at import only
+
+
+def compound(name: str, function: Callable, change: Callable | None = None, results: int | Callable = 1) -> Callable:
+    """A function `function(*numbers, **settings)` that returns a list of numbers, as a single operation of JAX.
+
+    - `name`: of that operation, of which there is one.
+    - `function`: of arrays that fit each other's shapes, in operations that work on each of their numbers; settings are
+      hashable.
+    - `change`: of the operation, numbers, their changes (`Zero` where there is none) and the settings: results and
+      their changes. None: those of what it consists of.
+    - `results`: how many there are, or a function of the number of numbers and of the settings that tells.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    _FUNCTIONS[name] = function
+
+    def bound(*numbers, **settings) -> list:
+        dtype = jnp.result_type(*numbers)
+        return primitive.bind(*(jnp.asarray(x, dtype) for x in numbers), **settings)
+
+    def types(*operands, **settings) -> list:
+        shape = jnp.broadcast_shapes(*(x.shape for x in operands))
+        count = results(len(operands), **settings) if callable(results) else results
+        return typed_like(operands, [(shape, operands[0].dtype)] * count)
+
+    @functools.lru_cache(maxsize=256)
+    def compiled(settings):
+        return jax.jit(functools.partial(primitive.bind, **dict(settings)))
+
+    def alone(*numbers, **settings):
+        with jax.disable_jit(False):
+            return compiled(tuple(settings.items()))(*numbers)
+
+    def pushed(numbers, changes, **settings):
+        if change is not None:
+            return change(bound, numbers, changes, **settings)
+        moves = [type(d) is not Zero for d in changes]
+
+        def of(*moving):
+            rest = iter(moving)
+            return function(*(next(rest) if move else x for x, move in zip(numbers, moves)), **settings)
+
+        moving, moved = ([x for x, move in zip(each, moves) if move] for each in (numbers, changes))
+        return jax.jvp(of, moving, moved)
+
+    def transposed(cotangents, *numbers, **settings):
+        linear = [ad.is_undefined_primal(x) for x in numbers]
+
+        def of(*moving):
+            rest = iter(moving)
+            return function(*(next(rest) if is_linear else x for x, is_linear in zip(numbers, linear)), **settings)
+
+        like = [x.aval for x, is_linear in zip(numbers, linear) if is_linear]
+        cotangents = [ad.instantiate_zeros(d) for d in cotangents]
+        found = iter(jax.linear_transpose(of, *like)(cotangents))
+        return [next(found) if is_linear else None for is_linear in linear]
+
+    primitive.def_impl(alone)
+    primitive.def_abstract_eval(types)
+    batching.primitive_batchers[primitive] = functools.partial(_batched, primitive)
+    ad.primitive_jvps[primitive] = pushed
+    ad.primitive_transposes[primitive] = transposed
+    mlir.register_lowering(primitive, functools.partial(_lowered, name))
+    return bound
+
+
+def is_compound(name: str) -> bool:
+    """Whether a primitive of this name consists of others."""
+    return name in _FUNCTIONS
+
+
+def written(name: str, operands: list, settings: dict) -> ClosedJaxpr:
+    """What an operation consists of, for such operands, as a program."""
+    kinds = tuple((x.shape, x.dtype) for x in operands)
+    return _program(name, kinds, tuple(settings.items()))
+
+
+@functools.lru_cache(maxsize=4096)
+def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...]) -> ClosedJaxpr:
+    shape = jnp.broadcast_shapes(*(shape for shape, _ in kinds))
+
+    def run(*numbers):
+        return [jnp.broadcast_to(x, shape) for x in _FUNCTIONS[name](*numbers, **dict(settings))]
+
+    # It is kept: outside of any mesh, and for any compiler.
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())), marking(True):
+        return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(*kind) for kind in kinds))
+
+
+@functools.lru_cache(maxsize=4096)
+def _called(name: str, kinds: tuple, settings: tuple) -> Callable:
+    """The same as a function of its own, which is lowered once in a module."""
+    return jax.jit(jaxpr_as_fun(_program(name, kinds, settings)))
+
+
+def _lowered(name: str, context, *operands, **settings):
+    kinds = tuple((x.shape, x.dtype) for x in context.avals_in)
+    return mlir.lower_fun(_called(name, kinds, tuple(settings.items())))(context, *operands)
+
+
+def _batched(primitive: Primitive, operands, axes, **settings) -> tuple[list, list]:
+    """Numbers fit each other's shapes, so what is not mapped needs no axis."""
+    most = max(jnp.ndim(x) - (axis is not None) for x, axis in zip(operands, axes))
+
+    def moved(x, axis):
+        if axis is None:
+            return x
+        x = jnp.moveaxis(x, axis, 0)
+        return x.reshape(x.shape[0], *[1] * (most + 1 - x.ndim), *x.shape[1:])
+
+    found = primitive.bind(*map(moved, operands, axes), **settings)
+    return found, [0] * len(found)

@@ -1,0 +1,185 @@
+"""Operations that consist of many: what they give, how they change, what is written for them; how long programs are."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from jax.extend.core import jaxpr_as_fun
+
+import jaxrock as rk
+from jaxrock.engines import free_stage
+from jaxrock.numerics import compound, elementary, polynomial as polynomials
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.xla_cpu import marking
+
+RNG = np.random.default_rng(7)
+NUMBERS = RNG.uniform(0.1, 1.2, 12)
+
+# Name: the operation, its settings, how many numbers it takes.
+OPERATIONS = {
+    "value": (polynomials.polynomial, {"derivatives": 0}, 6),
+    "value of a constant": (polynomials.polynomial, {"derivatives": 2}, 2),
+    "third derivative": (polynomials.polynomial, {"derivatives": 3}, 7),
+    "derivatives of a short one": (polynomials.polynomial, {"derivatives": 4}, 4),
+    "sum of products": (polynomials._products, {}, 10),
+    "one product": (polynomials._products, {}, 2),
+    "rescaled": (polynomials._rescaled, {}, 5),
+    "sign is kept": (polynomials._keeps_sign, {}, 8),
+    "fall": (polynomials._fall_bound, {"order": 2}, 6),
+    "clear length": (polynomials._clear_length, {}, 3),
+    "sine, cosine": (elementary._sine_cosine, {}, 1),
+    "sine, cosine of any": (elementary._sine_cosine_of_any, {}, 1),
+    "logarithm": (elementary._logarithm, {}, 1),
+    "exponential": (elementary._exponential, {}, 1),
+    "elliptic integral": (free_stage._carlson_rf, {}, 3),
+}
+each = pytest.mark.parametrize("operation, settings, count", OPERATIONS.values(), ids=OPERATIONS)
+
+
+def given(count):
+    """Numbers, some of them negative."""
+    return [jnp.asarray(x) for x in NUMBERS[:count] * np.where(np.arange(count) % 3 == 2, -1, 1) ** (count > 3)]
+
+
+def written_of(operation, settings, numbers):
+    """The operation's name, and what it consists of as a program."""
+    program = jax.make_jaxpr(lambda *x: operation(*x, **settings))(*numbers)
+    (equation,) = (e for e in program.jaxpr.eqns if compound.is_compound(e.primitive.name))
+    return compound.written(equation.primitive.name, [x.aval for x in equation.invars], equation.params)
+
+
+@each
+def test_it_is_what_it_consists_of(operation, settings, count):
+    """Alone, compiled, and at many places of which some numbers are shared; one operation in a program."""
+    numbers = given(count)
+    expected = jaxpr_as_fun(written_of(operation, settings, numbers))(*numbers)
+
+    def of(*numbers):
+        return operation(*numbers, **settings)
+
+    assert len(jax.make_jaxpr(of)(*numbers).jaxpr.eqns) == 1
+    np.testing.assert_allclose(of(*numbers), expected, rtol=1e-15)
+    np.testing.assert_allclose(jax.jit(of)(*numbers), expected, rtol=1e-15)
+    for mapped in {0, count - 1, count // 2}:
+        many = [jnp.linspace(0.9, 1.1, 3) * x if k == mapped else x for k, x in enumerate(numbers)]
+        found = jax.vmap(of, in_axes=[0 if k == mapped else None for k in range(count)])(*many)
+        rows = [of(*(x[i] if k == mapped else x for k, x in enumerate(many))) for i in range(3)]
+        np.testing.assert_allclose(found, np.transpose(rows), rtol=4e-16, atol=1e-300)
+        nested = jax.vmap(lambda *x: of(*(y * jnp.ones(2) if k else y for k, y in enumerate(x))))(
+            *(jnp.stack([x, x]) for x in numbers)
+        )
+        if count > 1:
+            np.testing.assert_allclose(np.asarray(nested)[:, 1, 1], expected, rtol=1e-15)
+
+
+@each
+def test_it_changes_as_what_it_consists_of(operation, settings, count):
+    """Forward, reverse, by some of the numbers, and again."""
+    numbers = given(count)
+    program = written_of(operation, settings, numbers)
+
+    def of(*numbers):
+        return jnp.stack(operation(*numbers, **settings))
+
+    def plain(*numbers):
+        return jnp.stack(jaxpr_as_fun(program)(*numbers))
+
+    if settings == {} and operation in (elementary._logarithm,):  # bits have no derivatives
+        plain = lambda x: jnp.log(x)[None]
+    for which in (tuple(range(count)), (0,), (count - 1,)):
+        expected = jax.jacfwd(plain, which)(*numbers)
+        np.testing.assert_allclose(jax.jacfwd(of, which)(*numbers), expected, rtol=2e-14, atol=1e-14)
+        if operation is not free_stage._carlson_rf:  # whose loop reverse mode does not go through
+            np.testing.assert_allclose(jax.jacrev(of, which)(*numbers), expected, rtol=2e-14, atol=1e-14)
+    second = jax.jacfwd(jax.jacfwd(plain))(*numbers)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(of))(*numbers), second, rtol=1e-12, atol=1e-12)
+
+
+@each
+def test_machine_code_is_the_same(operation, settings, count):
+    call = pytest.importorskip("jaxrock.native.call")
+    numbers = given(count)
+    lanes = [jnp.linspace(0.8, 1.2, 21) * x for x in numbers]
+
+    def of(*numbers):
+        return operation(*numbers, **settings)
+
+    plan = call.Plan(jax.make_jaxpr(of)(*numbers), [False] * count)
+    np.testing.assert_allclose(plan(lanes, threads=1), jax.vmap(of)(*lanes), rtol=1e-13, atol=1e-15)
+
+
+def test_a_polynomial_is_its_sum():
+    """Against 30 digits."""
+    mp.mp.dps = 30
+    terms, x = RNG.normal(size=9), 0.73
+    found = polynomials.jet([jnp.asarray(c) for c in terms], jnp.asarray(x), 3)
+    for k in range(4):
+        expected = sum(mp.mpf(terms[j]) * math.perm(j, k) * mp.mpf(x) ** (j - k) for j in range(k, 9))
+        assert abs(float(found[k]) - expected) < 1e-13 * max(1, abs(expected))
+    np.testing.assert_array_equal(polynomials.jet([], jnp.asarray(x), 1), 0.0)
+
+
+def test_a_choice_is_that_of_numpy():
+    flag = jnp.asarray(True)
+    for one, other in [
+        (1.5, jnp.float32(2)),
+        (jnp.float64(3), 1),
+        (jnp.int32(1), jnp.int32(2)),
+        (1.0, 2.0),
+        (flag, False),
+    ]:
+        for choice in (flag, ~flag, True):
+            found, expected = where(choice, one, other), jnp.where(choice, one, other)
+            assert (found.dtype, found.weak_type, found == expected) == (expected.dtype, expected.weak_type, True)
+    np.testing.assert_array_equal(where(jnp.arange(3) > 1, 1.0, jnp.arange(3.0)), [0, 1, 1])
+
+
+def test_what_is_fixed_has_no_derivatives():
+    """All of it is one operation."""
+
+    def of(x, y):
+        held = fixed({"a": x, "b": (y, jnp.int32(2))})
+        return x * held["a"] + held["b"][0]
+
+    assert jax.grad(of, (0, 1))(3.0, 5.0) == (3.0, 0.0)
+    np.testing.assert_array_equal(jax.vmap(jax.grad(of), (0, None))(jnp.arange(3.0), 2.0), [0, 1, 2])
+    assert str(jax.make_jaxpr(of)(3.0, 5.0)).count("fixed") == 1
+
+
+def operations_of(jaxpr):
+    """How many there are in a program, each as often as it stands there."""
+    inner = [
+        getattr(part, "jaxpr", part)
+        for equation in jaxpr.eqns
+        for value in equation.params.values()
+        for part in (value if isinstance(value, (tuple, list)) else (value,))
+        if hasattr(getattr(part, "jaxpr", part), "eqns")
+    ]
+    return len(jaxpr.eqns) + sum(map(operations_of, inner))
+
+
+def recipe_in(jaxpr):
+    """The recipe that a program asks for."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "scenes":
+            return equation.params["recipe"]
+        for value in equation.params.values():
+            if hasattr(value, "jaxpr") and (found := recipe_in(value.jaxpr)) is not None:
+                return found
+    return None
+
+
+@pytest.mark.parametrize(
+    "motion, most", [(rk.SinePulse(0.5, 1.0), 2500), (rk.example_record(), 2000)], ids=["pulse", "record"]
+)
+def test_programs_are_small(motion, most):
+    """What JAX traces, batches and differentiates of an outcome for machine code; a first answer waits for it."""
+    asked = jax.make_jaxpr(lambda alpha: rk.outcome(rk.Block(alpha, 2.0), motion))(0.2)
+    recipe = recipe_in(asked.jaxpr)
+    with marking(False):
+        assert 500 < operations_of(recipe.program.jaxpr) <= most
+    assert "keep" in str(recipe.program) and operations_of(recipe.program.jaxpr) <= 1.3 * most  # for XLA
