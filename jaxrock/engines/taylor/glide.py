@@ -17,6 +17,7 @@ from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.reach import Reach
 from jaxrock.engines.uncertainty import GRAZING, Spread
 from jaxrock.numerics.apart import lanes_part
+from jaxrock.numerics.choice import where
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -55,7 +56,7 @@ def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scala
     """The state with what errors have grown to in a glide; `strongest`: acceleration of the ground [g]."""
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
-    per_time = 1 / jnp.where(count > 0, time, 1.0)
+    per_time = 1 / where(count > 0, time, 1.0)
     largest = replace(state, opening=glide.opening, velocity=glide.speed)
     angle, velocity = rounded(stepper, largest, strongest, time / jnp.maximum(count, 1.0))
     least = 2 * stepper.rounding * stepper.scene.alpha
@@ -72,11 +73,11 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
     stepper = stepper.on(state.side)
     scene, moments = stepper.scene, stepper.scene.moments
     reach = Reach.of(stepper, state)
-    start, terms, speeds, opening = reach.start, reach.terms, reach.speeds, reach.opening
-    swing = reach.room * reach.first  # no turning point is further off
-    quiet = jnp.where(speeds[1] < 0, terms[0] + swing <= glide.low, terms[0] - swing >= glide.high)
+    start, opening = reach.start, reach.opening
+    swing = reach.room * jnp.abs(start.speed)  # no turning point is further off
+    quiet = where(reach.slows, start.opening + swing <= glide.low, start.opening - swing >= glide.high)
     unnoted = reach.one_way | (reach.steady & quiet & ~state.beyond)
-    escapes = state.beyond & (speeds[0] > 0) & (state.piece % _ESCAPES == 0)  # perhaps: now and then it is asked
+    escapes = state.beyond & (start.speed > 0) & (state.piece % _ESCAPES == 0)  # perhaps: now and then it is asked
     stays = (opening > 0) & ((opening >= moments.saddle) == state.beyond) & ~escapes
     rocks = (state.side != 0) & ~state.uplifting & (reach.room > 0)
     sure = rocks & reach.holds & reach.no_faster(state.fastest) & unnoted & stays
@@ -84,7 +85,7 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
         sure = sure & (opening < jnp.pi / 2)
 
     def moved(new, old):
-        return jnp.where(sure, new, old)
+        return where(sure, new, old)
 
     velocity = reach.speed * (1 / start.stretch)
     now = jnp.abs(velocity)
@@ -97,7 +98,7 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
         local=moved(local, state.local),
         opening=moved(opening, state.opening),
         velocity=moved(velocity, state.velocity),
-        fastest=jnp.where(sure & (now > state.fastest), now, state.fastest),
+        fastest=where(sure & (now > state.fastest), now, state.fastest),
         done=sure & over,
         steps=state.steps + sure,
     )
@@ -106,6 +107,6 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
         time=moved(glide.time + reach.time, glide.time),
         repulsion=moved(glide.repulsion + reach.time * repulsion, glide.repulsion),
         missed=moved(glide.missed + reach.missed**2, glide.missed),
-        opening=jnp.where(sure & (opening > glide.opening), opening, glide.opening),
-        speed=jnp.where(sure & (now > glide.speed), now, glide.speed),
+        opening=where(sure & (opening > glide.opening), opening, glide.opening),
+        speed=where(sure & (now > glide.speed), now, glide.speed),
     )

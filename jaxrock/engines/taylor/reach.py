@@ -1,6 +1,11 @@
-"""How far the series of a step goes within a piece of a record."""
+"""How far a block goes within a piece of a record, and whether anything may happen on the way.
 
-from typing import NamedTuple
+By its series, or, where the equation is linear, exactly: about the balance that moves with the ground the opening angle
+is a hyperbolic sine and cosine, whose acceleration changes its sign once at most.
+"""
+
+import math
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
@@ -8,85 +13,127 @@ from jaxtyping import Array, Bool, Inexact
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.polynomial import horner
 from jaxrock.numerics.xla_cpu import keep_by
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
 
+# Of (cosh(x) - 1)/x^2 and (sinh(x) - x)/x^3 in x^2, to rounding up to here.
+_EXACT = 0.04
+_EVEN, _ODD = (tuple(1 / math.factorial(2 * k + first) for k in range(5)) for first in (2, 3))
+
 
 class Reach(NamedTuple):
-    """The series of a step, to the end of a piece or a half or a quarter of the way. Time is in the unit of the series,
-    but for `unit`."""
+    """From a state to the end of a piece, or a half or a quarter of the way. Time is in the unit of `start`, but for
+    `unit`."""
 
     start: Start
     unit: Scalar  # [s]
-    terms: list[Scalar]  # of the opening angle
-    speeds: list[Scalar]  # of its velocity
-    whole: Scalar  # time to the end of the piece
     room: Scalar  # how far it goes
-    full: Flag  # as far as that
-    holds: Flag  # and is as exact as it has to be
-    missed: Scalar  # what it leaves out at its end [rad]
+    full: Flag  # to the end
+    holds: Flag  # as exactly as it has to
+    missed: Scalar  # what is left out at its end [rad]
     opening: Scalar  # there
     speed: Scalar
-    change: Scalar  # bound of how far the acceleration is off its first value on the way
-    bend: Scalar  # and the velocity off a straight line
-    first: Scalar  # size of the velocity at the start,
-    then: Scalar  # and of that line at the end, negative if it has turned
+    slows: Flag  # the acceleration is negative at its start
+    steady: Flag  # the velocity grows, or falls, all the way
+    one_way: Flag  # the block does not turn
+    largest: Scalar  # bound of how fast it is on the way
 
     @classmethod
     def of(cls, stepper: TaylorStepper, state: State) -> "Reach":
         """From a state on, of which `stepper` is on the side."""
-        order = stepper.order
         shaking, unit = stepper.shaking(state.piece, state.local)
-        start = stepper.start(state, shaking, unit)
-        series = expand(start, order)
-        terms, speeds = series.opening, series.speed
-        size = jnp.minimum(stepper.scene.alpha, jnp.abs(terms[0]) + jnp.abs(terms[1]))
-        last = jnp.abs(terms[-1]) + jnp.abs(terms[-2]) + 0.02 * (jnp.abs(terms[-3]) + jnp.abs(terms[-4]))
-
-        whole = stepper.room(state) * (1 / unit)
-        missed, most = last * whole**order, stepper.tolerance * size
-        full, half = missed <= most, missed <= 2**order * most
-        room = keep_by(jnp.where(full, whole, jnp.where(half, 0.5, 0.25) * whole), start.one)
-        missed = missed * jnp.where(full, 1.0, jnp.where(half, 0.5**order, 0.25**order))
-
-        change = room * horner([k * jnp.abs(c) for k, c in enumerate(speeds)][2:], room)
-        return cls(
-            start=start,
-            unit=unit,
-            terms=terms,
-            speeds=speeds,
-            whole=whole,
-            room=room,
-            full=full,
-            holds=missed <= most,
-            missed=missed,
-            opening=horner(terms, room),
-            speed=horner(speeds, room),
-            change=change,
-            bend=0.5 * room * change,
-            first=jnp.abs(speeds[0]),
-            then=jnp.where(speeds[0] < 0, -1.0, 1.0) * (speeds[0] + room * speeds[1]),
-        )
+        start, whole = stepper.start(state, shaking, unit), stepper.room(state) * (1 / unit)
+        return (_exactly if _is_linear(start) else _by_series)(stepper, start, unit, whole)
 
     @property
     def time(self) -> Scalar:
         """p t of how far it goes."""
         return self.room * self.start.stretch
 
-    @property
-    def steady(self) -> Flag:
-        """Whether the velocity grows or falls all the way."""
-        return jnp.abs(self.speeds[1]) > self.change
-
-    @property
-    def one_way(self) -> Flag:
-        """Whether the block does not turn."""
-        return (self.first > self.bend) & (self.then > self.bend)
-
     def no_faster(self, fastest: Scalar) -> Flag:
         """Whether it is nowhere on the way faster than at an end or (per p t) than this."""
-        fastest = fastest * self.start.stretch
-        return ((self.first + self.bend <= fastest) & (self.then + self.bend <= fastest)) | self.steady
+        return (self.largest <= fastest * self.start.stretch) | self.steady
+
+
+def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar) -> Reach:
+    order = stepper.order
+    series = expand(start, order)
+    terms, speeds = series.opening, series.speed
+    size = jnp.minimum(stepper.scene.alpha, jnp.abs(terms[0]) + jnp.abs(terms[1]))
+    last = jnp.abs(terms[-1]) + jnp.abs(terms[-2]) + 0.02 * (jnp.abs(terms[-3]) + jnp.abs(terms[-4]))
+
+    missed, most = last * whole**order, stepper.tolerance * size
+    full, half = missed <= most, missed <= 2**order * most
+    room = keep_by(where(full, whole, where(half, 0.5, 0.25) * whole), start.one)
+    missed = missed * where(full, 1.0, where(half, 0.5**order, 0.25**order))
+
+    # How far the acceleration is off its first value on the way, and the velocity off a straight line.
+    change = room * horner([k * jnp.abs(c) for k, c in enumerate(speeds)][2:], room)
+    bend = 0.5 * room * change
+    first, then = jnp.abs(speeds[0]), where(speeds[0] < 0, -1.0, 1.0) * (speeds[0] + room * speeds[1])
+    return Reach(
+        start=start,
+        unit=unit,
+        room=room,
+        full=full,
+        holds=missed <= most,
+        missed=missed,
+        opening=horner(terms, room),
+        speed=horner(speeds, room),
+        slows=speeds[1] < 0,
+        steady=jnp.abs(speeds[1]) > change,
+        one_way=(first > bend) & (then > bend),
+        largest=jnp.maximum(first, then) + bend,
+    )
+
+
+def _is_linear(start: Start) -> bool:
+    """Whether x'' = rate (x - saddle) + a straight line."""
+    moments, (horizontal, vertical) = start.moments, start.shaking
+    is_line = not moments.trigonometric and moments.arm_terms.line is None
+    return is_line and vertical is None and len(horizontal) <= 2
+
+
+def _exactly(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar) -> Reach:
+    moments: Any = start.moments
+    pull = -moments.restoring_terms.line
+    rate = start.stretch**2 * pull
+    # The balance moves along a straight line, about which offset'' = rate offset (D&D 2012, 3.1).
+    lever = start.side * moments.arm_terms.constant / pull
+    now, *rest = start.shaking.horizontal
+    drift = lever * rest[0] if rest else jnp.zeros_like(whole)
+    offset = start.opening - moments.restoring_terms.constant / pull - lever * now
+    relative = start.speed - drift
+
+    whole_square = rate * whole**2
+    full, half = whole_square <= _EXACT, whole_square <= 4 * _EXACT
+    room = keep_by(where(full, whole, where(half, 0.5, 0.25) * whole), start.one)
+    square = rate * room**2
+    grown, more = (square * horner([jnp.full_like(square, c) for c in terms], square) for terms in (_EVEN, _ODD))
+    lag = more * room  # of sinh over the root of the rate behind it
+    opening = start.opening + (room * start.speed + (grown * offset + lag * relative))
+    speed = start.speed + (grown * relative + rate * (room + lag) * offset)
+    end = offset + (grown * offset + (room + lag) * relative)
+
+    # What solves that equation is nowhere larger than at its ends, and has one zero at most.
+    steady = offset * end > 0
+    change = rate * room * jnp.maximum(jnp.abs(offset), jnp.abs(end))
+    first, then = jnp.abs(start.speed), jnp.abs(speed)
+    return Reach(
+        start=start,
+        unit=unit,
+        room=room,
+        full=full,
+        holds=square <= _EXACT,
+        missed=jnp.zeros_like(room),
+        opening=opening,
+        speed=speed,
+        slows=offset < 0,
+        steady=steady,
+        one_way=(start.speed * speed > 0) & (steady | (first > change)),
+        largest=jnp.maximum(first, then) + change,
+    )
