@@ -20,6 +20,7 @@ import jaxrock as rk
 from jaxrock.engines.taylor import expansion, fast
 from jaxrock.engines.taylor.follow import most_steps
 from jaxrock.engines.taylor.glide import Glide, onward, settled
+from jaxrock.numerics.compound import is_compound, written
 from jaxrock.responses import outcome
 from references import peer_problems as problems
 from references.in_jaxrock import MODELS
@@ -36,6 +37,8 @@ def operations(jaxpr, branches=False, found=None):
     for equation in jaxpr.eqns:
         values = [p for value in equation.params.values() for p in (value if isinstance(value, tuple) else (value,))]
         programs = [getattr(p, "jaxpr", p) for p in values if hasattr(getattr(p, "jaxpr", p), "eqns")]
+        if is_compound(equation.primitive.name):
+            programs = [written(equation.primitive.name, [x.aval for x in equation.invars], equation.params).jaxpr]
         if equation.primitive.name == "cond" and not branches:
             continue
         if not programs:

@@ -95,6 +95,11 @@ def test_it_changes_as_what_it_consists_of(operation, settings, count):
         np.testing.assert_allclose(jax.jacfwd(of, which)(*numbers), expected, rtol=2e-14, atol=1e-14)
         if operation is not free_stage._carlson_rf:  # whose loop reverse mode does not go through
             np.testing.assert_allclose(jax.jacrev(of, which)(*numbers), expected, rtol=2e-14, atol=1e-14)
+        many = [jnp.stack([x, 0.9 * x]) if k in which else x for k, x in enumerate(numbers)]
+        rows = [jax.jacfwd(plain, which)(*(x[i] if k in which else x for k, x in enumerate(many))) for i in range(2)]
+        axes = [0 if k in which else None for k in range(count)]
+        found = jax.vmap(jax.jacfwd(of, which), axes)(*many)
+        np.testing.assert_allclose(found, np.stack(rows, axis=1), rtol=2e-14, atol=1e-14)
     second = jax.jacfwd(jax.jacfwd(plain))(*numbers)
     np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(of))(*numbers), second, rtol=1e-12, atol=1e-12)
 

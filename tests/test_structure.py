@@ -353,7 +353,7 @@ def test_unknown_names_raise():
 SHARED = {
     "_garbage._pauses": "under its lock",
     "native.machine._registered": "under a lock",
-    "numerics.compound._FUNCTIONS": "changed at import only",
+    "numerics.compound._OPERATIONS": "changed at import only",
     "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
     "sweeps.grid._examples": "changed at import only",
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",

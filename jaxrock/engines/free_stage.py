@@ -21,7 +21,7 @@ from jaxrock.models import free_swing as skewed
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import compound
+from jaxrock.numerics.compound import Compound
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -80,7 +80,7 @@ def _carlson_rf_written(x, y, z):
     return [(1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44) / jnp.sqrt(mean)]
 
 
-_carlson_rf = compound("carlson_rf", _carlson_rf_written)
+_carlson_rf = Compound("carlson_rf", _carlson_rf_written)
 
 
 def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: Scalar) -> Scalar:

@@ -34,6 +34,7 @@ class Emitter:
         self.before = []  # the blocks before the loops that are being written
         self._depths = {}  # in how many of them a value is made anew, by the identity of the value
         self._alive = []  # so that identities are not used again
+        self._constants = {}  # by their text: to write one takes as long as ten operations
 
     # Types and small things
 
@@ -55,7 +56,10 @@ class Emitter:
     def constant_of(self, value, kind: ir.VectorType):
         """One number for all lanes, of a known type."""
         value = int(value) if isinstance(kind.element, ir.IntType) else float(value)
-        return ir.Constant(kind, [ir.Constant(kind.element, value)] * self.lanes)
+        key = repr(value), type(kind.element), getattr(kind.element, "width", 0)
+        if key not in self._constants:
+            self._constants[key] = ir.Constant(kind, [ir.Constant(kind.element, value)] * self.lanes)
+        return self._constants[key]
 
     def intrinsic(self, name: str, *values):
         """One of LLVM's own functions."""
@@ -144,6 +148,7 @@ class Emitter:
 
     def remember(self, values: list, depth: int) -> None:
         """That values are made anew in so many of the loops that are being written."""
+        values = [x for x in values if not isinstance(x, ir.Constant)]  # which many share, and nothing makes
         self._alive += values
         # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
         self._depths.update((id(x), min(depth, self._depths.get(id(x), depth))) for x in values)

@@ -16,10 +16,10 @@ from jaxrock._abstract import typed_like
 from jaxrock.numerics.xla_cpu import marking
 
 Zero = ad.Zero
-_FUNCTIONS: dict[str, Callable] = {}  # what each consists of, by the name of the primitive: set at import only
+_OPERATIONS: dict[str, "Compound"] = {}  # by the names of their primitives: set at import only
 
 
-def compound(name: str, function: Callable, change: Callable | None = None, results: int | Callable = 1) -> Callable:
+class Compound:
     """A function `function(*numbers, **settings)` that returns a list of numbers, as a single operation of JAX.
 
     - `name`: of that operation, of which there is one.
@@ -29,63 +29,69 @@ def compound(name: str, function: Callable, change: Callable | None = None, resu
       their changes. None: those of what it consists of.
     - `results`: how many there are, or a function of the number of numbers and of the settings that tells.
     """
-    primitive = Primitive(name)
-    primitive.multiple_results = True
-    _FUNCTIONS[name] = function
 
-    def bound(*numbers, **settings) -> list:
+    def __init__(self, name: str, function: Callable, change: Callable | None = None, results: int | Callable = 1):
+        self._function, self._change, self._results = function, change, results
+        self._primitive = primitive = Primitive(name)
+        primitive.multiple_results = True
+        primitive.def_impl(self._alone)
+        primitive.def_abstract_eval(self._types)
+        batching.primitive_batchers[primitive] = functools.partial(_batched, primitive)
+        ad.primitive_jvps[primitive] = self._pushed
+        ad.primitive_transposes[primitive] = self._transposed
+        mlir.register_lowering(primitive, functools.partial(_lowered, name))
+        _OPERATIONS[name] = self
+
+    def __call__(self, *numbers, **settings) -> list:
         dtype = jnp.result_type(*numbers)
-        return primitive.bind(*(jnp.asarray(x, dtype) for x in numbers), **settings)
+        return self._primitive.bind(*(jnp.asarray(x, dtype) for x in numbers), **settings)
 
-    def types(*operands, **settings) -> list:
+    def written(self, *numbers, **settings) -> list:
+        """The results, in the operations that it consists of."""
+        shape = jnp.broadcast_shapes(*map(jnp.shape, numbers))
+        return [jnp.broadcast_to(x, shape) for x in self._function(*numbers, **settings)]
+
+    def _types(self, *operands, **settings) -> list:
         shape = jnp.broadcast_shapes(*(x.shape for x in operands))
-        count = results(len(operands), **settings) if callable(results) else results
+        count = self._results(len(operands), **settings) if callable(self._results) else self._results
         return typed_like(operands, [(shape, operands[0].dtype)] * count)
 
-    @functools.lru_cache(maxsize=256)
-    def compiled(settings):
-        return jax.jit(functools.partial(primitive.bind, **dict(settings)))
-
-    def alone(*numbers, **settings):
+    def _alone(self, *numbers, **settings) -> list:
         with jax.disable_jit(False):
-            return compiled(tuple(settings.items()))(*numbers)
+            return _compiled(self._primitive, tuple(settings.items()))(*numbers)
 
-    def pushed(numbers, changes, **settings):
-        if change is not None:
-            return change(bound, numbers, changes, **settings)
+    def _of_some(self, numbers, chosen: list[bool], settings: dict) -> Callable:
+        """The function of some of the numbers."""
+
+        def of(*own):
+            rest = iter(own)
+            return self.written(*(next(rest) if mine else x for x, mine in zip(numbers, chosen)), **settings)
+
+        return of
+
+    def _pushed(self, numbers, changes, **settings):
+        if self._change is not None:
+            return self._change(self, numbers, changes, **settings)
         moves = [type(d) is not Zero for d in changes]
-
-        def of(*moving):
-            rest = iter(moving)
-            return function(*(next(rest) if move else x for x, move in zip(numbers, moves)), **settings)
-
         moving, moved = ([x for x, move in zip(each, moves) if move] for each in (numbers, changes))
-        return jax.jvp(of, moving, moved)
+        return jax.jvp(self._of_some(numbers, moves, settings), moving, moved)
 
-    def transposed(cotangents, *numbers, **settings):
+    def _transposed(self, cotangents, *numbers, **settings):
         linear = [ad.is_undefined_primal(x) for x in numbers]
-
-        def of(*moving):
-            rest = iter(moving)
-            return function(*(next(rest) if is_linear else x for x, is_linear in zip(numbers, linear)), **settings)
-
         like = [x.aval for x, is_linear in zip(numbers, linear) if is_linear]
-        cotangents = [ad.instantiate_zeros(d) for d in cotangents]
-        found = iter(jax.linear_transpose(of, *like)(cotangents))
+        given = [ad.instantiate_zeros(d) for d in cotangents]
+        found = iter(jax.linear_transpose(self._of_some(numbers, linear, settings), *like)(given))
         return [next(found) if is_linear else None for is_linear in linear]
 
-    primitive.def_impl(alone)
-    primitive.def_abstract_eval(types)
-    batching.primitive_batchers[primitive] = functools.partial(_batched, primitive)
-    ad.primitive_jvps[primitive] = pushed
-    ad.primitive_transposes[primitive] = transposed
-    mlir.register_lowering(primitive, functools.partial(_lowered, name))
-    return bound
+
+@functools.lru_cache(maxsize=256)
+def _compiled(primitive: Primitive, settings: tuple) -> Callable:
+    return jax.jit(functools.partial(primitive.bind, **dict(settings)))
 
 
 def is_compound(name: str) -> bool:
     """Whether a primitive of this name consists of others."""
-    return name in _FUNCTIONS
+    return name in _OPERATIONS
 
 
 def written(name: str, operands: list, settings: dict) -> ClosedJaxpr:
@@ -96,14 +102,10 @@ def written(name: str, operands: list, settings: dict) -> ClosedJaxpr:
 
 @functools.lru_cache(maxsize=4096)
 def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...]) -> ClosedJaxpr:
-    shape = jnp.broadcast_shapes(*(shape for shape, _ in kinds))
-
-    def run(*numbers):
-        return [jnp.broadcast_to(x, shape) for x in _FUNCTIONS[name](*numbers, **dict(settings))]
-
+    like = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
     # It is kept: outside of any mesh, and for any compiler.
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())), marking(True):
-        return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(*kind) for kind in kinds))
+        return jax.make_jaxpr(functools.partial(_OPERATIONS[name].written, **dict(settings)))(*like)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import compound
+from jaxrock.numerics.compound import Compound
 
 Real = Inexact[Array, "..."]
 
@@ -87,7 +87,7 @@ def _turned(operation, numbers, changes):
     return [sine, cosine], [cosine * moved, -sine * moved]
 
 
-_sine_cosine = compound("sine_cosine", _near, _turned, results=2)
+_sine_cosine = Compound("sine_cosine", _near, _turned, results=2)
 
 
 @jax.jit
@@ -115,7 +115,7 @@ def _anywhere(x):
     return [sign * sine, sign * cosine]
 
 
-_sine_cosine_of_any = compound("sine_cosine_of_any", _anywhere, _turned, results=2)
+_sine_cosine_of_any = Compound("sine_cosine_of_any", _anywhere, _turned, results=2)
 
 
 def logarithm(x: Real) -> Real:
@@ -139,7 +139,7 @@ def _logarithm_changed(operation, numbers, changes):
     return operation(*numbers), [changes[0] / numbers[0]]
 
 
-_logarithm = compound("logarithm", _logarithm_written, _logarithm_changed)
+_logarithm = Compound("logarithm", _logarithm_written, _logarithm_changed)
 
 
 def exponential(x: Real) -> Real:
@@ -168,7 +168,7 @@ def _exponential_changed(operation, numbers, changes):
     return [value], [value * changes[0]]
 
 
-_exponential = compound("exponential", _exponential_written, _exponential_changed)
+_exponential = Compound("exponential", _exponential_written, _exponential_changed)
 
 
 @jax.jit

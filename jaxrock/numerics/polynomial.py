@@ -14,7 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import Zero, compound
+from jaxrock.numerics.compound import Compound, Zero
 from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
@@ -34,7 +34,7 @@ def _rescaled_written(length, *coefficients):
     return scaled
 
 
-_rescaled = compound("rescaled", _rescaled_written, results=lambda count: count - 1)
+_rescaled = Compound("rescaled", _rescaled_written, results=lambda count: count - 1)
 
 
 def _polynomial(x, *coefficients, derivatives: int):
@@ -63,7 +63,7 @@ def _polynomial_changed(polynomial, numbers, changes, derivatives: int):
     return values, [jnp.broadcast_to(d, value.shape) for d, value in zip(change, values)]
 
 
-polynomial = compound("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
+polynomial = Compound("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
 
 
 def jet(coefficients: list[Scalar], x: Scalar, derivatives: int) -> list[Scalar]:
@@ -93,7 +93,7 @@ def _sum_of_products_changed(operation, numbers, changes):
     return [value], [jnp.broadcast_to(sum(moved[1:], start=moved[0]), value.shape)]
 
 
-_products = compound("sum_of_products", _sum_of_products, _sum_of_products_changed)
+_products = Compound("sum_of_products", _sum_of_products, _sum_of_products_changed)
 
 
 def sum_of_products(first: list, second: list) -> Scalar:
@@ -156,7 +156,7 @@ def _keeps_sign_written(length, sign, *coefficients):
     return _polynomial(length, *kept, derivatives=0)
 
 
-_keeps_sign = compound("keeps_sign", _keeps_sign_written)
+_keeps_sign = Compound("keeps_sign", _keeps_sign_written)
 
 
 def fall_bound(coefficients: list[Scalar], sign: Scalar, order: int, length: Scalar | float = 1.0) -> Scalar:
@@ -172,7 +172,7 @@ def _fall_bound_written(length, sign, *coefficients, order: int):
     return _polynomial(length, *falls, derivatives=0)
 
 
-_fall_bound = compound("fall_bound", _fall_bound_written)
+_fall_bound = Compound("fall_bound", _fall_bound_written)
 
 
 def last_size(coefficients: list[Scalar]) -> Scalar:
@@ -238,7 +238,7 @@ def _clear_length_written(value, slope, fall):
     return [where(below > 0, above / where(below > 0, below, 1.0), endless)]
 
 
-_clear_length = compound("clear_length", _clear_length_written)
+_clear_length = Compound("clear_length", _clear_length_written)
 
 
 def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar, needed: Flag) -> Landing:
