@@ -43,8 +43,9 @@ class Straight(AbstractMotion):
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         left, right = self._ends
-        slope = (right[piece] - left[piece]) * (1 / self.dt)
-        return [left[piece] + slope * local, slope * unit][: order + 1]
+        now = left[piece]
+        slope = (right[piece] - now) * (1 / self.dt)
+        return [now + slope * local, slope * unit][: order + 1]
 
 
 class Origin(NamedTuple):

@@ -103,7 +103,7 @@ def _exactly(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar) 
     pull = -moments.restoring_terms.line
     rate = start.stretch**2 * pull
     # The balance moves along a straight line, about which offset'' = rate offset (D&D 2012, 3.1).
-    lever = start.side * moments.arm_terms.constant / pull
+    lever = start.side * (moments.arm_terms.constant / pull)  # the quotient stays the same
     now, *rest = start.shaking.horizontal
     drift = lever * rest[0] if rest else jnp.zeros_like(whole)
     offset = start.opening - moments.restoring_terms.constant / pull - lever * now
