@@ -176,7 +176,7 @@ What is between the limit and the speed: under pulses an event in some lane of a
 its root; under records lanes part for that, and are collected and put back, by code that does not fit the first cache
 of instructions; a series is a chain in which every coefficient waits for the one before; signs are certified, errors
 are carried along, and divisions and roots take as long as ten products. Linear blocks (P6) glide without a series, by
-hyperbolic functions: there the slots of lanes that part count for more, 170 vectors that are loaded every few pieces.
+hyperbolic functions: there it counts for more that the slots of lanes that part are loaded every few pieces.
 """
 
 

@@ -34,7 +34,7 @@ class Emitter:
         self.before = []  # the blocks before the loops that are being written
         self._depths = {}  # in how many of them a value is made anew, by the identity of the value
         self._alive = []  # so that identities are not used again
-        self._constants = {}  # by their text: to write one takes as long as ten operations
+        self._constants = {}  # by their text: each is written once
 
     # Types and small things
 

@@ -1,5 +1,4 @@
-"""One of two values by a condition, as one operation: `jnp.where` is a call of a function, which takes as long to trace
-as ten."""
+"""One of two values by a condition, as one operation: `jnp.where` is a call of a function, and there are hundreds."""
 
 from typing import Any
 
