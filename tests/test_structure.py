@@ -357,6 +357,8 @@ SHARED = {
     "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
     "sweeps.grid._examples": "changed at import only",
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",
+    "transforms.recipe._alike": "under a lock",
+    "transforms.recipe._latest": "under a lock",
 }
 CHANGES = {"add", "append", "clear", "discard", "extend", "insert", "pop", "popitem", "remove", "setdefault", "update"}
 

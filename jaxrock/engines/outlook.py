@@ -29,9 +29,9 @@ class _Ahead(eqx.Module):
         """Of a component; no derivatives."""
         values = jax.lax.stop_gradient(jnp.pad(bounds.values, (0, 1)))
         if values.size <= _NEAR:
-            return cls(bounds, _running_maximum(values, bounds.left), values, values)
-        to_end = _running_maximum(values, bounds.left)
-        return cls(bounds, to_end, *(_sliding_maximum(values, width) for width in (_NEAR, _FAR)))
+            return cls(bounds, _maximum_to_end(values, bounds.left), values, values)
+        to_end, near, far = _maxima(values)
+        return cls(bounds, to_end if bounds.left is None else _maximum_to_end(values, bounds.left), near, far)
 
     def at(self, values: Inexact[Array, " knots"], piece: Int[Array, ""]) -> Scalar:
         """One of these bounds."""
@@ -86,32 +86,37 @@ class Outlook(eqx.Module):
         return most, None if vertical is None else 1 - vertical.at(vertical.to_end, piece)
 
 
-def _sliding_maximum(values: Inexact[Array, " n"], width: int) -> Inexact[Array, " n"]:
-    """Largest of the `width` values from each position on (width a power of two; zeros beyond the end)."""
-    return _doubled(values, width.bit_length() - 1)
+def _maxima(values: Inexact[Array, " n"]) -> tuple[Inexact[Array, " n"], ...]:
+    """Largest of the values from each position on: to the end, of the next 16, and of the next 256.
 
-
-def _running_maximum(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:
-    """Largest of the values from each position on, or of so many as are `left`; XLA's own takes n^2 operations on
-    CPUs."""
-    return _doubled(values, (values.size - 1).bit_length(), left)
-
-
-def _doubled(values: Inexact[Array, " n"], times: int, left: Int[Array, " m"] | None = None) -> Inexact[Array, " n"]:
-    """Largest of the 2^times values from each position on (zeros beyond the end, and beyond what is `left` from a
-    position on; none is negative).
-
-    A loop for many: unrolled, or as a scan of JAX, it takes XLA longer to compile than all else around a scene.
+    In one loop: a loop takes XLA longer to compile than all else around a scene.
     """
 
-    def wider(values, reach):
-        beyond = jnp.concatenate([values, jnp.zeros_like(values)])
-        more = jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size)
-        return jnp.maximum(values, more if room is None else where(reach < room, more, 0.0))
+    def wider(k, maxima):
+        wide, near, far = maxima
+        wide = _wider(wide, 1 << k)
+        return wide, where(1 << k < _NEAR, wide, near), where(1 << k < _FAR, wide, far)
 
-    room = None if left is None else jnp.pad(left, (0, values.size - left.size))
-    if values.size <= _NEAR and left is None:
-        for k in range(times):
-            values = jnp.maximum(values, jnp.pad(values[1 << k :], (0, min(1 << k, values.size))))
-        return values
-    return jax.lax.fori_loop(0, times, lambda k, values: wider(values, 1 << k), values)
+    return jax.lax.fori_loop(0, (values.size - 1).bit_length(), wider, (values, values, values))
+
+
+def _maximum_to_end(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:
+    """Largest of the values from each position on, or of so many as are `left`; XLA's own takes n^2 operations on
+    CPUs."""
+    times, size = (values.size - 1).bit_length(), values.size
+    if left is not None:
+        room = jnp.pad(left, (0, size - left.size))
+        return jax.lax.fori_loop(0, times, lambda k, values: _wider(values, 1 << k, room), values)
+    for k in range(times):
+        values = jnp.maximum(values, jnp.pad(values[1 << k :], (0, min(1 << k, size))))
+    return values
+
+
+def _wider(
+    values: Inexact[Array, " n"], reach: Int[Array, ""], room: Int[Array, " n"] | None = None
+) -> Inexact[Array, " n"]:
+    """Each value, or the one `reach` further on if that is larger (zeros beyond the end, and beyond the `room` that is
+    left from a position on; none is negative)."""
+    beyond = jnp.concatenate([values, jnp.zeros_like(values)])
+    more = jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size)
+    return jnp.maximum(values, more if room is None else where(reach < room, more, 0.0))

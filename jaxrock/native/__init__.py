@@ -1,6 +1,6 @@
 """Machine code for vectors of lanes: a program that JAX traces for one lane, compiled by LLVM for 8 or 16 of them.
 
 Knows nothing of blocks; imports `numerics.elementary`, `numerics.compound` and `keeping.folder`, and needs llvmlite.
-Start with `call`, then `plain`, `unmarked`, `hoisting` and `partition`, `kernels`, `parted`, `emitter`, `arrays`,
-`lists` and `operations`, `machine`, `interface` and `pool`.
+Start with `call` and `postponed`, then `plain`, `unmarked`, `hoisting` and `partition`, `kernels`, `parted`, `emitter`,
+`arrays`, `lists` and `operations`, `machine`, `interface` and `pool`.
 """

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxrock.native.emitter import SMALL, is_known
@@ -64,28 +65,75 @@ class Plan:
         inputs = {v for v, same in zip(self._program.jaxpr.invars, self._shared) if not same}
         return inputs | {v for v in self._each.outputs if not (self._alone and is_long(v.aval.shape))}
 
+    @property
+    def _own_inputs(self) -> list:
+        """Of what is left when XLA has computed its part: what a lane has of its own."""
+        own = self._first_own()
+        return [v for v in self._rest.inputs if v in own]
+
+    @property
+    def own(self) -> list:
+        """Shapes and types of these."""
+        return [v.aval for v in self._own_inputs]
+
+    @property
+    def results(self) -> list:
+        """Shapes and types of what it returns, of one lane."""
+        return [v.aval for v in self._program.jaxpr.outvars]
+
+    @property
+    def has_own_lists(self) -> bool:
+        """Whether a lane has long lists of its own, or what XLA computes for it."""
+        return bool(self._each.outputs) or any(is_long(x.shape) for x in self.own)
+
     def __call__(self, leaves: list, threads: int, count=None) -> list:
         """Results, with a leading axis of lanes, of leaves; `count`: of how many lanes, the first, there have to be
         results (at least 1; known at run time only)."""
-        values = dict(zip(self._program.jaxpr.invars, leaves))
-        computed(self._once, values, batched=False)
-        computed(self._each, values, batched=True)
+        values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
         more = -size % lanes_of()
         told = size + more, size if count is None else count, threads
-        sizes = jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
-        own = self._first_own()
-        values.update((v, values[v][0]) for v in self._each.outputs if v not in own)
-        for v in [v for v in self._rest.inputs if v in own]:
+        sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
+        for v in self._own_inputs:
             x = values[v]
             x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
             values[v] = x if is_long(v.aval.shape) else jnp.moveaxis(x, 0, -1)
+        return [jnp.moveaxis(x, -1, 0)[:size] for x in self._run(values, sizes, size + more)]
+
+    def own_of(self, leaves: list) -> list:
+        """Of leaves those that are `own`."""
+        values = dict(zip(self._program.jaxpr.invars, leaves))
+        return [values[v] for v in self._own_inputs]
+
+    def of_collected(self, leaves: list, own: list, sizes, room: int) -> list:
+        """Results, the axis of lanes behind, of lanes whose `own` have it there, too. `sizes`: `room` for lanes, how
+        many are wanted (the first), and threads."""
+        values = self._prepared(leaves)
+        values.update(zip(self._own_inputs, own))
+        return self._run(values, sizes, room)
+
+    def _prepared(self, leaves: list) -> dict:
+        """Values of variables before machine code runs."""
+        values = dict(zip(self._program.jaxpr.invars, leaves))
+        computed(self._once, values, batched=False)
+        computed(self._each, values, batched=True)
+        own = self._first_own()
+        values.update((v, values[v][0]) for v in self._each.outputs if v not in own)
+        return values
+
+    def _run(self, values: dict, sizes, room: int) -> list:
+        """The machine code: what the program returns, the axis of lanes behind."""
+        arrays = []
         for part, name in self._pieces:
-            shapes = [(*v.aval.shape, size + more) for v in part.outputs]
-            results = [jax.ShapeDtypeStruct(shape, v.aval.dtype) for shape, v in zip(shapes, part.outputs)]
-            arrays = jax.ffi.ffi_call(name, results)(sizes, *(values[v] for v in part.inputs))
+            results = [jax.ShapeDtypeStruct((*v.aval.shape, room), v.aval.dtype) for v in part.outputs]
+            arrays = ran(name, results, sizes, *(values[v] for v in part.inputs))
             values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
-        return [jnp.moveaxis(x, -1, 0)[:size] for x in arrays]
+        return arrays
+
+
+def ran(name: str, results: list, *arrays, aliases: dict | None = None) -> list:
+    """What machine code of this name makes of arrays; `aliases`: which of them become which results."""
+    return list(jax.ffi.ffi_call(name, results, input_output_aliases=aliases)(*arrays))
 
 
 # What takes as long as many products: it is not done again whenever a lane takes the next scene.

@@ -1,11 +1,11 @@
 """Loops rid of what stays the same in all their turns, where machine code cannot do it: XLA computes it before them."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
-import jax
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, Var
 
-from jaxrock.native.partition import needed_by, part_of
+from jaxrock.native.partition import needed_by
 
 
 def hoisted(program: ClosedJaxpr, is_left: Callable, constants: Sequence[int] = ()) -> ClosedJaxpr:
@@ -17,11 +17,47 @@ def hoisted(program: ClosedJaxpr, is_left: Callable, constants: Sequence[int] = 
     constant = {program.jaxpr.invars[place] for place in constants} | set(program.jaxpr.constvars)
     if not _has_any(program.jaxpr, constant, is_left):
         return program
+    around = _Around(program)
+    constant |= _same(program.jaxpr, constant)[1]
+    for equation in program.jaxpr.eqns:
+        if equation.primitive.name == "while":
+            equation = _loop(equation, around, is_left)
+        elif equation.primitive.name == "cond" and constant:
+            equation = _cases(equation, around, constant, is_left)
+        around.equations.append(equation)
+    return around.program
 
-    def run(*leaves):
-        return _run(program, leaves, constant, is_left)
 
-    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in program.in_avals))
+class _Around:
+    """A program that is written anew: operations of those within it may come to stand before them."""
+
+    def __init__(self, program: ClosedJaxpr):
+        self._old, self.equations = program, []
+        self._known = dict(zip(program.jaxpr.constvars, program.consts, strict=True))
+
+    @property
+    def program(self) -> ClosedJaxpr:
+        """As far as it is written."""
+        new = self._old.jaxpr.replace(eqns=self.equations, constvars=list(self._known))
+        return ClosedJaxpr(new, list(self._known.values()))
+
+    def take(self, program: ClosedJaxpr, more: list, given: dict) -> tuple[list, list]:
+        """Take some operations out of a program within: variables in it that they make for the rest of it, and what
+        these are here. `given`: what its inputs are here."""
+        names = dict(given)
+        for variable, value in zip(program.jaxpr.constvars, program.consts, strict=True):
+            if variable in needed_by(more, []):
+                names[variable] = Var(variable.aval)
+                self._known[names[variable]] = value
+        for equation in more:
+            # A program may stand at many places: what it makes has another name at each.
+            names.update((v, Var(v.aval)) for v in equation.outvars)
+            inputs = [x if isinstance(x, Literal) else names[x] for x in equation.invars]
+            self.equations.append(equation.replace(invars=inputs, outvars=[names[v] for v in equation.outvars]))
+        rest = [equation for equation in program.jaxpr.eqns if equation not in more]
+        passed = needed_by(rest, program.jaxpr.outvars)
+        made = [v for equation in more for v in equation.outvars if v in passed]
+        return made, [names[v] for v in made]
 
 
 def _has_any(jaxpr, constant: set, is_left: Callable) -> bool:
@@ -44,7 +80,8 @@ def _same(jaxpr, constant: set) -> tuple[list, set]:
     """Operations that only depend on what is constant, and all that is."""
     constant, same = set(constant), []
     for equation in jaxpr.eqns:
-        if equation.primitive.name != "while" and constant.issuperset(needed_by([equation], [])):
+        inputs = [x for x in equation.invars if not isinstance(x, Literal)]
+        if equation.primitive.name != "while" and constant.issuperset(inputs):
             constant.update(equation.outvars)
             same.append(equation)
     return same, constant
@@ -70,67 +107,37 @@ def _variables(program: ClosedJaxpr, places: Sequence[int]) -> set:
     return {program.jaxpr.invars[place] for place in places} | set(program.jaxpr.constvars)
 
 
-def _run(program: ClosedJaxpr, leaves: Sequence, constant: set, is_left: Callable) -> list:
-    """Evaluate a program, its loops and conditions rid of what is hoisted."""
-    jaxpr, constant = program.jaxpr, constant | _same(program.jaxpr, constant)[1]
-    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*program.consts, *leaves]))
-
-    def read(atom):
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for equation in jaxpr.eqns:
-        given = [read(x) for x in equation.invars]
-        if equation.primitive.name == "while":
-            found = _run_loop(equation, given, is_left)
-        elif equation.primitive.name == "cond" and constant:
-            found = _run_cases(equation, given, constant, is_left)
-        else:
-            part = part_of(program, [equation], list(equation.outvars))
-            found = jaxpr_as_fun(part.program)(*(values[v] for v in part.inputs))
-        values.update(zip(equation.outvars, found))
-    return [read(x) for x in jaxpr.outvars]
+def _without(program: ClosedJaxpr, more: list, inputs: list) -> ClosedJaxpr:
+    """A program without some operations, with other inputs."""
+    rest: Any = [equation for equation in program.jaxpr.eqns if equation not in more]
+    told = program.jaxpr.debug_info.with_unknown_names()  # JAX would compare their number
+    return ClosedJaxpr(program.jaxpr.replace(invars=inputs, eqns=rest, debug_info=told), program.consts)
 
 
-def _without(program: ClosedJaxpr, more: list, given: dict, place: int) -> tuple[ClosedJaxpr, list]:
-    """A program without some operations, whose results it takes as inputs at a place, and these results."""
-    jaxpr = program.jaxpr
-    rest = [equation for equation in jaxpr.eqns if equation not in more]
-    passed = needed_by(rest, jaxpr.outvars)
-    out = [v for equation in more for v in equation.outvars if v in passed]
-    part = part_of(program, more, out)
-    found = jaxpr_as_fun(part.program)(*(given[v] for v in part.inputs)) if out else []
-    inputs = [*jaxpr.invars[:place], *out, *jaxpr.invars[place:]]
-    told = jaxpr.debug_info.with_unknown_names()
-    return ClosedJaxpr(jaxpr.replace(invars=inputs, eqns=rest, debug_info=told), program.consts), found
-
-
-def _run_loop(loop, given: list, is_left: Callable) -> list:
-    """A loop, and before it what is hoisted out of it."""
-    parameters = loop.params
-    n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
-    body, consts = hoisted(parameters["body_jaxpr"], is_left, range(n_body)), given[n_cond : n_cond + n_body]
-    constants = body.jaxpr.invars[:n_body]
+def _loop(loop, around: _Around, is_left: Callable):
+    """A loop rid of what is hoisted out of it, which comes before it."""
+    n_cond, n_body = loop.params["cond_nconsts"], loop.params["body_nconsts"]
+    body = hoisted(loop.params["body_jaxpr"], is_left, range(n_body))
+    first, rest, constants = loop.invars[: n_cond + n_body], loop.invars[n_cond + n_body :], body.jaxpr.invars[:n_body]
     more = _to_hoist(body.jaxpr, set(constants) | set(body.jaxpr.constvars), is_left)
-    body, found = _without(body, more, dict(zip(constants, consts)), n_body)
-    changed = parameters | {"body_jaxpr": body, "body_nconsts": n_body + len(found)}
-    return loop.primitive.bind(*given[:n_cond], *consts, *found, *given[n_cond + n_body :], **changed)
+    made, here = around.take(body, more, dict(zip(constants, first[n_cond:])))
+    body = _without(body, more, [*constants, *made, *body.jaxpr.invars[n_body:]])
+    changed = loop.params | {"body_jaxpr": body, "body_nconsts": n_body + len(made)}
+    return loop.replace(invars=[*first, *here, *rest], params=changed)
 
 
-def _run_cases(equation, given: list, constant: set, is_left: Callable) -> list:
-    """A condition, and before it what is hoisted out of its cases."""
-    which, *operands = given
-    branches, found, places = [], [], _places(equation, constant)
-    for branch in equation.params["branches"]:
+def _cases(condition, around: _Around, constant: set, is_left: Callable):
+    """A condition rid of what is hoisted out of its cases, which comes before it."""
+    places, branches = _places(condition, constant), []
+    for branch in condition.params["branches"]:
         branch = hoisted(branch, is_left, places)
         more = _to_hoist(branch.jaxpr, _variables(branch, places), is_left)
-        values = dict(zip(branch.jaxpr.invars, operands))
-        branches.append(_without(branch, more, values, len(branch.jaxpr.invars)))
-        found += branches[-1][1]
-
-    def case(number):
-        program, own = branches[number]
-        before = sum(len(each) for _, each in branches[:number])
-        places = slice(len(operands) + before, len(operands) + before + len(own))
-        return lambda *all_: jaxpr_as_fun(program)(*all_[: len(operands)], *all_[places])
-
-    return jax.lax.switch(which, [case(number) for number in range(len(branches))], *operands, *found)
+        made, here = around.take(branch, more, dict(zip(branch.jaxpr.invars, condition.invars[1:])))
+        branches.append((branch, more, made, here))
+    all_made = [v for _, _, made, _ in branches for v in made]
+    changed = []
+    for branch, more, made, _ in branches:  # every case is given what any of them needs
+        inputs = [v if v in made else Var(v.aval) for v in all_made]
+        changed.append(_without(branch, more, [*branch.jaxpr.invars, *inputs]))
+    given = [x for *_, here in branches for x in here]
+    return condition.replace(invars=[*condition.invars, *given], params=condition.params | {"branches": tuple(changed)})

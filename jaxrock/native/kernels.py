@@ -5,7 +5,7 @@ Several threads may call such a function with the same arguments: each takes lan
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class Frame:
     is the first that nobody has taken.
     """
 
-    def __init__(self, jaxpr, lanes: int, name: str):
+    def __init__(self, inputs: Sequence[np.dtype], outputs: Sequence[np.dtype], lanes: int, name: str):
         self.module = ir.Module(name)
         table = _I8.as_pointer().as_pointer()
         kinds = [table, table, _I64.as_pointer()]
@@ -48,13 +48,18 @@ class Frame:
         # Or else LLVM spills vectors across the lines of the cache, which takes twice as long.
         function.attributes.add("nounwind")  # llvmlite writes the alignment only after another attribute
         function.attributes.alignstack = 64
-        outputs, inputs, self.next = function.args
+        to, of, self.next = function.args
         self.b = ir.IRBuilder(function.append_basic_block("entry"))
         self.e = Emitter(self.b, lanes)
-        self.sources = [self._array(inputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.invars, 1)]
-        self.targets = [self._array(outputs, i, v.aval.dtype) for i, v in enumerate(jaxpr.outvars)]
-        self.sizes = self._array(inputs, 0, np.int32)
+        self.sources = [self._array(of, i, kind) for i, kind in enumerate(inputs, 1)]
+        self.targets = [self._array(to, i, kind) for i, kind in enumerate(outputs)]
+        self.sizes = self._array(of, 0, np.int32)
         self.width, self.count = (self.b.sext(self.b.load(self.b.gep(self.sizes, [_I32(i)])), _I64) for i in (0, 1))
+
+    @classmethod
+    def of(cls, jaxpr, lanes: int, name: str) -> "Frame":
+        """The function of a program."""
+        return cls([v.aval.dtype for v in jaxpr.invars], [v.aval.dtype for v in jaxpr.outvars], lanes, name)
 
     def _array(self, of, index: int, dtype):
         kind = _I8 if dtype == np.bool_ else self.e.kind(dtype)
@@ -110,7 +115,7 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     (at least 1). What is not `shared` has an axis of lanes.
     """
     jaxpr = program.jaxpr
-    f = Frame(jaxpr, lanes, name)
+    f = Frame.of(jaxpr, lanes, name)
     b, e = f.b, f.e
     head, inside, after = (b.append_basic_block(name) for name in ("lanes", "program", "end"))
     b.branch(head)
@@ -138,7 +143,7 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
 
 def emit_loop(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """As `emit`, of a program that is one loop: a lane that is done takes the next scene, and waits for no other."""
-    return Refilled(Frame(program.jaxpr, lanes, name), program, shared).module()
+    return Refilled(Frame.of(program.jaxpr, lanes, name), program, shared).module()
 
 
 class Refilled:

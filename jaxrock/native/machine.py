@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 
 from llvmlite import binding
+from llvmlite.ir import Module
 
 from jaxrock._foreign import is_known, register
 from jaxrock.keeping import folder
@@ -38,11 +39,13 @@ class _Machine:
             code.verify()
         except RuntimeError as error:  # what was written is no program: XLA takes over
             raise Unsupported(f"a program that LLVM refuses: {error}") from error
-        # What the emitter writes has no calls to inline and no loops to turn into vectors: more passes than these take
-        # a fifth more time in all, and what comes of them is no faster.
-        options = binding.create_pipeline_tuning_options(speed_level=1)
-        builder = binding.create_pass_builder(self._target, options)
-        passes = builder.getFunctionPassManager()
+        # What the emitter writes has no calls to inline, no loops to turn into vectors, and nothing left in them that
+        # stays the same. LLVM's usual passes take three times as long as these two, a fifth of all that it takes, and
+        # what comes of them is no faster; one of them sums in an order of its own, which costs digits.
+        passes = binding.create_new_function_pass_manager()
+        passes.add_simplify_cfg_pass()
+        passes.add_instruction_combine_pass()
+        builder = binding.create_pass_builder(self._target, binding.create_pipeline_tuning_options())
         for function in code.functions:
             if not function.is_declaration:
                 passes.run(function, builder)
@@ -85,7 +88,12 @@ def registered(program, shared: list[bool], emit: Callable = emit) -> str:
     if not is_known():
         raise Unsupported("XLA's interface of this version")
     module = emit(program, shared, lanes_of(), "program")
-    add_handler(module, len(program.jaxpr.outvars), 1 + len(shared))
+    return kept(module, len(program.jaxpr.outvars), 1 + len(shared))
+
+
+def kept(module: Module, outputs: int, inputs: int) -> str:
+    """The name under which XLA finds the machine code of the function `program` of a module."""
+    add_handler(module, outputs, inputs)
     text = str(module)
     name = "jaxrock_" + hashlib.sha256(f"{machine()}\n{text}".encode()).hexdigest()[:20]
     if not is_there(name):

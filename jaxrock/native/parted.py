@@ -46,7 +46,7 @@ def _cases(program) -> int:
 
 def emit_parted(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     """As `emit_loop`, of a loop whose step has cases that are steps of their own."""
-    return _Parted(Frame(program.jaxpr, lanes, name), program, shared).module()
+    return _Parted(Frame.of(program.jaxpr, lanes, name), program, shared).module()
 
 
 class _Step:

@@ -22,7 +22,7 @@ _POINTER, _I32, _I64 = ir.IntType(8).as_pointer(), ir.IntType(32), ir.IntType(64
 
 
 def call_in_threads(b: ir.IRBuilder, program: ir.Function, tables: list, interface, context) -> None:
-    """Call a program in this thread and, where there are many lanes, at the same time in others.
+    """Call a program in this thread and, where there are many lanes, at the same time in others; for none it is not.
 
     `tables`: of outputs and of inputs; `interface`, `context`: what XLA has passed for calls of its own functions.
     """
@@ -32,13 +32,14 @@ def call_in_threads(b: ir.IRBuilder, program: ir.Function, tables: list, interfa
     others = b.select(b.icmp_signed("<", most, others), most, others)
     if not HAS_THREADS:
         others = _I64(0)
-    with b.if_else(b.icmp_signed("<=", others, _I64(0))) as (alone, shared):
-        with alone:
-            following = b.alloca(_I64)
-            b.store(_I64(0), following)
-            b.call(program, [*tables, following])
-        with shared:
-            _Shared(b, program).run(tables, others, interface, context)
+    with b.if_then(b.icmp_signed(">", wanted, _I64(0))):
+        with b.if_else(b.icmp_signed("<=", others, _I64(0))) as (alone, shared):
+            with alone:
+                following = b.alloca(_I64)
+                b.store(_I64(0), following)
+                b.call(program, [*tables, following])
+            with shared:
+                _Shared(b, program).run(tables, others, interface, context)
 
 
 class _Shared:
@@ -59,7 +60,7 @@ class _Shared:
             b.store(b.ptrtoint(table, _I64), self._number(b, memory, number))
         for number, value in ((_NEXT, _I64(0)), (_BEGUN, _I64(0)), (_ENDED, _I64(0)), (_HELD, b.add(others, _I64(1)))):
             b.store(value, self._number(b, memory, number))
-        asked = _count_up(b, others, self._asking(memory, interface, context))
+        asked = count_up(b, others, self._asking(memory, interface, context))
         b.atomic_rmw("sub", self._number(b, memory, _HELD), b.sub(others, asked), "acq_rel")
         self._run(b, memory)
         begun = b.atomic_rmw("add", self._number(b, memory, _BEGUN), _I64(_CLOSED), "acq_rel")
@@ -138,7 +139,7 @@ def _part(b: ir.IRBuilder, structure, kind: type[ctypes.Structure], name: str, o
     return b.bitcast(b.gep(structure, [_I64(getattr(kind, name).offset)]), of.as_pointer())
 
 
-def _count_up(b: ir.IRBuilder, size, act: Callable):
+def count_up(b: ir.IRBuilder, size, act: Callable):
     """`act(number)` from 0 to `size`, or until it is false; the number where it ends."""
     before, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("next", "act", "done"))
     b.branch(head)

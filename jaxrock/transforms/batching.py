@@ -8,8 +8,9 @@ Which way `Lanes.__call__` takes:
     up to _FEW; or any number   careful, in lanes                   careful, in chunks of _LANES
       without a quick pass
     more, with a quick pass     quick, in lanes; careful what it    quick, in chunks of _QUICK_LANES, which after
-                                  postpones, in chunks of             every round (if there are any) are made up
-                                  _NATIVE_LANES                       anew; careful what it postpones
+                                  postpones, collected; in            every round (if there are any) are made up
+                                  chunks of _NATIVE_LANES where       anew; careful what it postpones
+                                  scenes have lists of their own
 
 On accelerators XLA's chunks have _WIDE lanes. *Careful* is the function as it was given, *quick* a part of its
 `Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this process, where llvmlite is: not for what users
@@ -32,10 +33,11 @@ from jaxrock.transforms.recipe import Recipe
 
 native: Any = None
 Unsupported: Any = ()
+Postponed: Any = None
 try:  # an extra
-    from jaxrock.native import call, operations
+    from jaxrock.native import call, operations, postponed
 
-    native, Unsupported = call, operations.Unsupported
+    native, Unsupported, Postponed = call, operations.Unsupported, postponed.Postponed
 except (ImportError, OSError):
     pass
 
@@ -86,7 +88,10 @@ class Lanes:
 
     def codes(self) -> list[str]:
         """Names of the machine code that it calls."""
-        return [name for plan in self._plans() for name in plan.names] if self.in_machine_code else []
+        if not self.in_machine_code:
+            return []
+        postponed = self._postponed if self._is_quick else None
+        return [name for part in [*self._plans(), postponed] if part is not None for name in part.names]
 
     def found(self, code: str) -> bool:
         """Whether such machine code is there, or kept."""
@@ -115,6 +120,14 @@ class Lanes:
             self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled, alone)
         return self.recipe.plans[key]
 
+    @property
+    def _postponed(self) -> Any:
+        """The careful plan for those that the quick one postpones; None: in chunks."""
+        key = "postponed", self.own
+        if key not in self.recipe.plans:
+            self.recipe.plans[key] = Postponed.of(self._plans()[1])
+        return self.recipe.plans[key]
+
     def _one_natively(self, leaves) -> list:
         (plan,) = self._plans()
         leaves = [jnp.asarray(x)[None] if mine else x for x, mine in zip(leaves, self._own_of_one)]
@@ -126,6 +139,8 @@ class Lanes:
         if len(plans) == 1:
             return plans[0](leaves, threads)
         *found, which = plans[0](leaves, threads)
+        if self._postponed is not None:
+            return self._postponed(leaves, found, which, threads)
 
         def carefully(part, count):
             rest = iter(part)

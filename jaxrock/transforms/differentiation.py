@@ -54,7 +54,10 @@ def differentiable(
         like = [jax.ShapeDtypeStruct(jnp.shape(x), x.dtype) for x in leaves]
         told = None if name is None else facts_of((name, structure.unflatten(like)))
         known = results(structure.unflatten(like)) if told is not None and results is not None else None
-        recipe = Recipe(function, structure, like, passes, on_tape, told, known, in_lanes, refilled, plain)
+        recipe = Recipe.of(
+            function, structure, like, told,
+            passes=passes, on_tape=on_tape, results=known, in_lanes=in_lanes, refilled=refilled, plain=plain,
+        )  # fmt: skip
         recipe, leaves = _without_outside(recipe, leaves)
         return computed(recipe, leaves)
 

@@ -1,6 +1,9 @@
 """What is computed of one scene: a function as a whole, in parts, and with its derivatives, as a thing with a name."""
 
+import collections
 import functools
+import threading
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +13,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
 from jaxrock._garbage import not_collected
+from jaxrock.keeping.facts import settings
 from jaxrock.keeping.folder import name_of
 from jaxrock.numerics.xla_cpu import are_marked
 from jaxrock.transforms.fingerprint import Program
@@ -77,6 +81,19 @@ class Recipe:
         self.plain = plain
         self.plans, self._derivatives, self._programs = {}, {}, {}  # what has been made of it
 
+    @classmethod
+    def of(cls, function: Callable, structure: Any, like: Sequence, facts: str | None, **rest: Any) -> "Recipe":
+        """A recipe; the one that there is of a function with the same facts, with all that has been made of it."""
+        if facts is None:
+            return cls(function, structure, like, **rest)
+        key = facts, tuple((x.shape, x.dtype) for x in like), structure, settings()
+        with _one_at_a_time:
+            recipe = _alike.get(key)
+            if recipe is None:
+                recipe = _alike[key] = cls(function, structure, like, facts=facts, **rest)
+            _latest.append(recipe)
+        return recipe
+
     def _traced(self, quick: bool) -> tuple[ClosedJaxpr, Any]:
         key = quick, are_marked()
         if key not in self._programs:
@@ -138,3 +155,9 @@ class Recipe:
 
     def __repr__(self) -> str:
         return f"recipe {self.name}"
+
+
+# Recipes with facts: those that a compiled function holds, and the latest.
+_alike: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
+_latest: collections.deque = collections.deque(maxlen=32)
+_one_at_a_time = threading.Lock()

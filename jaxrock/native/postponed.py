@@ -1,0 +1,123 @@
+"""Some of many scenes once more: those that a first program has postponed are collected, run through a second one, and
+their results put where the first ones were. Needs llvmlite.
+
+XLA would do it in a loop over chunks, with a gather for every array of scenes and a scatter for every result, which
+takes it longer to compile than all else around a map.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from llvmlite import ir
+
+from jaxrock.native.call import Plan, lanes_of, ran
+from jaxrock.native.kernels import Frame, is_long
+from jaxrock.native.machine import kept
+from jaxrock.native.pool import count_up
+
+_I1, _I8, _I32, _I64 = ir.IntType(1), ir.IntType(8), ir.IntType(32), ir.IntType(64)
+_NUMBER = np.dtype(np.int32)
+
+
+class Postponed:
+    """A plan for those of many scenes that are postponed."""
+
+    def __init__(self, plan: Plan):
+        self._plan = plan
+        own, results = plan.own, plan.results
+        self._listed = kept(_listed(), 2, 3)
+        self._collected = kept(_moved(own, own, _collect), len(own), 2 + len(own))
+        self._put_back = kept(_moved([*results, *results], results, _put_back), len(results), 2 + 2 * len(results))
+
+    @classmethod
+    def of(cls, plan: Plan) -> "Postponed | None":
+        """None where scenes have long lists of their own, which XLA makes for a chunk of them at a time."""
+        return None if plan.has_own_lists or any(is_long(x.shape) for x in plan.results) else cls(plan)
+
+    @property
+    def names(self) -> list[str]:
+        """Of all machine code that it calls, but for the plan's."""
+        return [self._listed, self._collected, self._put_back]
+
+    def __call__(self, leaves: list, found: list, which, threads: int) -> list:
+        """`found`, results of all scenes, with those of the plan in the places `which`."""
+        size = which.size
+        room = size + -size % lanes_of()
+        told = [jax.ShapeDtypeStruct((n,), jnp.int32) for n in (3, size)]
+        sizes, places = ran(
+            self._listed, told, np.array([size, 1, 1], np.int32), np.array([room, threads], np.int32), which
+        )
+        own = [jax.ShapeDtypeStruct((*x.shape, room), x.dtype) for x in self._plan.own]
+        collected = ran(self._collected, own, sizes, places, *self._plan.own_of(leaves))
+        results = self._plan.of_collected(leaves, collected, sizes, room)
+        like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in found]
+        first = 2 + len(results)
+        return ran(
+            self._put_back, like, sizes, places, *results, *found, aliases={first + i: i for i in range(len(found))}
+        )
+
+
+def _listed() -> ir.Module:
+    """A program that lists the places of those that are wanted among many, and what it takes to run them: `(sizes,
+    (room, threads), which)` to `(sizes, places)`."""
+    f = Frame([_NUMBER, np.dtype(bool)], [_NUMBER, _NUMBER], lanes_of(), "program")
+    b, (told, which), (sizes, places) = f.b, f.sources, f.targets
+    count = b.alloca(_I64)
+    b.store(_I64(0), count)
+
+    def look(scene):
+        here = b.load(count)
+        b.store(b.trunc(scene, _I32), b.gep(places, [here]))  # it stays there if it is wanted
+        b.store(b.add(here, b.zext(b.load(b.gep(which, [scene])), _I64)), count)
+        return _I1(1)
+
+    count_up(b, f.width, look)
+    room, threads = (b.load(b.gep(told, [_I32(i)])) for i in (0, 1))
+    for i, value in enumerate((room, b.trunc(b.load(count), _I32), threads)):
+        b.store(value, b.gep(sizes, [_I32(i)]))
+    b.ret_void()
+    return f.module
+
+
+def _moved(inputs: Sequence, outputs: Sequence, move: Callable) -> ir.Module:
+    """A program that moves numbers between arrays of all scenes and arrays of those in `places`."""
+    f = Frame([_NUMBER, *(x.dtype for x in inputs)], [x.dtype for x in outputs], lanes_of(), "program")
+    b, lanes = f.b, f.e.lanes
+    head, inside, after = (b.append_basic_block(name) for name in ("scenes", "move", "end"))
+    b.branch(head)
+    b.position_at_end(head)
+    first = f.take(lanes)
+    b.cbranch(b.icmp_signed("<", first, f.count), inside, after)
+    b.position_at_end(inside)
+
+    def one(lane):
+        here = b.add(first, lane)
+        last = b.sub(f.count, _I64(1))
+        # A vector is filled up with the last scene.
+        scene = b.select(b.icmp_signed("<", here, last), here, last)
+        place = b.zext(b.load(b.gep(f.sources[0], [scene])), _I64)
+        for source, target, like in zip(f.sources[1:], f.targets, outputs):
+            size = math.prod(like.shape)
+            for number in range(size):
+                of_all = b.add(b.mul(place, _I64(size)), _I64(number))
+                move(b, (source, target), of_all, f.place(number, here), f.place(number, scene))
+        return _I1(1)
+
+    count_up(b, _I64(lanes), one)
+    b.branch(head)
+    b.position_at_end(after)
+    b.ret_void()
+    return f.module
+
+
+def _collect(b: ir.IRBuilder, pointers: tuple, of_all, here, _) -> None:
+    source, target = pointers
+    b.store(b.load(b.gep(source, [of_all])), b.gep(target, [here]))
+
+
+def _put_back(b: ir.IRBuilder, pointers: tuple, of_all, _, scene) -> None:
+    source, target = pointers
+    b.store(b.load(b.gep(source, [scene])), b.gep(target, [of_all]))
