@@ -15,6 +15,7 @@ COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
 PULSES = np.stack([RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT)], axis=1)  # amplitude and period
 TRUE = ALPHA * np.exp(SCATTER * RANDOM.normal(size=COUNT))
 UNKNOWN, SPREAD = rk.inverse.Unknown(0.05, 0.5), rk.inverse.Unknown(0.05, 0.8)
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=12), "progress": False}
 POINT = {"alpha": 0.18, "alpha_sd": 0.2}
 
 
@@ -28,17 +29,27 @@ def suite():
     return rk.motions.Suite(motions())
 
 
+@jax.jit
+@jax.vmap
+def _outcomes(alpha, amplitude, period):
+    block, pulse = rk.Block(alpha, P), rk.SinePulse(amplitude, period)
+    result = rk.outcome(block, pulse, QUICK["model"], engine=QUICK["engine"])
+    return result.overturned, result.max_rotation / alpha
+
+
+def outcomes(*scenes):
+    """Whether blocks overturn, and their peak rotation over their slenderness: any number, by one program."""
+    arrays = np.broadcast_arrays(*scenes)
+    count = arrays[0].size
+    lists = [np.resize(x, (-(-count // COUNT), COUNT)) for x in arrays]
+    found = [jax.device_get(_outcomes(*part)) for part in zip(*lists)]
+    return [np.concatenate(x)[:count] for x in zip(*found)]
+
+
 @functools.cache
 def verdicts():
-    """What blocks do, each drawn for its test: peak rotation over its slenderness too."""
-    true = ALPHA * np.exp(SCATTER * np.random.default_rng(5).normal(size=COUNT))
-
-    def one(alpha, amplitude, period):
-        result = rk.outcome(rk.Block(alpha, P), rk.SinePulse(amplitude, period))
-        return result.overturned, result.max_rotation / alpha
-
-    fell, rotation = jax.jit(jax.vmap(one))(true, *PULSES.T)
-    return np.asarray(fell), np.asarray(rotation)
+    """What blocks do, each drawn for its test."""
+    return outcomes(ALPHA * np.exp(SCATTER * np.random.default_rng(5).normal(size=COUNT)), *PULSES.T)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +57,7 @@ def found():
     make = lambda alpha: rk.Block(alpha, P)
     fell, _ = verdicts()
     return rk.inverse.calibrate_block(make, suite(), fell, {"alpha": UNKNOWN}, {"alpha": SPREAD}, cells=512, folds=10,
-                              progress=False)  # fmt: skip
+                              **QUICK)  # fmt: skip
 
 
 def test_the_truth_is_found_again(found):
@@ -57,9 +68,14 @@ def test_the_truth_is_found_again(found):
         assert 0.005 < float(found.standard_errors[name]) < 0.25
 
 
+@pytest.fixture(scope="module")
+def slopes(found):
+    return jax.jit(jax.grad(found.log_density))(POINT)
+
+
 @pytest.mark.parametrize("name", ["alpha", "alpha_sd"])
-def test_slopes_of_the_likelihood_by_differences(found, name):
-    slope = float(jax.grad(found.log_density)(POINT)[name])
+def test_slopes_of_the_likelihood_by_differences(found, slopes, name):
+    slope = float(slopes[name])
     step = 1e-5 * POINT[name]
     ends = [float(found.log_density({**POINT, name: POINT[name] + sign * step})) for sign in (1, -1)]
     assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
@@ -70,17 +86,16 @@ def test_a_probability_is_the_share_of_the_distribution_that_topples(found, abou
     """By intervals whose ends are found by halving: the grid knows them to half a cell."""
     test = int(np.abs(np.asarray(found.probability) - about).argmin())
     alphas = np.linspace(0.03, 0.8, 400)
-    fell = lambda alpha: bool(rk.outcome(rk.Block(alpha, P), motions()[test]).overturned)
-    lost = np.asarray(jax.jit(jax.vmap(lambda a: rk.outcome(rk.Block(a, P), motions()[test]).overturned))(alphas))
-    law, share = scipy.stats.lognorm(float(found.values["alpha_sd"]), scale=float(found.values["alpha"])), 0.0
+    fell = lambda alpha: outcomes(alpha, *PULSES[test])[0]
+    lost = fell(alphas)
+    law = scipy.stats.lognorm(float(found.values["alpha_sd"]), scale=float(found.values["alpha"]))
     edges = np.flatnonzero(np.diff(lost.astype(int)))
-    share = law.cdf(alphas[0]) if lost[0] else 0.0
-    for edge in edges:
-        low, high = alphas[edge], alphas[edge + 1]
-        for _ in range(12):
-            middle = (low + high) / 2
-            low, high = (middle, high) if fell(middle) == lost[edge] else (low, middle)
-        share += law.cdf(low) if lost[edge] else -law.cdf(low)
+    low, high = alphas[edges], alphas[edges + 1]
+    for _ in range(12):
+        middle = (low + high) / 2
+        same = fell(middle) == lost[edges]
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    share = np.sum(np.where(lost[edges], law.cdf(low), -law.cdf(low))) + lost[-1]
     assert (float(found.probability[test]) - 0.005) / 0.99 == pytest.approx(share, abs=0.011)
 
 
@@ -104,7 +119,7 @@ def test_rotations_say_more_than_verdicts(found):
     seen = np.where(fell, np.nan, np.where(noisy < 0.01, 0.0, noisy))
     more = rk.inverse.calibrate_block(
         lambda alpha: rk.Block(alpha, P), suite(), fell, {"alpha": UNKNOWN}, {"alpha": SPREAD},
-        cells=128, rotation=seen, rotation_sd=0.2, progress=False,
+        cells=512, rotation=seen, rotation_sd=0.2, **QUICK,
     )  # fmt: skip
     assert more.status == rk.inverse.CalibrationStatus.successful
     for name, truth in (("alpha", ALPHA), ("alpha_sd", SCATTER)):
@@ -115,7 +130,7 @@ def test_rotations_say_more_than_verdicts(found):
 def test_names_in_any_order():
     """Two parameters and a scatter: where the likelihood is largest does not hang on the order of their names."""
     unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}
-    given = {"cells": {"alpha": 32, "p": 8}, "progress": False}
+    given = {"cells": {"alpha": 64, "p": 8}} | QUICK  # as many scenes as above: one program
     fell, _ = verdicts()
     found = [
         rk.inverse.calibrate_block(

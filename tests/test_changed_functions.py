@@ -145,6 +145,7 @@ WAYS = [
 
 BLOCK, PULSE = rk.Block(0.2, 2.0), rk.SinePulse(0.28, 1.2)
 ENGINE = rk.Diffrax(rtol=1e-4)
+SHORT = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}  # compiles in half the time
 
 
 def sine(x, block):
@@ -177,7 +178,7 @@ def region(motion):
 
     seen = rk.inverse.Observations([0.2, 0.25], [2.0, 2.5], ["survived", "toppled"])
     over = {"amplitude": [0.2, 0.4], "duration": [0.3, 0.6]}
-    likelihood = rk.inverse.Likelihood(seen, by_name)
+    likelihood = rk.inverse.Likelihood(seen, by_name, model=rk.Linear(), engine=rk.Series(order=6))
     return lambda: rk.inverse.feasible_region(likelihood, over, progress=False).log_likelihood
 
 
@@ -195,7 +196,7 @@ def ratios(model):
 QUICK = {
     "outcome": of_model(lambda model: rk.outcome(BLOCK, PULSE, model, engine=ENGINE).max_rotation),
     "overturning_map of a pulse": of_pulse(
-        lambda f: rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=f, progress=False).max_rotation
+        lambda f: rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=f, **SHORT).max_rotation
     ),
     "feasible_region": (region, pulse),
 }
@@ -357,14 +358,14 @@ def test_checks_of_a_users_pulse_tell_the_point():
     with pytest.raises(
         ValueError, match=r"`period` must be positive and finite, from 1e-9 to 1e9, but is not at the point \(2, 3\)"
     ):
-        rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, -t), progress=False)
-    rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, t), progress=False)
+        rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, -t), **SHORT)
+    rk.overturning_map([3.0], [2.0], pulse=lambda a, t: rk.SinePulse(a, t), **SHORT)
 
 
 def test_an_equal_function_is_not_compiled_again():
     def run(size):
         held = jnp.array([size])
-        return rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=lambda a, t: pulse(held, a, t), progress=False)
+        return rk.overturning_map([1.0, 2.0], [1.2, 1.5], pulse=lambda a, t: pulse(held, a, t), **SHORT)
 
     run(1.0), run(2.0)
     before = len(COMPILED)
@@ -376,15 +377,17 @@ def test_an_equal_function_is_not_compiled_again():
 
 
 class Softer(rk.models.AbstractEquation):
-    """Housner's block on a softer ground, and the same as functions."""
+    """A linear block on a softer ground."""
 
     factors: jax.Array
 
     def moments(self, block):
-        return rk.Housner().moments(block).times(jnp.prod(self.factors))
+        return rk.Linear().moments(block).times(jnp.prod(self.factors))
 
 
 class SofterMoment(eqx.Module):
+    """Housner's, as functions."""
+
     factors: jax.Array
 
     def __call__(self, x, v, push, block):
@@ -392,9 +395,14 @@ class SofterMoment(eqx.Module):
 
 
 FACTORS = jnp.array([0.5, 1.6])
+# The model with its engine, what it is without the factors, and how near they come.
 HELD = {
-    "series": (Softer(FACTORS), None, 1e-9),
-    "functions": (rk.Equation(acceleration=SofterMoment(FACTORS)), rk.Diffrax(rtol=1e-7), 1e-4),
+    "series": ({"model": Softer(FACTORS), "engine": SHORT["engine"], "progress": False}, SHORT, 1e-9),
+    "functions": (
+        {"model": rk.Equation(acceleration=SofterMoment(FACTORS)), "engine": rk.Diffrax(rtol=1e-7), "progress": False},
+        {"progress": False},
+        1e-4,
+    ),
 }
 
 
@@ -402,28 +410,31 @@ HELD = {
 SOFT = float(np.sqrt(0.8))
 
 
-def soft_map(model, engine):
-    found = rk.overturning_map([2.0, 3.0], [1.5, 3.0], model=model, engine=engine, progress=False)
-    return found.max_rotation, rk.overturning_map(np.array([2.0, 3.0]) / SOFT, [1.5, 3.0], progress=False).max_rotation
+def soft_map(held, plain):
+    found = rk.overturning_map([2.0, 3.0], [1.5, 3.0], **held)
+    return found.max_rotation, rk.overturning_map(np.array([2.0, 3.0]) / SOFT, [1.5, 3.0], **plain).max_rotation
 
 
-def soft_suite(model, engine):
+def soft_suite(held, plain):
     levels = [0.25, 0.3, 0.35, 0.4, 0.5]
-    found = rk.hazard.simulated_fragility(BLOCK, [PULSE], levels, model, engine=engine, progress=False)
     softer = rk.Block(0.2, 2.0 * SOFT)
-    return found.verdict, rk.hazard.simulated_fragility(softer, [PULSE], levels, progress=False).verdict
+    return (
+        rk.hazard.simulated_fragility(block, [PULSE], levels, **settings).verdict
+        for block, settings in ((BLOCK, held), (softer, plain))
+    )
 
 
-def soft_critical(model, engine):
-    found = rk.critical_amplitudes(BLOCK, PULSE, model, intensity=(1.3, 1.8), engine=engine, progress=False)
-    other = rk.critical_amplitudes(rk.Block(0.2, 2.0 * SOFT), PULSE, intensity=(1.3, 1.8), progress=False)
-    return found.value, other.value
+def soft_critical(held, plain):
+    softer = rk.Block(0.2, 2.0 * SOFT)
+    return (
+        rk.critical_amplitudes(block, PULSE, intensity=(1.3, 1.8), **settings).value
+        for block, settings in ((BLOCK, held), (softer, plain))
+    )
 
 
-def soft_sensitivities(model, engine):
-    found = rk.studies.sensitivity_map([0.5], [1.0], model=model, engine=engine, progress=False)
-    other = rk.studies.sensitivity_map([0.5], [SOFT], progress=False)
-    return (x.sensitivity.max_rotation.elasticity[0, 0] for x in (found, other))
+def soft_sensitivities(held, plain):
+    found = rk.studies.sensitivity_map([0.5], [1.0], **held), rk.studies.sensitivity_map([0.5], [SOFT], **plain)
+    return (x.sensitivity.max_rotation.elasticity[0, 0] for x in found)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +451,7 @@ def soft_sensitivities(model, engine):
     ],
 )
 def test_models_that_hold_arrays(study, kind):
-    model, engine, tolerance = HELD[kind]
-    found, expected = study(model, engine)
+    *settings, tolerance = HELD[kind]
+    found, expected = study(*settings)
     assert np.size(found) == np.size(expected) > 0
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)

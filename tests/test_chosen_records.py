@@ -1,5 +1,7 @@
 """One record of a suite by its number: under `jax.vmap`, as an axis of a sweep, in place and without copies."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,20 +45,27 @@ def test_an_axis_of_records_beside_one_after_the_other(grid, by_hand, name):
     np.testing.assert_allclose(getattr(grid.values, name), getattr(by_hand, name), rtol=1e-8)
 
 
+@functools.partial(jax.jit, static_argnums=1)
+def told(motion, in_place):
+    """Of twice a motion: its first piece and the one after its last, bounds of what is to come, lengths of pieces, the
+    strongest drive, and bounds of the pieces."""
+    scene = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=in_place)
+    ahead, count = scene.outlook.horizontal, sum(LENGTHS) if in_place else motion.samples.size
+    lengths = jax.vmap(scene.length)(jnp.arange(count))
+    return scene.first, scene.pieces, ahead.to_end, lengths, scene.outlook.strongest_drive, ahead.bounds.values
+
+
 @pytest.mark.parametrize("number", range(4))
 def test_bounds_of_what_is_to_come_end_with_a_record(number):
     """They are those of the record alone: what follows in the array is another motion."""
-    motion = Chosen(JoinedRecords.of(RECORDS), jnp.int32(number), jnp.ones(()))
-    among = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=True)
-    alone = Scene.of(BLOCK, 2.0 * RECORDS[number], rk.Linear())
-    here = slice(int(among.first), int(among.pieces) + 1)
-    ahead, own = among.outlook.horizontal, alone.outlook.horizontal
-    np.testing.assert_array_equal(ahead.to_end[here], own.to_end)
-    pieces = jnp.arange(int(alone.pieces) + 1)
-    lengths = jax.vmap(among.length)(pieces + among.first), jax.vmap(alone.length)(pieces)
-    np.testing.assert_array_equal(*lengths)
-    assert jnp.isinf(lengths[0][-1])
-    assert among.outlook.strongest_drive == alone.outlook.strongest_drive == 2 * max(own.bounds.values)
+    chosen = Chosen(JoinedRecords.of(RECORDS), jnp.int32(number), jnp.ones(()))
+    first, pieces, to_end, lengths, strongest, _ = map(np.asarray, told(chosen, True))
+    _, count, own_to_end, own_lengths, own_strongest, own_bounds = map(np.asarray, told(RECORDS[number], False))
+    np.testing.assert_array_equal(to_end[first : pieces + 1], own_to_end)
+    lengths = lengths[first : first + count + 1]
+    np.testing.assert_array_equal(lengths, own_lengths)
+    assert np.isinf(lengths[-1])
+    assert strongest == own_strongest == 2 * own_bounds.max()
 
 
 def test_labels_are_the_names_of_records(grid, tmp_path):
@@ -92,7 +101,7 @@ def test_lanes_share_the_samples_of_all_records():
     def margin(number):
         return outcome(SUITE[number]).margin
 
-    numbers = jnp.arange(60) % len(SUITE)  # without a quick pass, which takes longer to compile
+    numbers = np.arange(60) % len(SUITE)  # without a quick pass, which takes longer to compile
     memory = jax.jit(jax.vmap(margin)).lower(numbers).compile().memory_analysis()
     lanes = numbers.size * max(LENGTHS) * SAMPLES.itemsize  # one copy for each
     assert memory.temp_size_in_bytes < lanes / 2
@@ -117,12 +126,17 @@ def test_numbers_without_a_record_are_no_other_record():
     with pytest.raises(Exception, match=r"must be in \[0, 3\]"):
         jax.block_until_ready(compiled(jax.device_put(numbers, dealt)))
     exported = jax.export.export(compiled)(jax.ShapeDtypeStruct(numbers.shape, numbers.dtype))
-    expected = [np.nan, *SUITE.peak_acceleration[jnp.array([0, 3])], np.nan]
+    expected = [np.nan, *np.asarray(SUITE.peak_acceleration)[[0, 3]], np.nan]
     np.testing.assert_allclose(exported.call(numbers), expected, rtol=1e-12)
     nothing = Chosen(JoinedRecords.of(RECORDS), jnp.int32(0), jnp.asarray(jnp.nan))
-    scene = Scene.of(BLOCK, 2.0 * nothing, rk.Linear(), in_place=True)
-    shaking, _ = scene.shaking(jnp.int32(0), jnp.zeros(()), 8)
-    assert np.isnan([scene.outlook.strongest_drive, *shaking.horizontal[:2]]).all()
+
+    @jax.jit
+    def shaken(motion):
+        scene = Scene.of(BLOCK, 2.0 * motion, rk.Linear(), in_place=True)
+        shaking, _ = scene.shaking(jnp.int32(0), jnp.zeros(()), 8)
+        return [scene.outlook.strongest_drive, *shaking.horizontal[:2]]
+
+    assert np.isnan(shaken(nothing)).all()
 
 
 @pytest.mark.slow
@@ -134,7 +148,7 @@ def test_an_exported_outcome_without_a_record():
 
 
 def test_measures_of_a_chosen_record():
-    peaks = jax.jit(jax.vmap(peak))(jnp.arange(4))
+    peaks = jax.jit(jax.vmap(peak))(np.arange(4))
     np.testing.assert_allclose(peaks, SUITE.peak_acceleration, rtol=1e-12)
 
 

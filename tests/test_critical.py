@@ -27,12 +27,13 @@ def test_all_ends(kind):
     shape = [np.array([scene["shape"][0] for scene in scenes])] if kind == "exponential" else []
     pulses = PULSES[kind](np.ones_like(length), length, *shape)
     found = rk.critical_amplitudes(rk.Block(alpha, p, restitution), pulses, intensity=(1.001, 12.0))
+    found = jax.tree.map(np.asarray, found)
     assert np.all(found.complete)
     derivatives = 0
     for k, scene in enumerate(scenes):
         ends = scene["ends"]
         assert found.count[k] == len(ends)
-        row = [np.asarray(x)[k, : len(ends)] for x in (found.value, found.rising, found.impacts)]
+        row = [x[k, : len(ends)] for x in (found.value, found.rising, found.impacts)]
         np.testing.assert_allclose(row[0], [float(end["amplitude"]) for end in ends], rtol=1e-12)
         assert row[1].tolist() == [end["kind"] == "below" for end in ends]
         assert row[2].tolist() == [end["impacts"] for end in ends]
@@ -45,6 +46,41 @@ def test_all_ends(kind):
                 derivatives += 1
     assert found.names[:4] == ("alpha", "p", "restitution", "period" if kind == "sine" else "duration")
     assert derivatives >= 4
+
+
+def least(numbers, amplitude):
+    """The three lowest ends of a block under a sine, by slenderness, frequency parameter, restitution and period."""
+    alpha, p, restitution, period = numbers
+    pulse = rk.SinePulse(amplitude, period)
+    return rk.critical_amplitudes(rk.Block(alpha, p, restitution), pulse, intensity=(1.001, 12.0), max_ends=3)
+
+
+def test_lowest_ends_within_transformations():
+    """jit, vmap and reverse mode: ends and their derivatives in 40 digits, and nothing where there are fewer."""
+    scenes = [scene for scene in SCENES if scene["kind"] == "sine"]
+    numbers = np.array([[*scene["block"], scene["length"]] for scene in scenes])
+
+    def told(numbers, amplitude):
+        found = least(numbers, amplitude)
+        return found.value, found
+
+    found = jax.jit(jax.vmap(jax.jacrev(told, has_aux=True)))(numbers, np.ones(len(scenes)))
+    slopes, found = jax.tree.map(np.asarray, found)
+    assert np.all(found.complete) and found.derivative.shape == (len(scenes), 3, 4)
+    fewer, derivatives = 0, 0
+    for k, scene in enumerate(scenes):
+        ends = scene["ends"][:3]
+        count, fewer = len(ends), fewer + (len(ends) < 3)
+        assert found.count[k] == count
+        np.testing.assert_allclose(found.value[k, :count], [float(end["amplitude"]) for end in ends], rtol=1e-12)
+        assert found.impacts[k, :count].tolist() == [end["impacts"] for end in ends]
+        assert np.all(np.isinf(found.value[k, count:])) and not np.any(slopes[k, count:])
+        for row, end in zip(slopes[k], ends):
+            if "gradient" in end:
+                exact = np.array([float(c) for c in end["gradient"]])
+                np.testing.assert_allclose(row, exact, rtol=1e-8, atol=1e-9 * np.abs(exact).max())
+                derivatives += 1
+    assert fewer >= 1 and derivatives >= 2
 
 
 @pytest.mark.slow
@@ -88,44 +124,10 @@ def test_arguments_out_of_range():
 
 
 def test_a_motion_too_weak_has_no_ends():
-    found = rk.critical_amplitudes(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.05), rk.Linear(), intensity=(1.0, 1.5))
-    assert (
-        found.count == 0 and np.isinf(found.lowest) and found.value.shape == (0,) and found.derivative.shape == (0, 4)
-    )
-
-
-def least(numbers):
-    """The three lowest ends of a block under a sine, by slenderness, frequency parameter, restitution and period."""
-    alpha, p, restitution, period = numbers
-    pulse = rk.SinePulse(1.0, period)
-    return rk.critical_amplitudes(rk.Block(alpha, p, restitution), pulse, intensity=(1.001, 12.0), max_ends=3)
-
-
-def test_lowest_ends_within_transformations():
-    """jit, vmap and reverse mode: ends and their derivatives in 40 digits, and nothing where there are fewer."""
-    scenes = [scene for scene in SCENES if scene["kind"] == "sine"]
-    numbers = np.array([[*scene["block"], scene["length"]] for scene in scenes])
-
-    def told(numbers):
-        found = least(numbers)
-        return found.value, found
-
-    slopes, found = jax.jit(jax.vmap(jax.jacrev(told, has_aux=True)))(numbers)
-    assert np.all(found.complete) and found.derivative.shape == (len(scenes), 3, 4)
-    fewer, derivatives = 0, 0
-    for k, scene in enumerate(scenes):
-        ends = scene["ends"][:3]
-        count, fewer = len(ends), fewer + (len(ends) < 3)
-        assert found.count[k] == count
-        np.testing.assert_allclose(found.value[k, :count], [float(end["amplitude"]) for end in ends], rtol=1e-12)
-        assert found.impacts[k, :count].tolist() == [end["impacts"] for end in ends]
-        assert np.all(np.isinf(found.value[k, count:])) and not np.any(slopes[k, count:])
-        for row, end in zip(slopes[k], ends):
-            if "gradient" in end:
-                exact = np.array([float(c) for c in end["gradient"]])
-                np.testing.assert_allclose(row, exact, rtol=1e-8, atol=1e-9 * np.abs(exact).max())
-                derivatives += 1
-    assert fewer >= 1 and derivatives >= 2
+    scene, engine = (rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.05), rk.Linear()), rk.Series(order=6)
+    found = rk.critical_amplitudes(*scene, intensity=(1.0, 1.5), engine=engine)
+    assert found.count == 0 and np.isinf(found.lowest)
+    assert found.value.shape == (0,) and found.derivative.shape == (0, 4)
 
 
 def test_traced_arguments_need_a_number_of_ends():

@@ -33,9 +33,12 @@ def test_numbers_are_seen(case):
 
 
 def test_results_are_seen_with_their_status():
-    told = repr(rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.1, 0.6)))
+    quick = {"model": rk.Linear(), "engine": rk.Series(order=4)}
+    told = repr(rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.1, 0.6), **quick))
     assert told.startswith("Outcome(\n  max_rotation=0,\n") and told.endswith("  status=Status.successful,\n)")
-    many = jax.vmap(lambda a: rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(a, 0.6)))(np.linspace(0.1, 0.5, 7))
+    many = jax.vmap(lambda a: rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(a, 0.6), **quick))(
+        np.linspace(0.1, 0.5, 7)
+    )
     assert "margin=float64[7]" in repr(many) and "status=Status[7]" in repr(many)
 
 

@@ -4,6 +4,7 @@ The processes are those of one machine, which talk over its loopback as machines
 """
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -98,8 +99,16 @@ def bits(results):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    return bits(job(1, "-", tmp_path_factory.mktemp("job") / "alone")[0])
+def finished(tmp_path_factory):
+    """A store that one process has made, with its results."""
+    pytest.importorskip("zarr")
+    folder = tmp_path_factory.mktemp("job")
+    return folder / "a.zarr", bits(job(1, folder / "a.zarr", folder / "alone")[0])
+
+
+@pytest.fixture(scope="module")
+def alone(finished):
+    return finished[1]
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
@@ -135,11 +144,10 @@ def test_a_killed_job_goes_on(tmp_path, request, count, kind):
             assert bits(results) == alone and int(results["resumed"]) == 23 * 31
 
 
-def test_a_job_verifies_its_store_together(tmp_path, alone):
+def test_a_job_verifies_its_store_together(tmp_path, finished):
     """Each process looks at some of the blocks; all hear which are damaged, and the first names them."""
-    pytest.importorskip("zarr")
-    store = tmp_path / "a.zarr"
-    job(1, store, tmp_path / "first")
+    whole, alone = finished
+    store = shutil.copytree(whole, tmp_path / "a.zarr")
     for number in (0, 1, 4):
         (store / "x" / "c" / str(number) / "0").unlink()
     for own, results in enumerate(job(2, store, tmp_path / "second")):

@@ -158,7 +158,7 @@ def test_a_film_of_a_column():
 
 
 def test_the_shape_of_an_asymmetric_block_must_be_given():
-    response = rk.simulate(ROCK, PULSE, duration=1.0)
+    response = rk.simulate(ROCK, PULSE, rk.Linear(), duration=1.0)
     with pytest.raises(ValueError, match="Argument `block` must be given for the response of an asymmetric block"):
         rk.plot.animate(response)
     started(rk.plot.animate(response, ROCK))

@@ -3,7 +3,6 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
@@ -252,7 +251,7 @@ def test_a_block_that_stands_still_is_answered():
 def test_nonsense_is_found():
     """The search's own judge."""
     good = dict(
-        successful=jnp.array([True]), overturned=np.array([False]), margin=np.array([0.5]), impact_count=np.array([1])
+        successful=np.array([True]), overturned=np.array([False]), margin=np.array([0.5]), impact_count=np.array([1])
     )
     good |= {name: np.array([0.1]) for name in ("max_rotation", "max_velocity", "time_of_max", "error")}
     assert not nonsense(good).any()
@@ -260,6 +259,26 @@ def test_nonsense_is_found():
         assert nonsense(good | {name: np.array([np.nan])}).all()
         assert nonsense(good | {name: np.array([np.inf])}).all()
     assert nonsense(good | {"overturned": np.array([True])}).all()
+
+
+def under_multiples(motion, loose, scales):
+    """Outcomes of a block under a motion times these numbers: exact, of a few at a time, for which the careful pass is
+    enough; and by a loose engine, of all at once."""
+    block = (0.2, 2.5, 0.9)
+    if motion == "sine":
+        rows = [(block, (0.35 * scale, 0.9), (0.0, 0.0)) for scale in scales]
+        exact = outcomes("sine", "nonlinear", engine("series"), rows)
+        return exact, outcomes("sine", "nonlinear", loose, rows, lanes=len(rows))
+
+    def followed(engine, lanes):
+        run = jax.jit(jax.vmap(lambda a: rk.outcome(rk.Block(*block), a * rk.example_record(), engine=engine)))
+        parts = [run(part) for part in scales.reshape(-1, lanes)]
+        names = ("max_rotation", "overturned", "error")
+        good = [np.asarray(part.status == rk.Status.successful) for part in parts]
+        found = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return found | {"successful": np.concatenate(good)}
+
+    return followed(rk.Series(), 50), followed(loose, len(scales))
 
 
 @pytest.mark.parametrize(
@@ -276,20 +295,14 @@ def test_nonsense_is_found():
 def test_what_a_tolerance_leaves_undone_is_told(motion, tolerance, most):
     """Verdicts are those of the exact series, or there is none; peaks are within the error that is told, and that is
     not too large to be of use."""
-    motion = rk.SinePulse(0.35, 0.9) if motion == "sine" else rk.example_record()
-    engines = rk.Series(), rk.Series(tolerance=tolerance)
-    scales = jnp.linspace(0.6, 2.4, 150)
-    exact, found = (
-        jax.jit(jax.vmap(lambda a, e=e: rk.outcome(rk.Block(0.2, 2.5, 0.9), a * motion, engine=e)))(scales)
-        for e in engines
-    )
-    good = np.asarray(found.status == rk.Status.successful)
+    exact, found = under_multiples(motion, rk.Series(tolerance=tolerance), np.linspace(0.6, 2.4, 150))
+    good = found["successful"]
     assert good.mean() > 0.95
-    np.testing.assert_array_equal(found.overturned[good], exact.overturned[good])
-    standing = good & ~np.asarray(exact.overturned) & np.asarray(exact.max_rotation > 0)
-    off = np.abs(found.max_rotation - exact.max_rotation)[standing]
-    assert standing.sum() > 20 and (off <= (found.error + exact.error)[standing]).all()
-    assert np.median(found.error[standing]) < most
+    np.testing.assert_array_equal(found["overturned"][good], exact["overturned"][good])
+    standing = good & ~exact["overturned"] & (exact["max_rotation"] > 0)
+    off = np.abs(found["max_rotation"][standing] - exact["max_rotation"][standing])
+    assert standing.sum() > 20 and (off <= (found["error"] + exact["error"])[standing]).all()
+    assert np.median(found["error"][standing]) < most
 
 
 def test_less_is_computed_where_less_is_asked():

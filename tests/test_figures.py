@@ -86,7 +86,7 @@ def test_safety_regions():
 
 
 def test_sine_regions():
-    axis = rk.plot.sine_regions(0.9, frequency_ratio=[1.0, 2.0, 4.0])
+    axis = rk.plot.sine_regions(0.9, frequency_ratio=np.geomspace(1.0, 4.0, 8))
     (curve,) = (line for line in axis.lines if line.get_label() == "case 2: no impact")
     np.testing.assert_allclose(curve.get_ydata(), sine_pulse.no_impact_limit(curve.get_xdata()))
 

@@ -23,17 +23,18 @@ from jaxrock.flexible.remainder import Tangents
 from references.flexible_column import PULSE, SHORT, TALL, Chain, largest_survived
 
 WHOLE = dict(base="sine", rotations="finite", p_delta=True)
+SAMPLES = 301  # of all histories: XLA compiles every number of times anew
 STRONG = rk.SinePulse(5.2974 / 9.81, 1.6)  # Diamantopoulos & Fragiadakis, figure 23
 
 
 def beside_scipy(shape, motion, duration, **more):
     """Largest differences of rotation and top over their peaks, and of impacts [s]."""
     block = rk.FlexibleBlock(**shape, **more)
-    found = rk.simulate(block, motion, duration=duration, samples=2)
+    found = rk.simulate(block, motion, duration=duration, samples=SAMPLES)
     assert found.status == rk.Status.successful
     chain = Chain(block, motion)
     pieces, impacts = chain.follow(duration)
-    time = np.linspace(0, duration, 301)
+    time = np.linspace(0, duration, SAMPLES)
     expected = np.array([chain.at(pieces, t) for t in time]).T
     off = np.abs(np.stack(found(time)[:2]) - expected).max(1) / np.abs(expected).max(1)
     # The last return may be one that SciPy does not come to any more.
@@ -62,9 +63,9 @@ def drift(masses, duration, **more):
     """By how much the energy varies after the pulse, over its mean, without damping and loss at impacts."""
     block = rk.FlexibleBlock(**SHORT, damping_ratio=0.0, masses=masses, restitution=1.0, **more)
     motion = rk.SinePulse(0.3, 1.0)
-    found = rk.simulate(block, motion, duration=duration, samples=2)
+    found = rk.simulate(block, motion, duration=duration, samples=SAMPLES)
     assert found.status == rk.Status.successful and found.impact_count > 0
-    energy = sum(np.asarray(part) for part in found.energy(np.linspace(1.01, duration, 101)))
+    energy = sum(np.asarray(part) for part in found.energy(np.linspace(1.01, duration, SAMPLES)))
     return np.ptp(energy) / energy.mean()
 
 
@@ -222,11 +223,16 @@ def test_numbers_of_single_precision_among_others(law):
     """All is computed in the usual precision, whatever was given: steps keep it."""
     shape = {name: np.float32(value) for name, value in TALL.items()}
     block, pulse = rk.FlexibleBlock(**shape, damping_ratio=0.01, masses=2, **law), rk.SinePulse(np.float32(0.5), 1.6)
-    scene = scene_of(block, pulse, jnp.float32(4.0))
-    start = scene.start()
-    kinds = [jax.tree.map(lambda x: x.dtype, state) for state in (start, jax.eval_shape(scene.advance, start))]
+
+    def step(block, pulse, stop):
+        scene = scene_of(block, pulse, stop)
+        start = scene.start()
+        return scene, start, scene.advance(start)
+
+    scene, *states = jax.eval_shape(step, block, pulse, np.float32(4.0))
+    kinds = [jax.tree.map(lambda x: x.dtype, state) for state in states]
     assert kinds[0] == kinds[1]
-    assert not {x.dtype for x in jax.tree.leaves((scene, start))} & {np.dtype(np.float32), np.dtype(np.complex64)}
+    assert not {x.dtype for x in jax.tree.leaves((scene, states))} & {np.dtype(np.float32), np.dtype(np.complex64)}
 
 
 def test_single_precision_is_refused():

@@ -13,7 +13,7 @@ from jaxrock.inverse.kept_spectrum import KeptSpectrum
 from jaxrock.inverse.nearest_change import allowed_changes, least_change
 
 ALPHA, P, DT, COUNT = 0.2, 3.0, 0.02, 40
-LINEAR = {"model": rk.Linear(), "engine": rk.Series(order=6)}
+LINEAR = {"model": rk.Linear(), "engine": rk.Series(order=12)}
 BLOCK = rk.Block(ALPHA, P, 0.9)
 TIME = DT * np.arange(COUNT)
 # Uplifts the block at once, and is too short to topple it.

@@ -71,13 +71,12 @@ def lognormal(median, dispersion):
 
 def assert_slopes(function, numbers):
     """Derivatives of all results in three directions against central differences of sixth order."""
-    function = jax.jit(function)
-    pushed = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,))[1])
+    pushed = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,)))  # one program for both
     for seed in range(3):
         direction = numbers * np.random.default_rng(seed).normal(size=numbers.size)
-        at = lambda n, h=1e-3, direction=direction: function(numbers + n * h * direction)
+        at = lambda n, direction=direction: np.asarray(pushed(numbers + n * 1e-3 * direction, direction)[0])
         differences = (45 * (at(1) - at(-1)) - 9 * (at(2) - at(-2)) + at(3) - at(-3)) / 0.06
-        np.testing.assert_allclose(pushed(numbers, direction), differences, rtol=1e-8)
+        np.testing.assert_allclose(pushed(numbers, direction)[1], differences, rtol=1e-8)
 
 
 # --------------------------------------------------------------------------------------- hazard curves
@@ -166,8 +165,8 @@ def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
 
 CURVES = {
     "site": CURVE,
-    "few levels": rk.hazard.HazardCurve([0.1, 0.4, 0.6], [2e-2, 1e-3, 2e-4]),
-    "flat at first": rk.hazard.HazardCurve([0.1, 0.2, 0.4], [1e-3, 1e-3, 1e-5]),
+    "few levels": rk.hazard.HazardCurve([0.1, 0.4, 0.5, 0.6], [2e-2, 1e-3, 5e-4, 2e-4]),
+    "flat at first": rk.hazard.HazardCurve([0.1, 0.2, 0.3, 0.4], [1e-3, 1e-3, 1e-4, 1e-5]),
     "steep": rk.hazard.HazardCurve([0.1, 0.3, 0.35, 0.4], [1e-2, 1e-3, 1e-9, 1e-12]),
     "first unknown": rk.hazard.HazardCurve([0.05, 0.1, 0.3, 0.8], [np.inf, 1e-2, 1e-3, 1e-5]),
     "last unknown": rk.hazard.HazardCurve([0.1, 0.3, 0.5, 0.8], [1e-2, 1e-3, 0.0, 0.0]),
@@ -394,7 +393,7 @@ def test_derivatives():
             [*rates, rk.hazard.survival_probability(rocks, ages, curve), rk.hazard.allowed_scale(rocks, ages, curve)]
         )
 
-    assert_slopes(results, jnp.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05]))
+    assert_slopes(results, np.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05]))
 
 
 SLOPES = [
@@ -578,7 +577,7 @@ def test_fit_has_derivatives():
         fit = rk.hazard.fit_fragility(numbers[:4], numbers[4:], 8)
         return jnp.stack([fit.fragility.median, fit.fragility.dispersion])
 
-    assert_slopes(results, jnp.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
+    assert_slopes(results, np.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
 
 
 # --------------------------------------------------------------------------------------- files

@@ -1,5 +1,6 @@
 """Measures of intensity: closed forms of harmonic pulses, direct quadrature, and another integrator of oscillators."""
 
+import functools
 import warnings
 
 import numpy as np
@@ -14,8 +15,11 @@ NOISE = np.random.default_rng(3).normal(0, 0.2, 400)
 RECORD = rk.Record(NOISE, 0.02)
 
 
+OF_SAMPLES = 0.02 * np.arange(NOISE.size)
+
+
 def lines(time):
-    return G * np.interp(time, 0.02 * np.arange(NOISE.size), NOISE)
+    return G * np.interp(time, OF_SAMPLES, NOISE)
 
 
 @pytest.mark.parametrize(
@@ -77,16 +81,29 @@ def test_peak_displacement_lies_between_samples():
     assert rk.intensity.peak_displacement(record) == pytest.approx(place + velocity + G * (0.5 - 4 / 6), rel=1e-12)
 
 
-@pytest.mark.parametrize("period, damping", [(0.25, 0.05), (0.05, 0.05), (0.9, 0.0), (3.0, 0.2)])
-def test_spectra_by_another_integrator(period, damping):
-    omega, end = 2 * np.pi / period, 0.02 * (NOISE.size - 1)
+OSCILLATORS = [(0.25, 0.05), (0.05, 0.05), (0.9, 0.0), (3.0, 0.2)]  # period [s], damping
+
+
+@functools.cache
+def largest_by_another_integrator():
+    """(2, oscillators) distance and speed of all oscillators, which are followed side by side."""
+    period, damping = np.array(OSCILLATORS).T
+    omega, end = 2 * np.pi / period, OF_SAMPLES[-1]
 
     def slope(t, y):
-        return [y[1], -2 * damping * omega * y[1] - omega**2 * y[0] - (lines(t) if t < end else 0.0)]
+        place, speed = y[:4], y[4:]
+        ground = lines(t) if t < end else 0.0
+        return np.concatenate([speed, -2 * damping * omega * speed - omega**2 * place - ground])
 
-    found = solve_ivp(slope, (0, end + period), [0, 0], "DOP853", max_step=0.005, rtol=1e-9, atol=1e-12,
+    found = solve_ivp(slope, (0, end + period.max()), np.zeros(8), "DOP853", max_step=0.005, rtol=1e-10, atol=1e-13,
                       dense_output=True)  # fmt: skip
-    place, speed = np.abs(found.sol(np.linspace(0, end + period, 200_001))).max(axis=1)
+    return np.abs(found.sol(np.linspace(0, end + period.max(), 300_001))).max(axis=1).reshape(2, 4)
+
+
+@pytest.mark.parametrize("period, damping", OSCILLATORS)
+def test_spectra_by_another_integrator(period, damping):
+    omega = 2 * np.pi / period
+    place, speed = largest_by_another_integrator()[:, OSCILLATORS.index((period, damping))]
     assert rk.intensity.spectral_acceleration(RECORD, period, damping) == pytest.approx(omega**2 * place / G, rel=1e-6)
     assert rk.intensity.spectral_velocity(RECORD, period, damping) == pytest.approx(omega * place, rel=1e-6)
     relative = rk.intensity.spectral_velocity(RECORD, period, damping, pseudo=False)

@@ -27,18 +27,28 @@ def rocks(seen, alpha=ALPHA, p=P, **more):
     return rk.inverse.Observations(alpha, p, seen, **({"alpha_sd": 0.04 * alpha, "p_sd": 0.02 * p} | more))
 
 
-def fallen(amplitude, period, alpha, p, restitution):
-    return {"fallen": rk.outcome(rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period)).overturned}
+def rocked(amplitude, period, alpha, p, restitution):
+    found = rk.outcome(rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period))
+    return {"overturned": found.overturned, "peak": jnp.where(found.overturned, 0.0, found.max_rotation)}
 
 
-def overturned(**scenes):
-    """The verdict on scenes given by lists that go together: no likelihood, no margin."""
+def what_becomes(**scenes):
+    """Verdict and peak rotation of scenes given by lists that go together: no likelihood, no margin."""
     arrays = np.broadcast_arrays(*scenes.values())
     count = arrays[0].size
     # As many as of the largest test, over and over: one compiled program.
     lists = {name: np.resize(x, max(count, 48_000)) for name, x in zip(scenes, arrays)}
-    found = rk.sweep(fallen, outer=False, progress=False, **lists).values["fallen"]
-    return found[:count].reshape(arrays[0].shape)
+    found = rk.sweep(rocked, outer=False, progress=False, **lists).values
+    return {name: x[:count].reshape(arrays[0].shape) for name, x in found.items()}
+
+
+def overturned(**scenes):
+    return what_becomes(**scenes)["overturned"]
+
+
+def by_momentum(alpha):
+    """Housner's restitution."""
+    return 1 - 1.5 * np.sin(alpha) ** 2
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +106,12 @@ def test_a_likelihood_is_smooth_in_the_amplitude():
 
 def log_terms(seen, scatter=SCATTER, **values):
     """Of rocks at motions (motions, rocks)."""
-    return np.asarray(rk.inverse.Likelihood(seen, rk.SinePulse, scatter).log_terms(values, slopes=False))
+    likelihood, arrays = rk.inverse.Likelihood(seen, rk.SinePulse, scatter), np.broadcast_arrays(*values.values())
+    count = arrays[0].size
+    # As many at a time as `feasible_region` takes: one compiled program.
+    parts = zip(*(np.resize(x, (-(-count // 64), 64)) for x in arrays))
+    found = [np.asarray(likelihood.log_terms(dict(zip(values, part)), slopes=False)) for part in parts]
+    return np.concatenate(found)[:count]
 
 
 def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
@@ -110,17 +125,14 @@ def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
     factors = np.exp(0.3 * e)
     exact = np.empty_like(found)
     grid = np.geomspace(amplitude[0] * factors[0], amplitude[-1] * factors[-1], 12_000)
-    scenes = [  # there are three blocks only
-        rk.sweep(rotation_of, outer=False, progress=False, amplitude=grid, alpha=0 * grid + alpha[i],
-                 p=0 * grid + p[i]).values  # fmt: skip
-        for i in range(3)
-    ]  # fmt: skip
+    weight = np.exp(-((np.log(grid / amplitude[:, None]) / 0.3) ** 2) / 2) / (np.sqrt(2 * np.pi) * 0.3)
+    # There are three blocks only.
+    scenes = what_becomes(amplitude=grid, period=1.2, alpha=alpha[:3, None], p=p[:3, None],
+                          restitution=by_momentum(alpha[:3, None]))  # fmt: skip
     for i in range(12):
-        scene = scenes[i % 3]
-        density = np.exp(-(((peak[i] - scene["peak"]) / sd[i]) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd[i])
-        density = np.where(scene["lost"], 0.0, density)
-        weight = np.exp(-((np.log(grid / amplitude[:, None]) / 0.3) ** 2) / 2) / (np.sqrt(2 * np.pi) * 0.3)
-        exact[:, i] = (density * weight).sum(axis=1) * np.log(grid[1] / grid[0])
+        density = np.exp(-(((peak[i] - scenes["peak"][i % 3]) / sd[i]) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd[i])
+        density = np.where(scenes["overturned"][i % 3], 0.0, density)
+        exact[:, i] = weight @ density * np.log(grid[1] / grid[0])
     exact = np.log(0.98 * exact + 0.01 * 2 / np.pi)
     # Such rotations are met within one or two hundredths of the amplitude, a tenth of the way from node to node.
     assert np.sqrt(np.mean((found - exact) ** 2)) < 0.45 and np.max(np.abs(found - exact)) < 1.0
@@ -129,15 +141,10 @@ def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
     assert abs(np.log(amplitude[total.argmax()] / amplitude[exact.sum(axis=1).argmax()])) < 0.05
 
 
-def rotation_of(amplitude, alpha, p):
-    found = rk.outcome(rk.Block(alpha, p), rk.SinePulse(amplitude, 1.2))
-    return {"lost": found.overturned, "peak": jnp.where(found.overturned, 0.0, found.max_rotation)}
-
-
 def test_motions_that_there_are_not_are_impossible():
     terms = log_terms(rocks(["survived"] * 12), amplitude=np.array([0.2, 0.2, np.nan]), period=np.array([1, -1, 1]))
     assert np.isfinite(terms[0]).all() and (terms[1:] == -np.inf).all()
-    never = {"amplitude": UNKNOWNS["amplitude"], "period": rk.inverse.Unknown(-2.0, -1.0, log=False)}
+    never = {"amplitude": UNKNOWNS["amplitude"], "period": rk.inverse.Unknown(1e10, 1e11)}  # s: beyond all ranges
     with pytest.raises(ValueError, match="`unknowns` must have ranges in which there are motions"):
         rk.inverse.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, never, SCATTER, starts=1)
 
@@ -157,7 +164,7 @@ def truth(seed, scatter=SCATTER):
     e = np.random.default_rng(seed).normal(size=(3, 12))
     alpha, p = ALPHA * np.exp(0.04 * e[0]), P * np.exp(0.02 * e[1])
     size = TRUTH["amplitude"] * np.exp(scatter * e[2])
-    known = {"alpha": alpha, "p": p, "restitution": np.asarray(rk.Block(alpha, p).restitution)}
+    known = {"alpha": alpha, "p": p, "restitution": by_momentum(alpha)}
     return ["toppled" if x else "survived" for x in overturned(amplitude=size, period=TRUTH["period"], **known)]
 
 
@@ -170,7 +177,7 @@ def logs_at(seen, **over):
 def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     seen = rocks(truth(3))
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
-    lists = {name: np.geomspace(float(x.low), float(x.high), 512) for name, x in UNKNOWNS.items()}
+    lists = {name: np.geomspace(float(x.low), float(x.high), 256) for name, x in UNKNOWNS.items()}
     assert logs_at(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
     ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}
     below = 2 * (float(found.log_likelihood) - logs_at(seen, **lists | {"amplitude": ends["amplitude"]}).max(axis=1))
@@ -301,7 +308,15 @@ def test_up_to_the_unexceeded_motion_all_that_stand_stand():
     assert (above.sum(axis=1) == 1).all() and (above.argmax(axis=1) + 6 == weakest).all()
 
 
-def test_the_command_from_a_table_to_figures(tmp_path, capsys):
+def test_the_command_from_a_table_to_figures(tmp_path, capsys, monkeypatch):
+    """What it asks for, and that what is found is in its tables."""
+    estimate_motion, asked = rk.inverse.estimate_motion, []
+
+    def noted(*given, **named):
+        asked.append((given, named, estimate_motion(*given, **named)))
+        return asked[-1][-1]
+
+    monkeypatch.setattr(rk.inverse, "estimate_motion", noted)
     rows = [f"{a!r},{0.04 * a!r},{p!r},{0.02 * p!r},{word}" for a, p, word in zip(ALPHA.tolist(), P.tolist(), WORDS)]
     rows = [f'"rock {i + 1}",{row}' for i, row in enumerate(rows)]
     path = tmp_path / "rocks.csv"
@@ -311,7 +326,10 @@ def test_the_command_from_a_table_to_figures(tmp_path, capsys):
     printed, errors = capsys.readouterr()
     assert status == 0 and errors == ""
     assert printed.startswith("12 rocks: 6 survived, 6 toppled, 0 rotation\n  amplitude ")
-    found = rk.inverse.estimate_motion(rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    [(given, named, found)] = asked
+    expected = rocks(WORDS), rk.SinePulse, UNKNOWNS, SCATTER, {"lapse": 0.02, "starts": 8, "model": rk.Housner()}
+    assert jax.tree.structure((*given, named)) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, (*given, named), expected)
     lines = (tmp_path / "estimate.csv").read_text().splitlines()
     for line, name, value, interval in zip(lines[1:], found.names, found.values, found.interval, strict=True):
         fields = line.split(",")

@@ -16,6 +16,8 @@ import jaxrock as rk
 from jaxrock.keeping import facts, folder
 from jaxrock.transforms import lowering
 
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
+
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
@@ -68,7 +70,7 @@ def test_nothing_fails_where_nothing_can_be_kept(place):
     place.parent.write_text("a file is in the way")
     folder.write("kind", "name", b"content")
     assert folder.read("kind", "name") is None
-    assert float(jax.jit(lambda a: rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(a, 0.8)).margin)(0.3)) > 0
+    assert float(jax.jit(lambda a: rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(a, 0.8), **QUICK).margin)(0.3)) > 0
 
 
 def test_many_write_at_once(place):
@@ -134,17 +136,20 @@ Recipe._trace = lambda *given: traced.append(1) or trace(*given)
 given = dict(model=rk.Linear(), engine=rk.Series(order=4))
 def peak(x): return rk.outcome(rk.Block(x[0], 2.0), rk.SinePulse(x[1], 0.8), **given).max_rotation
 x = jnp.array([0.2, 0.3]) * jnp.linspace(0.98, 1.02, 70)[:, None]
-found = [peak(x[0])[None], jax.vmap(peak)(x), *jax.vmap(jax.grad(peak))(x).T,
-         rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **given).rotation,
-         rk.overturning_map(x[:, 1] * 5, [2.0, 3.0], progress=False, **given).margin.ravel()]
+found = [peak(x[0])[None], jax.vmap(peak)(x)]
+if sys.argv[1] == "all":
+    found += [*jax.vmap(jax.grad(peak))(x).T,
+              rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **given).rotation,
+              rk.overturning_map(x[:, 1] * 5, [2.0, 3.0], progress=False, **given).margin.ravel()]
 assert "scipy" not in sys.modules  # JAX takes it to get LAPACK ready, which takes longer than an answer
 print(len(traced), jnp.concatenate(found).tobytes().hex())
 """
 
 
-def answer(place):
-    environment = os.environ | {"JAXROCK_CACHE": str(place)}
-    done = subprocess.run([sys.executable, "-c", _ANSWER], env=environment, capture_output=True, text=True, timeout=600)
+def answer(place, questions="all"):
+    """How many programs were traced, and the numbers; `"few"` questions are the first of all."""
+    environment, words = os.environ | {"JAXROCK_CACHE": str(place)}, [sys.executable, "-c", _ANSWER, questions]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     traced, numbers = done.stdout.split()
     return int(traced), numbers
@@ -160,8 +165,8 @@ def test_another_session_traces_nothing_and_answers_the_same_bits(tmp_path):
         content = bytearray(path.read_bytes())
         content[-20] ^= 255
         path.write_bytes(content)
-    again, same = answer(tmp_path)
-    assert again > 0 and same == numbers
+    again, same = answer(tmp_path, "few")
+    assert again > 0 and len(same) == 71 * 16 and numbers.startswith(same)
 
 
 def test_processes_share_a_folder(tmp_path):
@@ -216,8 +221,7 @@ def test_checks_are_kept_with_the_users_own_programs(tmp_path):
 def test_another_version_of_the_package_asks_anew(place, monkeypatch):
     def ask():
         jax.clear_caches()
-        given = {"model": rk.Linear(), "engine": rk.Series(order=4)}
-        return float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **given).max_rotation)
+        return float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **QUICK).max_rotation)
 
     exports = []
     exported = lowering._exported

@@ -1,7 +1,6 @@
 """Records of many lengths are one program, and many scales of a record share its arrays."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -41,10 +40,10 @@ def test_derivatives_by_the_time_step_with_room():
 
 def test_records_of_many_lengths_are_one_program():
     samples, block = np.asarray(rk.example_record().samples), rk.Block(0.2, 2.0)
-    rk.outcome(block, rk.Record(samples[:1790], 0.01))
+    rk.outcome(block, rk.Record(samples[:1790], 0.01), **QUICK)
     before = _outcome._cache_size()
     for count in (1537, 1600, 1792):
-        rk.outcome(block, rk.Record(samples[:count], 0.01))
+        rk.outcome(block, rk.Record(samples[:count], 0.01), **QUICK)
     assert _outcome._cache_size() == before
 
 
@@ -55,9 +54,9 @@ def test_scales_of_a_record_share_its_arrays(vertical):
 
     def margin(scale):
         motion = scale * record
-        return rk.outcome(block, motion.with_vertical(0.3 * record) if vertical else motion).margin
+        return rk.outcome(block, motion.with_vertical(0.3 * record) if vertical else motion, **QUICK).margin
 
-    scales = jnp.linspace(0.5, 2.0, 200)
+    scales = np.linspace(0.5, 2.0, 200)
     memory = jax.jit(jax.vmap(margin)).lower(scales).compile().memory_analysis()
     assert memory.temp_size_in_bytes < (500 if vertical else 40) * record.samples.nbytes
 

@@ -52,14 +52,23 @@ MOTIONS = {
 each = pytest.mark.parametrize("name", MOTIONS)
 
 
-@jax.jit
+ROOM = 2000
+_at = jax.jit(lambda motion, time: motion.acceleration(time))
+
+
 def acceleration(motion, time):
-    return motion.acceleration(time)
+    """At times of any shape; so many at once that all questions to motions of a kind are one program."""
+    time = np.asarray(time, float)
+    room = np.zeros(-(-time.size // ROOM) * ROOM)
+    room[: time.size] = time.ravel()
+    found = [np.asarray(_at(motion, part)) for part in room.reshape(-1, ROOM)]
+    return np.concatenate(found)[: time.size].reshape(time.shape)
 
 
 @functools.partial(jax.jit, static_argnames="order")
 def series(motion, piece, local, unit, order):
-    return jax.vmap(lambda piece, local, unit: jnp.stack(motion.series(piece, local, unit, order)))(piece, local, unit)
+    """Point by point: that is compiled sooner than all side by side."""
+    return jax.lax.map(lambda point: jnp.stack(motion.series(*point, order)), (piece, local, unit))
 
 
 @jax.jit
@@ -78,11 +87,24 @@ def size(name):
     return facts(name)[2].max()
 
 
+FEW = np.array([0.0, 0.11, 0.37, 0.5, 0.83, 0.999])
+MANY = np.append(FEW, np.linspace(0.0, 1.0, 501))
+
+
 def points(name, shares):
-    """Piece, time since its start, and its length, at shares of every piece that has a length."""
+    """Piece, time since its start, and its length, at shares of every piece: a row for each. Those without a length
+    are there, too, so that motions of a kind have as many."""
     lengths = np.diff(facts(name)[0])
-    piece = np.repeat(np.flatnonzero(lengths > 0), len(shares))
-    return piece, lengths[piece] * np.tile(shares, len(piece) // len(shares)), lengths[piece]
+    piece = np.repeat(np.arange(lengths.size), len(shares))
+    return piece, np.outer(lengths, shares).ravel(), lengths[piece]
+
+
+@functools.cache
+def values(name):
+    """Series of order 0 at many shares of every piece, in a unit that must not matter."""
+    piece, local, _ = points(name, MANY)
+    found = np.asarray(series(MOTIONS[name], piece, local, np.full(len(piece), 0.05), 0))
+    return found.reshape(-1, len(MANY), found.shape[1])
 
 
 MOVING = [name for name in MOTIONS if name != "record of one sample"]
@@ -95,7 +117,7 @@ each_moving = pytest.mark.parametrize("name", MOVING)
 @each_moving
 def test_series_is_the_acceleration_around_a_point(name):
     knots, scales, _, end = facts(name)
-    piece, local, length = points(name, np.array([0.0, 0.11, 0.37, 0.5, 0.83, 0.999]))
+    piece, local, length = points(name, FEW)
     unit = np.minimum(scales[piece], 0.3)
     terms = np.asarray(series(MOTIONS[name], piece, local, unit, ORDER))
     assert terms.shape[1] <= ORDER + 1
@@ -104,20 +126,23 @@ def test_series_is_the_acceleration_around_a_point(name):
     time = knots[piece] + reached
     # Times round; where the acceleration is steep, it follows.
     tolerance = size(name) * (1e-14 + 4 * EPS * (time + end) / unit) + 1e-300
-    np.testing.assert_array_less(np.abs(value - acceleration(MOTIONS[name], time)), tolerance)
+    moves = length > 0
+    assert moves.any()
+    off = np.abs(value - acceleration(MOTIONS[name], time))
+    np.testing.assert_array_less(off[:, moves], tolerance[:, moves])
 
 
 @each_moving
 def test_shorter_series_in_another_unit(name):
     """A shorter series is the beginning of a longer one; its terms go with the powers of the unit."""
-    piece, local, _ = points(name, np.array([0.0, 0.11, 0.37, 0.5, 0.83, 0.999]))
-    unit = np.full(len(piece), 0.1)
+    piece, local, length = points(name, FEW)
+    unit, moves = np.full(len(piece), 0.1), length > 0
     long = np.asarray(series(MOTIONS[name], piece, local, unit, ORDER))
-    for order in (0, 3):
-        short = np.asarray(series(MOTIONS[name], piece, local, unit / 2, order))
+    one = values(name)[:, : len(FEW)].reshape(len(piece), -1)
+    for order, short in ((0, one), (3, np.asarray(series(MOTIONS[name], piece, local, unit / 2, 3)))):
         assert short.shape[1] == min(order + 1, long.shape[1])
         expected = long[:, : order + 1] * 0.5 ** np.arange(short.shape[1])
-        np.testing.assert_allclose(short, expected, rtol=1e-13, atol=1e-15 * size(name))
+        np.testing.assert_allclose(short[moves], expected[moves], rtol=1e-13, atol=1e-15 * size(name))
 
 
 @each
@@ -133,9 +158,10 @@ def test_knots_increase_from_zero_to_the_end(name):
 @each_moving
 def test_bounds_bound(name):
     """On a dense grid of every piece, both ends of it included."""
-    piece, local, _ = points(name, np.linspace(0.0, 1.0, 501))
-    found = np.abs(np.asarray(series(MOTIONS[name], piece, local, np.ones(len(piece)), 0))[:, 0])
-    np.testing.assert_array_less(found, facts(name)[2][piece] * (1 + 4 * EPS) + 1e-300)
+    knots, _, bounds, _ = facts(name)
+    moves = np.diff(knots) > 0
+    found = np.abs(values(name)[moves, :, 0])
+    np.testing.assert_array_less(found, np.broadcast_to(bounds[moves, None] * (1 + 4 * EPS) + 1e-300, found.shape))
     # And not by far more than the motion in all (sums add up the bounds of their parts; a spike never moves).
     assert size(name) <= 2.5 * found.max() or name == "exponential, shape inf"
 
@@ -167,13 +193,17 @@ JUMPS = {
 }
 
 
+made_so_strong = jax.jit(_of_strength)
+
+
 @pytest.mark.parametrize("name", [name for name, motion in MOTIONS.items() if isinstance(motion, AbstractPulse)])
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_pulse_is_proportional_to_its_amplitude(name, way):
     """So likelihoods may leave it out where they set the strength of a motion."""
-    motion, t = MOTIONS[name], np.linspace(0, 1.2 * float(MOTIONS[name].end), 50)
-    found = _of_strength(motion, jnp.log(0.37), jnp.asarray(way)).acceleration(t)
-    expected = way * 0.37 / np.max(motion.bounds) * motion.acceleration(t)
+    motion, t = MOTIONS[name], np.linspace(0, 1.2 * float(facts(name)[3]), 50)
+    scaled = made_so_strong(motion, np.log(0.37), way)
+    found = float(scaled.factor) * acceleration(scaled.motion, t)
+    expected = way * 0.37 / size(name) * acceleration(motion, t)
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
 
@@ -185,11 +215,11 @@ def test_value_at_a_jump_is_the_one_after_it(motion, values):
 
 def test_acceleration_has_the_shape_of_the_time():
     motion, time = MOTIONS["triangle"], np.linspace(-0.5, 2.0, 12).reshape(3, 2, 2)
-    found = acceleration(motion, time)
+    found = _at(motion, time)
     assert found.shape == (3, 2, 2)
-    np.testing.assert_array_equal(found.ravel(), acceleration(motion, time.ravel()))
-    assert acceleration(motion, 0.8).shape == ()
-    assert acceleration(motion, np.zeros((0,))).shape == (0,)
+    np.testing.assert_array_equal(np.ravel(found), acceleration(motion, time.ravel()))
+    assert _at(motion, 0.8).shape == ()
+    assert _at(motion, np.zeros((0,))).shape == (0,)
 
 
 # --------------------------------------------------------------------- formulas, written again
@@ -345,8 +375,9 @@ def test_derivatives_of_the_exponential_pulse(shape):
 @pytest.mark.parametrize("shape", [-math.inf, math.inf])
 def test_derivatives_at_the_limits(shape):
     """The limits depend on the amplitude alone."""
-    found = np.asarray(slopes(0.8, 0.6, shape, 0.6 * np.array([0.001, 0.2, 0.5, 0.7])))
-    np.testing.assert_array_equal(found, [[float(shape < 0)] * 4, [0.0] * 4, [0.0] * 4])
+    time = 0.6 * np.array([0.001, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+    found = np.asarray(slopes(0.8, 0.6, shape, time))
+    np.testing.assert_array_equal(found, [[float(shape < 0)] * 10, [0.0] * 10, [0.0] * 10])
 
 
 # -------------------------------------------------------------------------------- near-fault pulse
@@ -457,15 +488,24 @@ def test_a_batch_of_motions_is_made_at_once():
 # ------------------------------------------------------------------------------------------ late motions
 
 LATE = rk.SinePulse(0.3, 0.8)
+QUICK = {"engine": rk.Series(order=8)}
+
+
+@jax.jit
+def of_a_late_one(delay):
+    return rk.outcome(rk.Block(0.2, 2.0), LATE.shifted(delay), **QUICK)
+
+
+@jax.jit
+def of_two_late_ones(delay):
+    motion = LATE.shifted(delay) - 0.1 * LATE.shifted(delay + 0.5)
+    return rk.outcome(rk.Block(0.2, 2.0), motion, **QUICK)
 
 
 @pytest.mark.parametrize("delay", [1e3, 1e6, 1e9, 1e12])
 def test_a_late_motion_does_what_it_does_early(delay):
     """Its knots are rounded to 1e-4 s at 1e12 s; how long its pieces last is not."""
-    block, quick = rk.Block(0.2, 2.0), {"engine": rk.Series(order=8)}
-    early, late = (
-        jax.jit(lambda m: rk.outcome(block, m, **quick))(m) for m in (LATE.shifted(0.0), LATE.shifted(delay))
-    )
+    early, late = of_a_late_one(0.0), of_a_late_one(delay)
     for name in ("max_rotation", "max_velocity", "margin"):
         np.testing.assert_allclose(getattr(late, name), getattr(early, name), rtol=1e-15)
     assert late.impact_count == early.impact_count
@@ -474,10 +514,8 @@ def test_a_late_motion_does_what_it_does_early(delay):
 @pytest.mark.parametrize("delay", [1e6, 1e9, 9e11])
 def test_two_late_motions_say_how_late_they_may_be(delay):
     """Of a sum the rounded times of the one beside the other count, and `error` knows."""
-    block, quick = rk.Block(0.2, 2.0), {"engine": rk.Series(order=8)}
-    outcome = jax.jit(lambda t: rk.outcome(block, LATE.shifted(t) - 0.1 * LATE.shifted(t + 0.5), **quick))
-    early, late = outcome(0.0), outcome(delay)
-    off = abs(float(late.max_rotation - early.max_rotation))
+    early, late = of_two_late_ones(0.0), of_two_late_ones(delay)
+    off = abs(float(late.max_rotation) - float(early.max_rotation))
     assert off <= float(late.error) <= 1e-14 * delay
     assert float(early.error) < 1e-13
 
@@ -486,6 +524,7 @@ def test_late_in_single_precision():
     """Where times are rounded to 64 s."""
     block = rk.Block(np.float32(0.2), np.float32(2.0))
     motion = rk.SinePulse(np.float32(0.3), np.float32(0.8))
-    early, late = (rk.outcome(block, m).max_rotation for m in (motion, motion.shifted(np.float32(1e9))))
+    delays = np.float32(0.0), np.float32(1e9)
+    early, late = (rk.outcome(block, motion.shifted(delay), **QUICK).max_rotation for delay in delays)
     assert early.dtype == late.dtype == np.float32
     np.testing.assert_allclose(late, early, rtol=1e-6)

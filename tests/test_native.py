@@ -1,6 +1,7 @@
 """Machine code for many lanes at once does what JAX does for each."""
 
 import ctypes
+import functools
 import logging
 import re
 from pathlib import Path
@@ -613,27 +614,32 @@ def damped(a, u):
     return rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 0.6), model).margin
 
 
-def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), **settings):
-    return rk.outcome(rk.Block(a, 2.0, 0.9), u * motion, engine=rk.Diffrax(**settings))
+def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), model=rk.Housner(), **settings):
+    return rk.outcome(rk.Block(a, 2.0, 0.9), u * motion, model, engine=rk.Diffrax(**settings))
 
 
+SHORT_SERIES = {"engine": rk.Series(order=6)}  # of the same operations, and compiled in half the time
 PULSE, SHORT = rk.SinePulse(0.4, 0.8), rk.Record(rk.example_record().samples[500:2500], 0.005)
 SCENES = {
     "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
     "derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin, (0, 1)),
     "two sides, exponential": lambda a, u: (
-        rk.outcome(rk.AsymmetricBlock(a, 1.3 * a, 2.0), rk.ExponentialPulse(u, 1.0, u)).margin
+        rk.outcome(rk.AsymmetricBlock(a, 1.3 * a, 2.0), rk.ExponentialPulse(u, 1.0, u), **SHORT_SERIES).margin
     ),
     "a scaled record": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin,
     "its derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin, (0, 1)),
     "two records": lambda a, u: (
-        rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3), rk.Linear(), engine=rk.Series(order=6)).margin
+        rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3), rk.Linear(), **SHORT_SERIES).margin
     ),
     "vertical records": lambda a, u: rk.outcome(rk.Block(a, 2.0), (u * SHORT).with_vertical(0.3 * SHORT)).margin,
     "two sides, vertical": lambda a, u: (
-        rk.outcome(rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3))).margin
+        rk.outcome(
+            rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3)), **SHORT_SERIES
+        ).margin
     ),
-    "spring": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear")).margin,
+    "spring": lambda a, u: (
+        rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear"), **SHORT_SERIES).margin
+    ),
     "an equation with a damper": damped,
     "its derivatives by diffrax": jax.grad(damped, (0, 1)),
     "another solver of diffrax": lambda a, u: by_diffrax(a, u, solver=diffrax.Dopri8()).margin,
@@ -660,12 +666,17 @@ def test_scenes_do_not_fall_back(name, caplog):
 
 def test_diffrax_in_lanes():
     """As alone, to the bit, and as the series."""
-    a, u = jnp.linspace(0.1, 0.3, 40), jnp.linspace(1.3, 0.2, 40)
-    found = jax.vmap(by_diffrax)(a, u)
+    a, u = np.linspace(0.1, 0.3, 40), np.linspace(1.3, 0.2, 40)
+    linear = functools.partial(by_diffrax, model=rk.Linear())
+    found = jax.tree.map(np.asarray, jax.vmap(linear)(a, u))
     for i in (0, 17, 39):
-        alone = by_diffrax(a[i], u[i])
+        alone = linear(a[i], u[i])
         jax.tree.map(lambda one, many, i=i: np.testing.assert_array_equal(one, many[i]), alone, found)
-    exact = jax.vmap(lambda a, u: rk.outcome(rk.Block(a, 2.0, 0.9), rk.SinePulse(u, 1.0)))(a, u)
+
+    def by_series(a, u):
+        return rk.outcome(rk.Block(a, 2.0, 0.9), rk.SinePulse(u, 1.0), rk.Linear(), **SHORT_SERIES)
+
+    exact = jax.tree.map(np.asarray, jax.vmap(by_series)(a, u))
     np.testing.assert_array_equal(found.overturned, exact.overturned)
     np.testing.assert_array_equal(found.impact_count, exact.impact_count)
     np.testing.assert_allclose(found.max_rotation, exact.max_rotation, rtol=1e-6)
@@ -690,11 +701,17 @@ def test_diffrax_as_xla_has_it(name, monkeypatch):
 )
 def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
     """The knots of two motions are sorted once, and the blocks do the same as where XLA runs all of it."""
-    a, u = jnp.full(20, 0.2), jnp.linspace(0.8, 2.0, 20)
-    found = jax.vmap(SCENES[name])(a, u)
-    jax.clear_caches()
+    given = np.full(20, 0.2), np.linspace(0.8, 2.0, 20)
+
+    def lowered():
+        return jax.jit(lambda a, u: jax.vmap(SCENES[name])(a, u)).lower(*given)
+
+    own = lowered()
     monkeypatch.setattr(batching, "native", None)
-    np.testing.assert_allclose(found, jax.vmap(SCENES[name])(a, u), rtol=1e-9)
+    by_xla = lowered()
+    ours = re.compile(r"custom_call @jaxrock_[0-9a-f]{20}\b")
+    assert ours.search(own.as_text()) and not ours.search(by_xla.as_text())
+    np.testing.assert_allclose(own.compile()(*given), by_xla.compile()(*given), rtol=1e-9)
 
 
 def test_a_place_of_a_lanes_own_list_in_a_refilled_loop():

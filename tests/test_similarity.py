@@ -11,9 +11,18 @@ import pytest
 import jaxrock as rk
 from jaxrock.studies import similarity
 from jaxrock.studies.similarity import orientations
+from references import hard_cases
 from references.smooth_differences import gradient
 
 TAU = np.linspace(0, 12, 400)
+
+
+@jax.jit
+def history(block, motion, model, scales):
+    """Rotation and velocity at dimensionless times, in units and in scales."""
+    engine = rk.Series(order=6)  # a shorter program
+    response = rk.simulate(block, motion, model, duration=12.01 / block.p, engine=engine, samples=2)
+    return jnp.stack(response(TAU / block.p)), jnp.stack(similarity.master_curve(response, scales, TAU))
 
 
 @pytest.mark.parametrize("form", [rk.SinePulse, rk.CosinePulse, lambda a, t: rk.RickerPulse(a, t)])
@@ -23,40 +32,42 @@ def test_slender_blocks_collapse(form, amplitude, frequency):
     groups = similarity.groups(first, 0.25, 10.0, kind="slender")
     curves = []
     for block, peak in ((first, 0.25), (similarity.block(groups, amplitude, frequency), amplitude)):
-        response = rk.simulate(block, similarity.motion(groups, block, form), rk.Linear(), duration=12 / block.p)
-        curves.append(similarity.master_curve(response, similarity.scales(block, peak, "slender"), TAU))
+        motion, scales = similarity.motion(groups, block, form), similarity.scales(block, peak, "slender")
+        curves.append(history(block, motion, rk.Linear(), scales)[1])
     np.testing.assert_allclose(curves[0], curves[1], atol=1e-13)
 
 
 def test_rigid_blocks_of_one_slenderness_collapse():
-    first, second = rk.Block(0.35, 2.0), rk.Block(0.35, 5.0)
-    groups = similarity.groups(first, 0.7, 9.0)
+    # Housner's restitution, of which the groups know the number.
+    first, second = (rk.Block(0.35, p, float(rk.Block(0.35, p).restitution)) for p in (2.0, 5.0))
+    groups = similarity.groups(rk.Block(0.35, 2.0), 0.7, 9.0)
+    assert float(groups.restitution) == float(first.restitution)
     curves = []
     for block in (first, second):
         pulse = similarity.motion(groups, block, rk.SinePulse)
-        assert similarity.groups(block, pulse.amplitude, 2 * jnp.pi / pulse.period).strength == pytest.approx(
-            float(groups.strength), rel=1e-15
-        )
-        response = rk.simulate(block, pulse, duration=12 / block.p)
-        curves.append(similarity.master_curve(response, similarity.scales(block, pulse.amplitude), TAU))
+        again = similarity.groups(block, pulse.amplitude, 2 * np.pi / float(pulse.period))
+        assert float(again.strength) == pytest.approx(float(groups.strength), rel=1e-15)
+        scales = similarity.scales(block, pulse.amplitude)
+        curves.append(history(block, pulse, rk.Housner(), scales)[1])
     np.testing.assert_allclose(curves[0], curves[1], atol=1e-13)
 
 
-@jax.jit
-@functools.partial(jax.vmap, in_axes=(0, None, None))
-def peak_of_sine(alpha, strength, ratio):
-    """In both scales."""
-    block, amplitude = rk.Block(alpha, 1.0, 0.85), jnp.tan(alpha) / strength
-    found = rk.outcome(block, rk.SinePulse(amplitude, 2 * jnp.pi / ratio)).max_rotation
-    return [found / similarity.scales(block, amplitude, kind).rotation for kind in ("rigid", "slender")]
+def peaks_of_sines(model, alpha, amplitude, ratio):
+    """Of blocks with p = 1 and restitution 0.85, with the number of impacts."""
+    scenes = [((a, 1.0, 0.85), (b, 2 * np.pi / ratio), (0.0, 0.0)) for a, b in zip(alpha, amplitude)]
+    found = hard_cases.outcomes("sine", model, rk.Series(), scenes)
+    return found["max_rotation"], found["impact_count"]
 
 
 @pytest.mark.parametrize("ratio, most", [(8.0, 0.004), (5.0, 0.009), (3.0, 0.019)])
 @pytest.mark.parametrize("strength", [0.75, 0.9])
 def test_small_rotations_nearly_collapse(ratio, strength, most):
     """D&D equation 6.1: the spread of peaks over slenderness angles of 0.02 to 0.35, restitution 0.85."""
-    peaks = peak_of_sine(np.linspace(0.02, 0.35, 8), strength, ratio)
-    rigid, slender = (np.ptp(found) / np.mean(found) for found in map(np.asarray, peaks))
+    alpha = np.linspace(0.02, 0.35, 8)
+    amplitude = np.tan(alpha) / strength
+    peaks, _ = peaks_of_sines("nonlinear", alpha, amplitude, ratio)
+    units = [similarity.scales(rk.Block(alpha, np.ones(8)), amplitude, kind).rotation for kind in ("rigid", "slender")]
+    rigid, slender = (np.ptp(found) / np.mean(found) for found in (peaks / np.asarray(unit) for unit in units))
     assert rigid < most < 0.04 < slender
 
 
@@ -68,22 +79,27 @@ PULSES = {
 }
 
 
+@functools.partial(jax.jit, static_argnames="kind")
+def there_and_back(block, other, pulse, kind):
+    """Groups of a block under a pulse, the pulse from these, that for another block, its groups, and how both go."""
+    groups = similarity.groups_of(block, pulse, kind)
+    again, alike = (similarity.motion(groups, each, type(pulse)) for each in (block, other))
+    tau = np.linspace(0, 3.0, 20)
+    accelerations = pulse.acceleration(tau / block.p), alike.acceleration(tau / other.p)
+    return groups, again, similarity.groups_of(other, alike, kind), accelerations
+
+
 @pytest.mark.parametrize("kind", similarity.KINDS)
 @pytest.mark.parametrize("pulse", PULSES.values(), ids=PULSES)
 def test_groups_of_pulses(pulse, kind):
     """To groups and back to the pulse; another block's pulse with these groups has them, and goes the same way."""
     block, other = rk.Block(0.12, 3.0, 0.9), rk.Block(0.12, 5.0, 0.9)
-    groups = similarity.groups_of(block, pulse, kind)
-    again = similarity.motion(groups, block, type(pulse))
+    groups, again, its_groups, accelerations = there_and_back(block, other, pulse, kind)
     for one, two in zip(jax.tree.leaves(pulse), jax.tree.leaves(again), strict=True):
         assert float(one) == pytest.approx(float(two), rel=1e-14)
-    alike = similarity.motion(groups, other, type(pulse))
-    for one, two in zip(
-        jax.tree.leaves(groups), jax.tree.leaves(similarity.groups_of(other, alike, kind)), strict=True
-    ):
+    for one, two in zip(jax.tree.leaves(groups), jax.tree.leaves(its_groups), strict=True):
         assert float(one) == pytest.approx(float(two), rel=1e-14)
-    tau = np.linspace(0, 3.0, 20)
-    np.testing.assert_allclose(pulse.acceleration(tau / 3.0), alike.acceleration(tau / 5.0), atol=1e-14)
+    np.testing.assert_allclose(*accelerations, atol=1e-14)
 
 
 def test_groups_of_a_single_lobe():
@@ -123,7 +139,7 @@ def with_slopes(name):
     if name == "closed form":
         function = lambda x: rk.closed_form.single_lobe.peak_rotation(*x.T)
         return function(LOBES), gradient(function, LOBES)
-    function = {"series": lobe_peak(None), "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10))}[name]
+    function = {"series": lobe_peak(rk.Series(order=6)), "diffrax": lobe_peak(rk.Diffrax(rtol=1e-10))}[name]
     return jax.jit(jax.vmap(jax.value_and_grad(function)))(LOBES)
 
 
@@ -193,14 +209,9 @@ def similar_scenes():
     alpha = np.array([0.02, 0.05, 0.1, 0.2])
     amplitude = alpha / 0.45
 
-    def peak(alpha, amplitude):
-        block = rk.Block(alpha, 1.0, 0.85)
-        found = rk.outcome(block, rk.SinePulse(amplitude, 2 * np.pi / 5.0), rk.Linear())
-        return found.max_rotation, found.impact_count
-
-    rotation, impacts = jax.jit(jax.vmap(peak))(alpha, amplitude)
+    rotation, impacts = peaks_of_sines("linear", alpha, amplitude, 5.0)
     assert np.all(impacts >= 1) and np.all(np.isfinite(rotation))
-    return alpha, amplitude, np.asarray(rotation)
+    return alpha, amplitude, rotation
 
 
 @pytest.mark.parametrize("of_motion", range(-3, 4))
@@ -220,8 +231,10 @@ def test_exponents_that_orientations_allow_and_that_scale(of_motion):
 def test_what_orientations_say_is_a_mirror(model):
     """What points along z changes its sign with the accelerations along x, in every model; not every model scales."""
     block = rk.Block(0.3, 2.0, 0.85)
-    follow = jax.jit(lambda a: rk.simulate(block, rk.SinePulse(a, 0.8), model, duration=4.0)(jnp.linspace(0, 4, 90)))
-    for one, other in zip(follow(0.6), follow(-0.6)):
+    one_side, other_side = (
+        np.asarray(history(block, rk.SinePulse(a, 0.8), model, similarity.scales(block, 0.6))[0]) for a in (0.6, -0.6)
+    )
+    for one, other in zip(one_side, other_side):
         np.testing.assert_array_equal(one, -other)
         assert np.max(np.abs(one)) > 0.05
 

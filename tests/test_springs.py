@@ -127,14 +127,17 @@ def test_a_stout_block_has_no_balance():
 def run(kind, spring, derivatives):
     """Derivatives (scenes, results, parameters), if any, and outcomes, compiled once."""
 
-    def results(x):
+    def outcome(x):
         block = rk.Block(x[0], x[1], x[2])
         motion = x[3] * rk.example_record() if kind == "record" else PULSES[kind](*[x[k] for k in range(3, x.size)])
-        found = rk.outcome(block, motion, rk.Spring(*spring))
+        return rk.outcome(block, motion, rk.Spring(*spring))
+
+    def results(x):
+        found = outcome(x)
         return jnp.stack([getattr(found, name) for name in RESULTS]), found
 
-    if not derivatives:
-        return jax.jit(lambda x: (None, jax.vmap(lambda x: results(x)[1])(x)))
+    if not derivatives:  # one by one, as a single scene is compiled
+        return lambda x: (None, jax.tree.map(lambda *found: np.array(found), *map(outcome, x)))
     return jax.jit(jax.vmap(jax.jacfwd(results, has_aux=True)))
 
 
@@ -205,6 +208,14 @@ def test_free_stage(spring):
         visit = Visit(rk.Spring(*spring).moments(block), Reset.of(block.law, block.corners, block.p))
         return free_stage((visit, visit), x, v, jnp.array(True), jnp.array(0.0))
 
+    @jax.jit
+    def start(alpha, share, speed):
+        """An angle, a velocity in shares of what reaches the saddle, and a little more than that."""
+        table = rk.Spring(*spring).moments(rk.Block(alpha, 1.0, 0.6))
+        x = share * table.saddle
+        most = table.manifold(x)
+        return x, speed * jnp.abs(most), 1.001 * most
+
     follow = jax.jit(stage)
     for alpha, share, speed in [
         (0.05, 0.3, 0.9),
@@ -213,15 +224,13 @@ def test_free_stage(spring):
         (0.7, 1.2, -1.3),
         (0.7, 0.8, -2),
     ]:
-        table = rk.Spring(*spring).moments(rk.Block(alpha, 1.0, 0.6))
-        x = share * float(table.saddle)
-        v = speed * abs(float(table.manifold(jnp.array(x))))
+        x, v, more = (float(value) for value in start(alpha, share, speed))
         found = follow(alpha, 0.6, x, v)
         assert not found.overturned
         peak, time = free_peak(spring[0], alpha, 0.6, x, v)
         assert float(found.peak) == pytest.approx(float(peak), rel=2e-14)
         assert float(found.peak_time) == pytest.approx(float(time), rel=1e-13)
-        assert follow(alpha, 0.6, x, 1.001 * float(table.manifold(jnp.array(x)))).overturned == (share < 1 or v > 0)
+        assert follow(alpha, 0.6, x, more).overturned == (share < 1 or v > 0)
 
 
 @pytest.mark.parametrize("spring", [SPRINGS[3], *(slow(spring) for spring in SPRINGS[:3])], ids=" ".join)
@@ -230,9 +239,7 @@ def test_energy_between_impacts(spring):
     alpha, e, p = 0.4, 0.8, 2.0
     block, model = rk.Block(alpha, p, e), rk.Spring(*spring)
     moment = MOMENTS[spring]
-    release = jax.jit(
-        lambda speed: rk.simulate(block, rk.Record([0.0], 0.1), model, initial=(0.0, speed), duration=8.0)
-    )
+    release = lambda speed: rk.simulate(block, rk.Record([0.0], 0.1), model, initial=(0.0, speed), duration=8.0)
     over = float(
         mpmath.sqrt(2 * mpmath.quad(lambda x: moment(x, alpha, mpmath), [0, float(model.moments(block).saddle)]))
     )

@@ -73,10 +73,12 @@ def test_axes_keep_their_type_and_one_number_is_a_result():
 
 def test_sweep_is_made_of_outcomes():
     record = rk.Record(0.3 * np.sin(np.linspace(0, 6, 40)), 0.05)
-    grid = rk.sweep(
-        lambda alpha, p: rk.outcome(rk.Block(alpha, p), record, rk.Linear()), alpha=[0.1, 0.2], p=np.linspace(1, 9, 40)
-    )
-    single = jax.jit(jax.vmap(lambda p: rk.outcome(rk.Block(0.2, p), record, rk.Linear())))(grid.axes["p"])
+
+    def scene(alpha, p):
+        return rk.outcome(rk.Block(alpha, p), record, rk.Linear(), engine=rk.Series(order=6))
+
+    grid = rk.sweep(scene, alpha=[0.1, 0.2], p=np.linspace(1, 9, 40))
+    single = jax.jit(jax.vmap(lambda p: scene(0.2, p)))(grid.axes["p"])
     assert isinstance(grid.values, rk.responses.Outcome) and np.all(grid.values.status == rk.Status.successful)
     assert 0 < np.sum(grid.values.overturned) < grid.values.overturned.size
     np.testing.assert_array_equal(grid.values.impact_count[1], single.impact_count)

@@ -45,13 +45,13 @@ def draw_blocks(
     **Raises:** ValueError for arguments outside their ranges.
     """
     check_single(block=block)
+    if restitution != 0 and block.law.depends_on_speed:
+        raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
     keys = jax.random.split(jax.random.key(seed), 3)
     normal = [jax.random.normal(key, (draws,)) for key in keys[:2]]
     alphas, ps = block.alpha * jnp.exp(alpha * normal[0]), block.p * jnp.exp(p * normal[1])
     if restitution == 0:
         return Block(alphas, ps, jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), block.law))
-    if block.law.depends_on_speed:
-        raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
     ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
     return Block(alphas, ps, block.restitution + restitution * jax.random.truncated_normal(keys[2], *ends, (draws,)))
 

@@ -18,6 +18,7 @@ Real = Float[Array, "..."]
 
 _MOST_PIECES = 4096
 _PIECES = 16
+_LENGTH = 128  # of the lanes that are compiled
 
 
 class Lane(eqx.Module):
@@ -62,17 +63,16 @@ def follow(intensity: np.ndarray, ratio: float, restitution: float) -> Lane:
 
     Some blocks take thousands of arcs, most only a few: those that have arrived are put aside as one goes along.
     """
-    lane = start(jnp.asarray(intensity))
-    lanes = jax.tree.map(np.array, lane)
+    # Not uplifted yet: at angle 0.
+    lanes = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(start, intensity))
     waiting = np.arange(intensity.size)
     for _ in range(_MOST_PIECES // _PIECES):
-        # Repeated to a power of 2: few lengths are compiled.
-        size = max(64, 1 << (waiting.size - 1).bit_length())
-        index = np.resize(waiting, size)
-        part = jax.tree.map(lambda x, index=index: x[index], lanes)
-        part = _advance(part, intensity[index], jnp.full(size, ratio), jnp.full(size, restitution))
-        for whole, new in zip(jax.tree.leaves(lanes), jax.tree.leaves(part)):
-            whole[waiting] = np.asarray(new)[: waiting.size]
+        for some in np.split(waiting, range(_LENGTH, waiting.size, _LENGTH)):
+            index = np.resize(some, _LENGTH)  # repeated
+            part = jax.tree.map(lambda x, index=index: x[index], lanes)
+            part = _advance(part, intensity[index], np.full(_LENGTH, ratio), np.full(_LENGTH, restitution))
+            for whole, new in zip(jax.tree.leaves(lanes), jax.tree.leaves(part)):
+                whole[some] = np.asarray(new)[: some.size]
         waiting = waiting[~lanes.done[waiting]]
         if not waiting.size:
             break
@@ -81,13 +81,20 @@ def follow(intensity: np.ndarray, ratio: float, restitution: float) -> Lane:
 
 @jax.jit
 def _advance(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
-    """Some pieces of an arc further."""
+    """Some pieces of an arc further, as long as a lane has any left."""
+    # The uplift is computed where it is compared, for a block is driven from there on to the last digit.
+    lane = jax.tree.map(lambda new, old: jnp.where(lane.angle == 0, new, old), start(intensity), lane)
 
-    def step(_, lane):
+    def going(carry):
+        count, lane = carry
+        return (count < _PIECES) & ~jnp.all(lane.done)
+
+    def step(carry):
+        count, lane = carry
         new = _next(lane, intensity, ratio, restitution)
-        return jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane)
+        return count + 1, jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane)
 
-    return jax.lax.fori_loop(0, _PIECES, step, lane)
+    return jax.lax.while_loop(going, step, (0, lane))[1]
 
 
 def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:

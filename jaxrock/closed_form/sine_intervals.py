@@ -72,7 +72,7 @@ def overturning_intervals(
     def unchanged(points):
         return (_at(points, ratio, restitution)[0] > 0) == lost[change][:, None]
 
-    low, high = _narrowed(samples[change], samples[change + 1], unchanged, 17)
+    low, high = _narrowed(samples[change], samples[change + 1], unchanged, 27)
     ends = (low + high) / 2
     lower, upper = list(ends[~lost[change]]), list(ends[lost[change]])
     if lost[0]:
@@ -102,7 +102,7 @@ def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) 
     def more(points):
         return _at(points, ratio, restitution)[1] > level[:, None]
 
-    return np.unique(np.concatenate(_narrowed(samples[index], samples[index + 1], more, 9)))
+    return np.unique(np.concatenate(_narrowed(samples[index], samples[index + 1], more, 15)))
 
 
 def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarray, np.ndarray]:
@@ -115,10 +115,10 @@ def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarra
 
 
 def _narrowed(below, above, like_below, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Brackets of a change, each cut into 9 at every level."""
+    """Brackets of a change, each cut into 4 at every level."""
     rows = np.arange(below.size)
     for _ in range(levels):
-        grid = below[:, None] + (above - below)[:, None] * np.linspace(0, 1, 10)
+        grid = below[:, None] + (above - below)[:, None] * np.linspace(0, 1, 5)
         first = np.cumprod(like_below(grid[:, 1:-1]), axis=1).sum(axis=1)
         below, above = grid[rows, first], grid[rows, first + 1]
     return below, above

@@ -3,6 +3,7 @@ exceed each level of intensity."""
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
@@ -17,7 +18,7 @@ from jaxrock._checks import (
     share,
 )
 from jaxrock._described import described
-from jaxrock.hazard.fragility import alike, beside, rising
+from jaxrock.hazard.fragility import alike, beside, rising, the_one_before
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 Real = Inexact[Array, "..."]
@@ -56,12 +57,8 @@ class HazardCurve(eqx.Module):
         self.levels, rates = alike(rising("levels", levels), as_real("rates", rates))
         rates = beside("rates", rates, self.levels)
 
-        def holds(x):
-            known = jnp.any((x > 0) & (x < jnp.inf), -1, keepdims=True)
-            return (x >= 0) & ~(jnp.diff(x, prepend=jnp.inf) > 0) & (known | (x < jnp.inf))
-
         allowed = "be 0 or more, never rise, and be infinite only before a positive finite one"
-        self.rates = checked("rates", rates, allowed, holds)
+        self.rates = checked("rates", rates, allowed, _can_be_rates)
         self.measure = measure
 
     @classmethod
@@ -140,6 +137,11 @@ class HazardCurve(eqx.Module):
         inner = jnp.where(levels > self.levels[last], law(last - 1, last), inner)
         inner = jnp.where(levels < self.levels[first], law(first, first + 1), inner)
         return HazardCurve(levels, inner, self.measure)
+
+
+def _can_be_rates(x):
+    known = ((x > 0) & (x < np.inf)).any(-1, keepdims=True)
+    return (x >= 0) & ~(x > the_one_before(x, np.inf)) & (known | (x < np.inf))
 
 
 def check_one(curve: HazardCurve) -> None:

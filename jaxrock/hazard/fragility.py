@@ -114,7 +114,17 @@ def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
     if array.ndim == 0 or array.shape[-1] < 2 or array.size == 0:
         raise ValueError(f"Argument `{name}` must hold at least two levels, but has shape {array.shape}.")
     allowed = "be positive and finite, and rise from level to level"
-    return checked(name, array, allowed, lambda x: (jnp.diff(x, prepend=0.0) > 0) & (x < jnp.inf))
+    return checked(name, array, allowed, _rises)
+
+
+def _rises(x):
+    return (x > the_one_before(x, 0.0)) & (x < np.inf)
+
+
+def the_one_before(x, first: float):
+    """Of each value along the last axis, by NumPy of known ones: JAX would compile that for every length."""
+    arrays = np if isinstance(x, np.ndarray) else jnp
+    return arrays.concatenate([arrays.full_like(x[..., :1], first), x[..., :-1]], axis=-1)
 
 
 def rising_list(name: str, value: Values) -> Inexact[Array, " n"]:

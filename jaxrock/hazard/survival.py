@@ -17,7 +17,7 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, checked, inner_share, not_negative, scalar, share
+from jaxrock._checks import Values, checked, inner_share, not_negative, placed, scalar, share
 from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled, shakings
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility
 from jaxrock.numerics.roots import search_root
@@ -135,7 +135,8 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragil
     ages = not_negative("ages", ages)
     if ages.shape not in ((), (len(rocks),)) or not rocks:
         raise ValueError(f"Argument `ages` must be one for each of {len(rocks)} rocks, but has shape {ages.shape}.")
-    ages = jnp.broadcast_to(ages, len(rocks))
+    arrays = jnp if isinstance(ages, jax.core.Tracer) else np
+    ages = arrays.broadcast_to(ages, len(rocks))
     kinds = {}
     for index, rock in enumerate(rocks):
         numbers, rest = eqx.partition(rock, eqx.is_array_like)
@@ -149,8 +150,16 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragil
     stacks = []
     for members in kinds.values():
         numbers, rest = eqx.partition([rocks[index] for index in members], eqx.is_array_like)
-        stacks.append(eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *numbers), rest[0]))
-    return tuple(stacks), ages[np.concatenate(list(kinds.values()))]
+        stacks.append(eqx.combine(jax.tree.map(_stacked, *numbers), rest[0]))
+    order = np.concatenate(list(kinds.values()))
+    return tuple(stacks), ages[order] if isinstance(ages, jax.core.Tracer) else placed(ages[order])
+
+
+def _stacked(*numbers: Any) -> Array:
+    """By NumPy where they are known: JAX would compile that for every number of rocks."""
+    if any(isinstance(number, jax.core.Tracer) for number in numbers):
+        return jnp.stack(numbers)
+    return placed(np.stack([np.asarray(number) for number in numbers]))
 
 
 @eqx.filter_jit

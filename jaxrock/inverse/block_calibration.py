@@ -86,8 +86,7 @@ class BlockCalibration(AbstractTable):
         """
         if not isinstance(values, Mapping) or set(values) != set(self.problem.unknowns):
             raise ValueError(f"Argument `values` must have the names {sorted(self.problem.unknowns)}.")
-        places = [self.problem.place(name, as_real(name, values[name])) for name in self.problem.unknowns]
-        return self.problem.log_density(jnp.stack(places))
+        return _density(self.problem, {name: as_real(name, values[name]) for name in self.problem.unknowns})
 
     def auc(self, held_out: bool = False) -> float:
         """Share of pairs of a test that toppled and one that stood of which the first has the higher probability."""
@@ -317,11 +316,12 @@ def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
     held_out = np.full(table.seen.shape, np.nan)
     if part is not None:
         for number in range(int(part.max()) + 1):
-            other, _ = climbed(problem, [place], jnp.asarray(part != number, float))
+            other, _ = climbed(problem, [place], (part != number).astype(float))
             held_out[part == number] = np.asarray(_probabilities(problem, other, table.toppled))[part == number]
     bounds = [_probabilities(problem, place, shares) for shares in (table.lower, table.upper)]
+    height, _ = _value(problem, place, np.ones(len(table.seen)))
     return BlockCalibration(
-        problem.values(jnp.asarray(place)), jnp.asarray(covariance), _value(problem, place, None)[0],
+        problem.values(jnp.asarray(place)), jnp.asarray(covariance), height,
         _probabilities(problem, place, table.toppled), jnp.stack(bounds), jnp.asarray(held_out), table.seen, status,
         problem,
     )  # fmt: skip
@@ -343,15 +343,21 @@ def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[
     from scipy.optimize import minimize
 
     ends = np.asarray(problem.ends)
+    weights = np.ones(len(problem.table.seen)) if weights is None else weights  # one program for both
 
     def down(place):
-        value, slope = _value(problem, jnp.asarray(place), weights)
+        value, slope = _value(problem, place, weights)
         return -float(value), -np.asarray(slope)
 
     settings = {"jac": True, "method": "L-BFGS-B", "bounds": ends, "options": {"ftol": 1e-13, "gtol": 1e-7}}
     found = [minimize(down, start, **settings) for start in starts]
     best = min(found, key=lambda each: each.fun)
     return best.x, bool(best.success) or float(np.abs(best.jac).max()) < 1e-3
+
+
+@jax.jit
+def _density(problem, values):
+    return problem.log_density(jnp.stack([problem.place(name, values[name]) for name in problem.unknowns]))
 
 
 @jax.jit

@@ -6,7 +6,8 @@ from typing import Annotated
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Inexact
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, check_shapes
@@ -38,12 +39,12 @@ class LogDensity(eqx.Module):
     def __call__(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-density of points, (..., parameters), with respect to the points themselves, but for a constant: what a
         sampler takes. Many points at once take less time than `jax.vmap` of one."""
-        return _at_points(self, self._checked(point), True)
+        return _at_points(self, self._checked(point), np.array(True))
 
     def objective(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-likelihood and log-prior: what `estimate_motion` makes as large as it can. It does not depend on the
         coordinates."""
-        return _at_points(self, self._checked(point), False)
+        return _at_points(self, self._checked(point), np.array(False))
 
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
         """Parameters by name, in their units, at points."""
@@ -88,7 +89,8 @@ class LogDensity(eqx.Module):
 
 
 @eqx.filter_jit
-def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
+def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) -> Real:
+    """The log-density or, not `by_point`, the objective: one program for both."""
     problem = density.problem
     if point.shape[-1:] != (len(problem.names),):
         raise ValueError(
@@ -96,8 +98,7 @@ def _at_points(density: LogDensity, point: Real, by_point: bool) -> Real:
         )
     nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
     point = jnp.where(nowhere[..., None], 0.0, point)
-    value = problem.log_density(density.place(point))
-    value = value + density.log_volume(point) if by_point else value
+    value = problem.log_density(density.place(point)) + jnp.where(by_point, density.log_volume(point), 0.0)
     return jnp.where(nowhere, -jnp.inf, value)
 
 

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments, at_least
+from jaxrock._checks import placed
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
@@ -232,13 +232,12 @@ def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
 def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Profile, trace: Trace) -> Estimate:
     problem = evaluate.problem
     best = int(np.argmax(summits.values))
-    places = jnp.asarray(evaluate.places(summits.points))
+    parameters = problem.parameters(evaluate.places(summits.points))
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
-    values = {name: x[best] for name, x in problem.values(places).items()}
     stands, computed, *facts = evaluate.facts(evaluate.places(summits.points[best]))
     surprise = _surprise(facts)
-    probability = jnp.where(problem.likelihood.observations.seen == TOPPLED, 1 - stands, stands)
-    remarks, consistent = _remarks(problem, shape, profiled), jnp.inf
+    probability = np.where(np.asarray(problem.likelihood.observations.seen) == TOPPLED, 1 - stands, stands)
+    remarks, consistent = _remarks(problem, shape, profiled), np.inf
     status = EstimateStatus.successful
     if profiled.open.any():
         status = EstimateStatus.open_interval
@@ -256,27 +255,22 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         interval, covariance = np.full_like(interval, np.nan), np.full_like(covariance, np.nan)
         consistent = _consistent(evaluate, summits.points[best])
         names = problem.likelihood.observations.names
-        worst = np.argsort(np.asarray(probability))[:3]
+        worst = np.argsort(probability)[:3]
         worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
         remarks = (f"Least probable under the best motion: {', '.join(worst)}.",) if worst else ()
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
     per_point = problem.likelihood.observations.ways.size * NODES
+    arrays = {
+        "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
+        "directions": shape.directions, "deviations": shape.deviations, "log_likelihood": summits.values[best],
+        "surprise": surprise, "probability": probability, "consistent_scatter": consistent, "summits": parameters,
+        "summit_values": summits.values,
+    }  # fmt: skip
     return Estimate(
+        **placed({name: np.asarray(x) for name, x in arrays.items()}),
         names=problem.names,
-        values=jnp.stack(list(values.values())),
-        interval=jnp.asarray(interval),
-        open=jnp.asarray(profiled.open),
-        covariance=jnp.asarray(covariance),
-        directions=jnp.asarray(shape.directions),
-        deviations=jnp.asarray(shape.deviations),
-        log_likelihood=jnp.asarray(summits.values[best]),
-        surprise=jnp.asarray(surprise),
-        probability=probability,
         scatter=problem.likelihood.scatter,
-        consistent_scatter=jnp.asarray(consistent),
-        summits=jnp.stack(list(problem.values(places).values()), axis=-1),
-        summit_values=jnp.asarray(summits.values),
         trace=trace,
         responses=evaluate.count * per_point,
         remarks=remarks,

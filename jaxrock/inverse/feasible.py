@@ -5,7 +5,6 @@ from typing import Annotated
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -14,7 +13,7 @@ from jaxrock._checks import Values, finite, placed, scalar, size
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.likelihood import Likelihood, as_program
 from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -80,17 +79,14 @@ def feasible_region(
         parts = (x[begin : begin + _LANES] for x in (rows, columns))
         count = min(_LANES, rows.size - begin)
         parts = (np.pad(x, (0, _LANES - count), mode="edge") for x in parts)
-        terms.append(np.asarray(_log_likelihood(likelihood, dict(zip(lists, parts)) | rest))[:count])
+        motions: dict[str, ArrayLike] = {**dict(zip(lists, parts)), **rest}
+        found = as_program(Likelihood.terms, likelihood, motions, False)
+        terms.append(np.asarray(found)[:count].sum(axis=-1))
         bar.add(count)
     total = np.concatenate(terms).reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
     (first, second), (across, up) = lists, lists.values()
     return FeasibleRegion((first, second), (across, up), *placed((total, total > total.max() + np.log(0.05))))
-
-
-@eqx.filter_jit
-def _log_likelihood(likelihood, values):
-    return jnp.sum(likelihood.log_terms(values, slopes=False), axis=-1)
 
 
 class Unexceeded(AbstractTable):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, gradient_transformation, known, pair
-from jaxrock._checks import Values, finite, not_negative, one_of, positive, scalar, shown
+from jaxrock._checks import Values, finite, not_negative, one_of, placed, positive, scalar, shown
 from jaxrock._parameters import broadcast, leaves_of
 from jaxrock._precision import say_if_single
 from jaxrock._progress import Progress
@@ -229,13 +229,13 @@ def _site(block, start: Record, target, model: AbstractEquation, engine: Abstrac
     for each in targets:
         if isinstance(each, str):
             one_of("target", each, tuple(_SIDES))
-    wanted = jnp.asarray([0.0 if isinstance(x, str) else float(scalar("target", finite("target", x))) for x in targets])
+    wanted = np.array([0.0 if isinstance(x, str) else float(scalar("target", finite("target", x))) for x in targets])
     model = current_model(model, blocks, start)
-    site = Site(blocks, start.samples, start.dt, jnp.ones(count), wanted, model, engine)
-    margin = site.margins(jnp.zeros_like(start.samples))[0]
-    from_above = [x > y for x, y in zip(margin, wanted)]
+    site = Site(blocks, start.samples, start.dt, placed(np.ones(count)), placed(wanted), model, engine)
+    margin = site.margins(np.zeros((1, start.samples.size)))[0][0]
+    from_above = margin > wanted
     sides = [_SIDES[x] if isinstance(x, str) else 1.0 if above else -1.0 for x, above in zip(targets, from_above)]
-    return eqx.tree_at(lambda it: it.side, site, jnp.asarray(sides))
+    return eqx.tree_at(lambda it: it.side, site, placed(np.array(sides)))
 
 
 class _Directions(NamedTuple):
@@ -289,8 +289,8 @@ class _Directions(NamedTuple):
 def _result(
     search: Search, start: Record, found: Found | None, lengths: list[float], scaling: float, kept: KeptSpectrum | None
 ) -> FoundRecord:
-    change = np.zeros_like(start.samples) if found is None else found.change
-    margin, _ = search.site.margins(jnp.asarray(change))
+    change = np.zeros(start.samples.shape) if found is None else found.change
+    margin = search.site.margins(change[None])[0][0]
     slope = np.nan if found is None else found.slope
     spectrum = np.nan if kept is None else kept.change(np.asarray(start.samples) + change)
     status = RecordStatus.successful
@@ -302,16 +302,14 @@ def _result(
         status = RecordStatus.useless_slopes
     elif spectrum > TOLERANCE:
         status = RecordStatus.spectrum_changed
+    numbers = {
+        "change": _length(found), "scaling": scaling, "margin": margin, "slope": slope, "changes": lengths,
+        "path": found.lengths if found else (), "spectrum": spectrum,
+    }  # fmt: skip
     name = f"{start.name}, changed".removeprefix(", ")
     return FoundRecord(
         record=start if found is None else Record(start.samples + change, start.dt, name),
         start=start,
-        change=jnp.asarray(_length(found)),
-        scaling=jnp.asarray(scaling),
-        margin=margin,
-        slope=jnp.asarray(slope),
-        changes=jnp.asarray(lengths),
-        path=jnp.asarray(found.lengths if found else ()),
-        spectrum=jnp.asarray(spectrum),
         status=status,
+        **placed({name: np.asarray(x) for name, x in numbers.items()}),
     )

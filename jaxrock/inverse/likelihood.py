@@ -104,8 +104,17 @@ class Likelihood(eqx.Module):
         [1/rad]; minus infinity for motions that there are not, such as those of a negative duration. It has derivatives
         if `slopes`, and is computed faster without. Many motions at once take less time than `jax.vmap` of one.
         """
+        return self._compiled(Likelihood.terms, values, slopes)
+
+    def terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
+        """What `log_terms` returns, within a program."""
         possible, impossible = self._possible(values, slopes)
         return self._terms(self._log_probabilities(possible), impossible)
+
+    def _compiled(self, what: Callable, values: Mapping[str, ArrayLike], *how):
+        """One of its functions as one program: outside of a program every operation would be one of its own."""
+        given = {name: as_real(name, x) for name, x in values.items()}
+        return as_program(what, self.current(tuple(values)), given, *how)
 
     def _log_probabilities(self, possible: Possible) -> Real:
         """Of standing and toppling, and of standing as it was measured; without the possibility of a lapse."""
@@ -130,6 +139,9 @@ class Likelihood(eqx.Module):
 
     def survival(self, values: Mapping[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks), without derivatives."""
+        return self._compiled(Likelihood._survival, values)
+
+    def _survival(self, values: Mapping[str, ArrayLike]) -> Real:
         return jnp.exp(self._possible(values)[0].log_probabilities()[0])
 
     def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
@@ -138,12 +150,15 @@ class Likelihood(eqx.Module):
         The badness is minus the log-probability; for a measured rotation half its squared distance from what is
         expected, in standard deviations, and minus the log-probability that it stands. Without derivatives.
         """
+        return self._compiled(Likelihood._surprise_at, values)
+
+    def _surprise_at(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
         possible = self._possible(values)[0]
         return self._surprise(possible, possible.log_probabilities())
 
     def terms_and_facts(self, values: Mapping[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
         """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
-        of the first."""
+        of the first. Within a program."""
         possible, impossible = self._possible(values, slopes=True)
         logarithms = self._log_probabilities(possible)
         facts = jnp.exp(logarithms[0]), possible.share_known, *self._surprise(possible, logarithms)
@@ -204,6 +219,12 @@ class Likelihood(eqx.Module):
             strength = _log_strength(self.motion(**dict(zip(names, parameters))))
         failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in checks)]).any()
         return jnp.where(failed, 0.0, strength), failed
+
+
+@eqx.filter_jit
+def as_program(what: Callable, likelihood: Likelihood, values: Mapping[str, ArrayLike], *how):
+    """A function of a likelihood as it is now (`current`), at values by name, as one compiled program."""
+    return what(likelihood, values, *how)
 
 
 def _log_strength(motion: AbstractMotion) -> Real:

@@ -50,20 +50,29 @@ class Site(eqx.Module):
         result = outcome(block, record, self.model, engine=self.engine, throw=False)
         return result.margin, result.status == Status.successful
 
-    def margins(self, change: Float[Array, " n"]) -> tuple[Float[Array, " blocks"], Bool[Array, " blocks"]]:
-        """Those of all blocks."""
-        own = jax.tree.map(lambda whole: None if whole else 0, shared(self.blocks))
-        return jax.vmap(lambda block: self.margin(block, change), in_axes=(own,))(self.blocks)
+    def margins(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those of all blocks under any number of changes, (changes, n): (changes, blocks), and whether each is known;
+        one compiled program serves for all."""
+        found = []
+        for begin in range(0, len(changes), _LANES):
+            part = changes[begin : begin + _LANES]
+            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
+            found.append([np.asarray(x)[: len(part)] for x in _margins(self, padded)])
+        margins, known = (np.concatenate(x) for x in zip(*found))
+        return margins, known
 
 
 @eqx.filter_jit
-def _reached(site: Site, changes: Float[Array, "lanes n"]) -> Bool[Array, " lanes"]:
-    margin, known = jax.vmap(site.margins)(changes)
-    return jnp.all((site.side * (margin - site.target) <= 0) & known, axis=1)
+def _margins(
+    site: Site, changes: Float[ArrayLike, "lanes n"]
+) -> tuple[Float[Array, "lanes blocks"], Bool[Array, "lanes blocks"]]:
+    own = jax.tree.map(lambda whole: None if whole else 0, shared(site.blocks))
+    of_all = jax.vmap(site.margin, in_axes=(own, None))
+    return jax.vmap(lambda change: of_all(site.blocks, change))(changes)
 
 
 @eqx.filter_jit
-def _margins_and_slopes(site: Site, change: Float[Array, " n"]):
+def _margins_and_slopes(site: Site, change: Float[ArrayLike, " n"]):
     """Margins of all blocks, (blocks,), and their derivatives by the change, (blocks, n)."""
 
     def one(number):
@@ -97,16 +106,13 @@ class Search(NamedTuple):
 
     def reached(self, changes: np.ndarray) -> np.ndarray:
         """Whether changes, (lanes, n), do what is wanted."""
-        found = []
-        for begin in range(0, len(changes), _LANES):
-            part = changes[begin : begin + _LANES]
-            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append(np.asarray(_reached(self.site, jnp.asarray(padded)))[: len(part)])
-        return np.concatenate(found)
+        margin, known = self.site.margins(changes)
+        side, target = np.asarray(self.site.side), np.asarray(self.site.target)
+        return ((side * (margin - target) <= 0) & known).all(axis=1)
 
     def slopes(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By how much margins fail, (blocks,), and its derivatives by the allowed changes, (blocks, n) [1/g]."""
-        margin, slopes = map(np.asarray, _margins_and_slopes(self.site, jnp.asarray(change)))
+        margin, slopes = map(np.asarray, _margins_and_slopes(self.site, change))
         side = np.asarray(self.site.side)
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
-from jaxrock._checks import shown
+from jaxrock._checks import placed, shown
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import Summits, climb
 
@@ -38,10 +38,8 @@ class Trace(eqx.Module):
         """That of points on the way to summits."""
         assert summits.path is not None
         points, values = summits.path
-        places = jnp.asarray(evaluate.places(points))
-        parameters = jnp.stack(list(evaluate.problem.values(places).values()), axis=-1)
-        gone = jnp.isnan(jnp.asarray(values))
-        return cls(jnp.where(gone[..., None], jnp.nan, parameters), jnp.asarray(values))
+        parameters = evaluate.problem.parameters(evaluate.places(points))
+        return cls(*placed((np.where(np.isnan(values)[..., None], np.nan, parameters), values)))
 
 
 def optimizer_or_none(name: str, value: Any) -> Any:

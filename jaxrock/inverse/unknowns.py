@@ -128,6 +128,11 @@ class Problem(eqx.Module):
             for i, (name, unknown) in enumerate(self.unknowns.items())
         }
 
+    def parameters(self, places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Those at known places, (..., parameters): by NumPy, for which nothing is compiled."""
+        logs = np.array([unknown.log for unknown in self.unknowns.values()])
+        return np.where(logs, np.exp(np.where(logs, places, 0.0)), places)
+
     def log_prior(self, places: Real) -> Real:
         """Logarithm of the prior's density at places, (..., parameters), but for a constant."""
         priors = [unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values())]
@@ -135,7 +140,7 @@ class Problem(eqx.Module):
 
     def log_density(self, places: Real, slopes: bool = True) -> Real:
         """Log-likelihood and log-prior (by the places) at places, (..., parameters); with first derivatives."""
-        terms = self.likelihood.log_terms(self.values(places), slopes)
+        terms = self.likelihood.terms(self.values(places), slopes)
         return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
 

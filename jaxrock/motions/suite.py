@@ -27,7 +27,10 @@ _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
 def _known_stays_so(tree) -> contextlib.AbstractContextManager:
     """Within it what follows from a tree without traced arrays is computed at once, within `jax.jit` too."""
-    return contextlib.nullcontext() if is_traced(tree) else jax.ensure_compile_time_eval()
+    # Where nothing is traced that is so anyway; to ask for it would compile one by one what `jax.jit` compiles whole.
+    if is_traced(tree) or not is_traced(jnp.zeros(())):
+        return contextlib.nullcontext()
+    return jax.ensure_compile_time_eval()
 
 
 def _is_motion(value) -> bool:

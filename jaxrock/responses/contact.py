@@ -79,6 +79,11 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
     check_single(block=block)
     response.trajectory.check_single()
+    return _contact(response, block, ratio)
+
+
+@jax.jit
+def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) -> Contact:
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (jnp.ones_like(block.p),) * 2
         rates = block.p, block.p

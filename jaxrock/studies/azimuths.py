@@ -8,14 +8,13 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, finite, scalar, shown, size
+from jaxrock._checks import Values, finite, placed, scalar, shown, size
 from jaxrock._described import described
-from jaxrock._parameters import broadcast, check_single, one_of_many
+from jaxrock._parameters import check_single
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -103,13 +102,14 @@ def azimuth_outcomes(
     first = float(scalar("orientation", finite("orientation", orientation)))
     blocks = _blocks(rock, angles)
     model = current_model(model, blocks, components.first, scales)
+    known = jax.tree.map(np.asarray, blocks)
     bar, found = Progress(angles.size * scales.size, "azimuths", progress), []
     for index, angle in enumerate(angles):
         motion: AbstractMotion = components.along(angle - first)
         if vertical and components.vertical is not None:
             motion = motion.with_vertical(components.vertical)
-        lanes = broadcast(one_of_many(blocks, index), scales.shape)
-        found.append(of_motion(with_room(motion), lanes, jnp.asarray(scales), model, engine))
+        lanes = placed(jax.tree.map(lambda x, at=index: np.full(scales.shape, x[at]), known))
+        found.append(of_motion(with_room(motion), lanes, placed(scales), model, engine))
         bar.add(scales.size)
     parts = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
     return AzimuthOutcomes(angles, scales, blocks, *parts)
@@ -124,7 +124,7 @@ def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBloc
         check_single(rock=block)
     if len({jax.tree.structure(block) for block in found}) > 1:
         raise ValueError("Argument `rock` must give blocks of one kind for all azimuths, but gives several.")
-    return stacked(jax.tree.map(lambda *x: jnp.stack(x), *found))
+    return stacked(jax.tree.map(lambda *x: np.stack(x), *found))
 
 
 def _in_plane(rock: Rock | Callable, azimuth: float):

@@ -201,6 +201,12 @@ def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Arr
     return jax.vmap(one)(jnp.arange(size))
 
 
+@eqx.filter_jit
+def _units(kind: AbstractVaried, both: PyTree, size: int) -> Array:
+    """What the factors multiply in so many scenes."""
+    return jax.vmap(lambda index: kind.unit(*one_of_many(both, index)))(jnp.arange(size))
+
+
 # Of many scenes: what is asked of one point.
 
 
@@ -260,7 +266,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
     ends = roots_of(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
-    units = jax.vmap(lambda index: kind.unit(*one_of_many(scenes.both, index)))(jnp.arange(grid.shape[0]))
+    units = _units(kind, scenes.both, grid.shape[0])
     units, threshold, amplitude = (np.asarray(x)[ends["index"]] for x in (units, scenes.threshold, scenes.amplitude))
     value = np.exp(ends["z"]) * units
     rows = {"value": value, "intensity": kind.amplitude(value, amplitude) / threshold}

@@ -146,7 +146,7 @@ def rocking_spectrum(
     block = Block(alpha, 1.0, restitution)  # raises here, where values are known
 
     scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
-    return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress))
+    return Spectrum(period, **_only(_PEAKS, surface(_under_motion, (period,), scene, "spectrum", progress)))
 
 
 @arguments
@@ -188,7 +188,7 @@ def self_similar_spectrum(
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
     scene = _scene(axes, alpha, restitution, pulse, model, engine)
-    results = _over_pulses(_peaks_under_pulse, axes, scene, "spectrum", progress)
+    results = _only(_PEAKS, _over_pulses(axes, scene, "spectrum", progress))
     return Spectrum(abscissa=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
 
@@ -221,7 +221,7 @@ def overturning_map(
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
     scene = _scene(axes, alpha, restitution, pulse, model, engine)
-    results = _over_pulses(_states_under_pulse, axes, scene, "map", progress)
+    results = _only(_STATES, _over_pulses(axes, scene, "map", progress))
     return OverturningMap(
         frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, scene=scene, **results
     )
@@ -281,11 +281,11 @@ class _Family(eqx.Module):
         return self.pulse(size, extent, **self.numbers, **dict(zip(self.lists, listed)))
 
 
-def _over_pulses(function, axes: _PulseAxes, scene: tuple, label: str, progress: bool | None) -> dict:
+def _over_pulses(axes: _PulseAxes, scene: tuple, label: str, progress: bool | None) -> dict:
     """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
     points = (*axes.lists.values(), axes.intensity, axes.ratio)
     # Neighbours in intensity share a chunk: they move alike.
-    return surface(function, points, scene, label, progress, columns=True)
+    return surface(_under_pulse, points, scene, label, progress, columns=True)
 
 
 def scaled_law(block: Block) -> AbstractRestitution:
@@ -306,22 +306,23 @@ def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"
     return array
 
 
-# What a surface keeps of an outcome: computed with it, point by point.
+# What a surface keeps of an outcome: computed with it, point by point, and alike for spectra and maps, so that a
+# spectrum and a map of one pulse are one program.
+_PEAKS = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
+_STATES = ("state", "max_rotation", "impact_count", "margin", "status")
 
 
-def _peaks(result: Outcome, block: Block) -> dict:
-    """Of a spectrum."""
+def _only(names: tuple[str, ...], results: dict) -> dict:
+    return {name: results[name] for name in names}
+
+
+def _kept(result: Outcome, block: Block) -> dict:
+    """Of a spectrum, and of a map."""
     rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
     velocity = result.max_velocity / (block.p * block.alpha)
-    return {"max_rotation": result.max_rotation / block.alpha, "max_velocity": velocity, **rest}
-
-
-def _states(result: Outcome, block: Block) -> dict:
-    """Of a map."""
-    rest = {name: getattr(result, name) for name in ("impact_count", "margin", "status")}
     state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
     state = jnp.where(result.status == Status.successful, state, -1)
-    return {"state": state, "max_rotation": result.max_rotation / block.alpha, **rest}
+    return {"state": state, "max_rotation": result.max_rotation / block.alpha, "max_velocity": velocity, **rest}
 
 
 # The functions of surfaces. What is given for all points lies in the scene, a pytree, so that a second surface of a
@@ -331,7 +332,7 @@ def _states(result: Outcome, block: Block) -> dict:
 def _under_motion(period, scene):
     alpha, restitution, motion, model, engine = scene
     block = Block(alpha, 2 * jnp.pi / period, restitution)
-    return _peaks(outcome(block, motion, model, engine=engine), block)
+    return _kept(outcome(block, motion, model, engine=engine), block)
 
 
 def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
@@ -342,9 +343,5 @@ def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
     return outcome(block, motion, model, engine=engine), block
 
 
-def _peaks_under_pulse(*point_and_scene) -> dict:
-    return _peaks(*under_pulse(*point_and_scene))
-
-
-def _states_under_pulse(*point_and_scene) -> dict:
-    return _states(*under_pulse(*point_and_scene))
+def _under_pulse(*point_and_scene) -> dict:
+    return _kept(*under_pulse(*point_and_scene))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock._checks import placed
 from jaxrock._parameters import one_of_many
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -41,10 +42,10 @@ class Scenes(NamedTuple):
 
 def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
     """A block with parameters of shape (draws,)."""
-    shape = jnp.broadcast_shapes((1,), *(jnp.shape(leaf) for leaf in jax.tree.leaves(block)))
+    shape = np.broadcast_shapes((1,), *(np.shape(leaf) for leaf in jax.tree.leaves(block)))
     if len(shape) > 1:
         raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), block)
+    return jax.tree.map(lambda x: placed(np.broadcast_to(np.asarray(x), shape)), block)
 
 
 def scenes(
@@ -54,12 +55,12 @@ def scenes(
     factors = np.broadcast_to(factors, (len(suite), np.shape(factors)[-1]))
     draws, count = jax.tree.leaves(blocks)[0].shape[0], factors.shape[1]
     # Neighbours differ by the factor: they move alike.
-    lanes = jax.tree.map(lambda x: jnp.repeat(x, count), blocks)
+    lanes = jax.tree.map(lambda x: placed(np.repeat(np.asarray(x), count)), blocks)
     model = current_model(model, lanes, next(suite.motions()), factors)
     bar = Progress(factors.size * draws, "suite", progress)
     found = []
     for motion, row in zip(suite.motions(), factors):
-        found.append(of_motion(with_room(motion), lanes, jnp.tile(jnp.asarray(row), draws), model, engine))
+        found.append(of_motion(with_room(motion), lanes, placed(np.tile(row, draws)), model, engine))
         bar.add(count * draws)
     shape = len(suite), draws, count
     parts = (np.stack([np.asarray(x) for x in part]).reshape(shape).swapaxes(1, 2) for part in zip(*found))

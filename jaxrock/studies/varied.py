@@ -121,12 +121,16 @@ def _on_border_jvp(primals, tangents):
     z, found, balanced, scene = primals
     z = on_border(*primals)  # for derivatives of the next order
 
-    def margins(scene):
-        kind, *both = scene
+    moving = eqx.filter(scene, jax.tree.map(lambda x: x is not None, tangents[3], is_leaf=lambda x: x is None))
+
+    def margins(z, moving):
+        kind, *both = eqx.combine(moving, scene)
         return jax.vmap(lambda z: kind.margin(z, *both)[0])(z)
 
-    _, change = eqx.filter_jvp(margins, (scene,), (tangents[3],))
-    slope = jax.vmap(lambda z: scene[0].at(z, *scene[1:])[1])(z)
+    # By both in one program.
+    _, push = jax.linearize(margins, z, moving)
+    change = push(jnp.zeros_like(z), tangents[3])
+    slope = push(jnp.ones_like(z), jax.tree.map(jnp.zeros_like, tangents[3]))
     good = balanced & (slope != 0)
     rate = jnp.where(good, -1 / jnp.where(good, slope, 1.0), jnp.where(found, jnp.nan, 0.0))
     return z, rate * change
