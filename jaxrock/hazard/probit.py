@@ -131,7 +131,8 @@ def fit_probit(
     if errors != "information" and labels.max() < 1:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
     logarithms = jnp.log(jnp.stack(lists))
-    numbers = _fit(logarithms, toppled, trials - toppled, jnp.asarray(labels), int(labels.max()) + 1, errors)
+    count = 0 if errors == "information" else int(labels.max()) + 1
+    numbers = _fit(logarithms, toppled, trials - toppled, jnp.asarray(labels), count, errors)
     return ProbitFit(tuple(measures), *numbers)
 
 

@@ -5,6 +5,7 @@ memory. Here a program runs from its first to its last operation for a few lanes
 vector register, and then for the next few. XLA calls it as a foreign function.
 """
 
+import functools
 import math
 import os
 from typing import NamedTuple
@@ -50,7 +51,7 @@ class Plan:
         for part in around_loop(self._rest) if refilled else [self._rest]:
             is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
             parted = is_loop and has_parts(part.program.jaxpr.eqns[0])
-            writes = emit_parted if parted else emit_loop if is_loop else emit
+            writes = emit_parted if parted else emit_loop if is_loop else functools.partial(emit, alone=alone)
             name = registered(part.program, [v not in own for v in part.inputs], writes)
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(part, name))
@@ -91,7 +92,7 @@ class Plan:
         results (at least 1; known at run time only)."""
         values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
-        more = -size % lanes_of()
+        more = 0 if self._alone else -size % lanes_of()
         told = size + more, size if count is None else count, threads
         sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
         for v in self._own_inputs:

@@ -81,9 +81,9 @@ class Frame:
         """Numbers for all lanes; flags are bytes in memory."""
         return self.as_flag(pointer, self.b.load(self.vector(pointer, at), align=1))
 
-    def load_shared(self, pointer, number: int):
+    def load_shared(self, pointer, at):
         """A number that all lanes share."""
-        return self.as_flag(pointer, self.e.splat(self.b.load(self.b.gep(pointer, [_I64(number)]))))
+        return self.as_flag(pointer, self.e.splat(self.b.load(self.b.gep(pointer, [at]))))
 
     def as_flag(self, pointer, value):
         """What was loaded from there; flags are bytes in memory."""
@@ -96,6 +96,11 @@ class Frame:
             value = self.b.zext(value, ir.VectorType(_I8, self.e.lanes))
         self.b.store(value, self.vector(pointer, at), align=1)
 
+    def store_first(self, value, pointer, at):
+        """The number of the first lane."""
+        value = self.e.lane(value, 0)
+        self.b.store(self.b.zext(value, _I8) if pointer.type.pointee == _I8 else value, self.b.gep(pointer, [at]))
+
     def argument(self, variable, source, shared: bool, load, starts):
         """What stands for an input of the program: `load(source, number)` loads a lane's own numbers, `starts(size)`
         tells where its long list begins."""
@@ -103,16 +108,17 @@ class Frame:
         if is_long(shape):
             rows = shape[0] if len(shape) == 2 else None
             return Memory(source, shape[-1], None if shared else starts(math.prod(shape)), rows, shape[-1])
-        load = self.load_shared if shared else load
-        numbers = boxed([load(source, k) for k in range(math.prod(shape))])
+        count = range(math.prod(shape))
+        numbers = boxed([self.load_shared(source, _I64(k)) if shared else load(source, k) for k in count])
         return unboxed(numbers.reshape(shape))
 
 
-def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
+def emit(program, shared: list[bool], lanes: int, name: str, alone: bool = False) -> ir.Module:
     """A function `void name(void **outputs, void **inputs, int64 *next)` that runs a program over arrays of many lanes.
 
     Before the inputs of the program stands how many lanes there are (a multiple of `lanes`), and how many are wanted
-    (at least 1). What is not `shared` has an axis of lanes.
+    (at least 1). What is not `shared` has an axis of lanes. `alone`: there is one, and room for one, which all lanes of
+    the vector do.
     """
     jaxpr = program.jaxpr
     f = Frame.of(jaxpr, lanes, name)
@@ -125,7 +131,7 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     b.position_at_end(inside)
 
     def load(source, number):
-        return f.load(source, f.place(number, first))
+        return f.load_shared(source, f.place(number, first)) if alone else f.load(source, f.place(number, first))
 
     def starts(size):
         return [b.mul(b.add(first, _I64(i)), _I64(size)) for i in range(lanes)]
@@ -134,7 +140,7 @@ def emit(program, shared: list[bool], lanes: int, name: str) -> ir.Module:
     results = e.run(program, [f.argument(*each, load, starts) for each in given], e.constant(True, bool))
     for values, target in zip(results, f.targets):
         for number, value in enumerate(flat([values])):
-            f.store(value, target, f.place(number, first))
+            (f.store_first if alone else f.store)(value, target, f.place(number, first))
     b.branch(head)
     b.position_at_end(after)
     b.ret_void()
