@@ -92,7 +92,7 @@ class Plan:
         results (at least 1; known at run time only)."""
         values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
-        more = 0 if self._alone else -size % lanes_of()
+        more = 0 if self._alone else room_for(size) - size
         told = size + more, size if count is None else count, threads
         sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
         for v in self._own_inputs:
@@ -130,6 +130,11 @@ class Plan:
             arrays = ran(name, results, sizes, *(values[v] for v in part.inputs))
             values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
         return arrays
+
+
+def room_for(size: int) -> int:
+    """How many lanes arrays of so many have: no fewer than a vector."""
+    return max(size, lanes_of())
 
 
 def ran(name: str, results: list, *arrays, aliases: dict | None = None) -> list:

@@ -116,7 +116,7 @@ class Frame:
 def emit(program, shared: list[bool], lanes: int, name: str, alone: bool = False) -> ir.Module:
     """A function `void name(void **outputs, void **inputs, int64 *next)` that runs a program over arrays of many lanes.
 
-    Before the inputs of the program stands how many lanes there are (a multiple of `lanes`), and how many are wanted
+    Before the inputs of the program stands how many lanes there are (no fewer than `lanes`), and how many are wanted
     (at least 1). What is not `shared` has an axis of lanes. `alone`: there is one, and room for one, which all lanes of
     the vector do.
     """
@@ -129,6 +129,9 @@ def emit(program, shared: list[bool], lanes: int, name: str, alone: bool = False
     first = f.take(lanes)
     b.cbranch(b.icmp_signed("<", first, f.count), inside, after)
     b.position_at_end(inside)
+    if not alone:  # the last vector does some lanes once more, rather than what is beyond the last
+        last = b.sub(f.width, _I64(lanes))
+        first = b.select(b.icmp_signed("<", first, last), first, last)
 
     def load(source, number):
         return f.load_shared(source, f.place(number, first)) if alone else f.load(source, f.place(number, first))

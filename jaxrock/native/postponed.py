@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from jaxrock.native.call import Plan, lanes_of, ran
+from jaxrock.native.call import Plan, lanes_of, ran, room_for
 from jaxrock.native.kernels import Frame, is_long
 from jaxrock.native.machine import kept
 from jaxrock.native.pool import count_up
@@ -45,7 +45,7 @@ class Postponed:
     def __call__(self, leaves: list, found: list, which, threads: int) -> list:
         """`found`, results of all scenes, with those of the plan in the places `which`."""
         size = which.size
-        room = size + -size % lanes_of()
+        room = room_for(size)
         told = [jax.ShapeDtypeStruct((n,), jnp.int32) for n in (3, size)]
         sizes, places = ran(
             self._listed, told, np.array([size, 1, 1], np.int32), np.array([room, threads], np.int32), which
@@ -94,10 +94,8 @@ def _moved(inputs: Sequence, outputs: Sequence, move: Callable) -> ir.Module:
     b.position_at_end(inside)
 
     def one(lane):
-        here = b.add(first, lane)
-        last = b.sub(f.count, _I64(1))
-        # A vector is filled up with the last scene.
-        scene = b.select(b.icmp_signed("<", here, last), here, last)
+        # A vector is filled up with the last scene, as far as there is room.
+        here, scene = (_at_most(b, b.add(first, lane), b.sub(most, _I64(1))) for most in (f.width, f.count))
         place = b.zext(b.load(b.gep(f.sources[0], [scene])), _I64)
         for source, target, like in zip(f.sources[1:], f.targets, outputs):
             size = math.prod(like.shape)
@@ -111,6 +109,10 @@ def _moved(inputs: Sequence, outputs: Sequence, move: Callable) -> ir.Module:
     b.position_at_end(after)
     b.ret_void()
     return f.module
+
+
+def _at_most(b: ir.IRBuilder, number, most):
+    return b.select(b.icmp_signed("<", number, most), number, most)
 
 
 def _collect(b: ir.IRBuilder, pointers: tuple, of_all, here, _) -> None:
