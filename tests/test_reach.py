@@ -33,8 +33,8 @@ def reached(way, alpha, p, opening, velocity, side, dt):
         speeds = jax.vmap(lambda t: _linear_speed(start, t))(times)
         return found._replace(start=start.speed), speeds
 
-    piece = jnp.asarray(RNG.integers(0, 38, COUNT), jnp.int32)
-    return jax.vmap(one)(alpha, p, opening, velocity, side, piece)
+    piece = RNG.integers(0, 38, COUNT).astype(np.int32)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(alpha, p, opening, velocity, side, piece))
 
 
 def _linear_speed(start, t):
@@ -90,10 +90,16 @@ def test_only_linear_equations_under_straight_lines_go_exactly():
     record = rk.Record(SAMPLES, 0.01)
 
     def is_exact(model, motion):
+        found = []
+        jax.eval_shape(lambda motion: started(model, motion, found), motion)
+        return found[0]
+
+    def started(model, motion, found):
         scene = Scene.of(rk.Block(0.2, 2.0), motion, model)
         stepper = rk.Series().stepper(scene, None, history=False)
         state = initial_state(scene, jnp.asarray(0.1), jnp.asarray(0.0))
-        return reach._is_linear(stepper.start(state, *stepper.shaking(state.piece, state.local)))
+        found.append(reach._is_linear(stepper.start(state, *stepper.shaking(state.piece, state.local))))
+        return state
 
     assert is_exact(rk.Linear(), record) and is_exact(rk.Linear(), 2 * record)
     assert not is_exact(rk.Housner(), record)
