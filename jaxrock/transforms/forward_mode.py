@@ -28,7 +28,12 @@ def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
     def both(leaves):
         pushed = functools.partial(_pushed, recipe, moves, leaves)
-        value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions_of(_moving(leaves, moves)))
+        directions = directions_of(_moving(leaves, moves))
+        if len(directions[0]) == 1:  # to trace it under `jax.vmap`, too, takes twice as long
+            value, tangents = pushed(*(x[0] for x in directions))
+            tangents = [x[None] for x in tangents]
+        else:
+            value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions)
         columns = [columns_of(*pair, moving) for pair in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
 
