@@ -24,6 +24,18 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def one_program(function: Making) -> Making:
+    """Decorate a pure function of arrays: of known ones all its operations are one program, where each would be one for
+    every shape; of traced ones it is as it is written."""
+    compiled = jax.jit(function)
+
+    @functools.wraps(function)
+    def run(*args: Any) -> Any:
+        return function(*args) if is_traced(args) else compiled(*args)
+
+    return cast(Making, run)
+
+
 def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     """Return `value` as a floating-point array, or say what it is instead; what is known stays so within `jax.jit`."""
     if isinstance(value, jax.Array) and value.dtype == jnp.result_type(float) and not value.weak_type:
@@ -108,7 +120,8 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     good = holds(known)
     if isinstance(good, jax.core.Tracer):
         return watched(array, message, ~jnp.all(good))
-    if not np.all(good):
+    good = np.asarray(good)  # of an array of JAX `np.all` would be a program for every shape
+    if not good.all():
         known, good = np.broadcast_arrays(known, good)
         raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
     return array

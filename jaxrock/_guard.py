@@ -47,7 +47,7 @@ def _(failed, *values, message):
 def _batched(operands, axes, *, message):
     size = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     moved = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else x if axis == 0 else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(operands, axes)
     ]
     found = _guard_p.bind(*moved, message=message)

@@ -167,6 +167,21 @@ def in_precision(owner: Any, dtype: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(owner), leaves)
 
 
+def in_real_numbers(*owners: Any) -> tuple:
+    """Owners, with numbers that are whole, but not declared so, as real ones: what is compiled for real ones serves
+    them, too."""
+    leaves = jax.tree.leaves(owners)
+    if not any(_is_whole(leaf) for leaf in leaves):
+        return owners
+    kind = jnp.result_type(*leaves)
+    kind = kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float)
+    return tuple(in_precision(owner, kind) for owner in owners)
+
+
+def _is_whole(leaf: Any) -> bool:
+    return leaf.dtype.kind in "biu" if hasattr(leaf, "dtype") else isinstance(leaf, int)
+
+
 def check_single(**owners: Any) -> None:
     """Raise ValueError where a parameter of one scene is an array outside of `jax.vmap`."""
     for name, owner in owners.items():

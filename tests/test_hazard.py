@@ -140,7 +140,7 @@ def test_what_a_curve_leaves_open_is_bounded(median):
     assert below < full < above
     # Above the last level, what is left open is at most its rate times the probability to withstand it.
     beyond = curve(slice(0, 260))
-    most = float(beyond.rates[-1] * (1 - fragility(beyond.levels[-1])))
+    most = float(beyond.rates[-1]) * (1 - float(fragility(float(beyond.levels[-1]))))
     assert -1e-15 <= full - float(rk.hazard.toppling_rate(fragility, beyond)) <= most + 1e-15
 
 
@@ -154,10 +154,10 @@ def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
     levels = np.geomspace(1e-7, 1e3, 80)
     curve = rk.hazard.HazardCurve(levels, 1e-4 * levels**-k)
     exact = 1e-4 * median**-k * np.exp((k * dispersion) ** 2 / 2)
-    rock, own = rk.hazard.LogNormalFragility(median, dispersion), Own(median, dispersion)
+    rock, own = rk.hazard.LogNormalFragility(median, dispersion), Own(jnp.asarray(median), jnp.asarray(dispersion))
     np.testing.assert_allclose(rk.hazard.toppling_rate(rock, curve), exact, rtol=1e-12)
     np.testing.assert_allclose(rk.hazard.toppling_rate(own, curve), exact, rtol=1e-10)
-    np.testing.assert_allclose(-jnp.log(rk.hazard.survival_probability(rock, 1.0, curve)), exact, rtol=1e-10)
+    np.testing.assert_allclose(-np.log(rk.hazard.survival_probability(rock, 1.0, curve)), exact, rtol=1e-10)
     # Of one power law, two levels say all.
     two = rk.hazard.HazardCurve(levels[[0, -1]], 1e-4 * levels[[0, -1]] ** -k)
     np.testing.assert_allclose(rk.hazard.toppling_rate(rock, two), exact, rtol=1e-11)
@@ -182,7 +182,7 @@ def test_toppling_rate_is_the_integral_over_the_curve(name, median, dispersion):
     exact = float(integral(lognormal(median, dispersion), CURVES[name], breaks))
     np.testing.assert_allclose(rk.hazard.toppling_rate(rock, CURVES[name]), exact, rtol=1e-11)
     np.testing.assert_allclose(
-        -jnp.log(rk.hazard.survival_probability(rock, 1.0, CURVES[name])), exact, rtol=1e-9, atol=1e-16
+        -np.log(rk.hazard.survival_probability(rock, 1.0, CURVES[name])), exact, rtol=1e-9, atol=1e-16
     )
 
 
@@ -264,7 +264,7 @@ def test_limits_of_survival():
     # Rocks without scatter of their own topple together: any number of them is one, the weakest counts.
     one = rk.hazard.survival_probability(step, 500.0, CURVE)
     np.testing.assert_allclose(one, np.exp(-500 * rate), rtol=1e-13)
-    np.testing.assert_allclose(rk.hazard.survival_probability([step] * 5, 500.0, CURVE), one, rtol=1e-13)
+    np.testing.assert_allclose(rk.hazard.survival_probability([step] * 3, 500.0, CURVE), one, rtol=1e-13)
     np.testing.assert_allclose(
         rk.hazard.survival_probability([step, Step(0.9), Step(0.5)], 500.0, CURVE), one, rtol=1e-13
     )
@@ -297,7 +297,9 @@ def test_a_rock_counts_since_it_became_fragile():
 
 def test_uncertain_ages_are_a_mean_over_samples():
     samples = np.random.default_rng(1).uniform(100.0, 3000.0, (50, 2))
-    each = jax.vmap(lambda ages: rk.hazard.survival_probability([ROCK, TOUGH], ages, CURVE))(samples)
+    each = np.asarray(
+        jax.jit(jax.vmap(lambda ages: rk.hazard.survival_probability([ROCK, TOUGH], ages, CURVE)))(samples)
+    )
     for i in (0, 17, 49):
         np.testing.assert_allclose(
             each[i], rk.hazard.survival_probability([ROCK, TOUGH], samples[i], CURVE), rtol=1e-13
@@ -316,10 +318,10 @@ def test_weights_of_branches():
         rk.hazard.branch_weights([2.0, 1.0, 1.0], [0.3, 0.3, 0.3]), [0.5, 0.25, 0.25], rtol=1e-14
     )
     branches = rk.hazard.HazardCurve(np.tile(LEVELS, (3, 1)), site_rate(LEVELS) * np.array([[0.3], [1.0], [10.0]]))
-    survival = jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 2000.0, curve))(branches)
+    survival = jax.jit(jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 2000.0, curve)))(branches)
     rate = rk.hazard.toppling_rate(ROCK, CURVE)
     np.testing.assert_allclose(survival, np.exp(-2000 * rate * np.array([0.3, 1.0, 10.0])), rtol=1e-9)
-    weights = rk.hazard.branch_weights(np.full(3, 1 / 3), survival)
+    weights = np.asarray(rk.hazard.branch_weights(np.full(3, 1 / 3), survival))
     np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
     assert weights[0] > 0.8 and weights[2] < 1e-6
 
@@ -342,7 +344,7 @@ def test_allowed_scale_under_a_power_law():
 
 def test_allowed_scale_brings_survival_to_the_probability():
     probabilities = np.array([0.01, 0.05, 0.5])
-    scales = jax.jit(jax.vmap(lambda p: rk.hazard.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities)
+    scales = np.asarray(jax.jit(jax.vmap(lambda p: rk.hazard.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities))
     survival = lambda scale: float(rk.hazard.survival_probability(ROCKS, AGES, CURVE.scaled(scale)))
     np.testing.assert_allclose([survival(scale) for scale in scales], probabilities, rtol=1e-12)
     assert survival(1.001 * scales[1]) < 0.05
@@ -358,15 +360,15 @@ def test_no_factor_is_large_or_small_enough():
     assert rk.hazard.allowed_scale(Step(1e-9), 2000.0, CURVE) == 0
     slope = jax.jit(jax.grad(lambda age: rk.hazard.allowed_scale(ROCK, age, CURVE)))
     assert slope(14.0) == 0
-    near = rk.hazard.allowed_scale(ROCK, 100.01, CURVE) - rk.hazard.allowed_scale(ROCK, 99.99, CURVE)
-    np.testing.assert_allclose(slope(100.0), near / 0.02, rtol=1e-6)
+    near = [float(rk.hazard.allowed_scale(ROCK, age, CURVE)) for age in (100.01, 99.99)]
+    np.testing.assert_allclose(slope(100.0), (near[0] - near[1]) / 0.02, rtol=1e-6)
 
 
 def test_allowed_scale_is_the_first_of_several():
     """A rock that only middling shakings topple stands under weak and under strong hazard."""
     rock = rk.hazard.TabulatedFragility([0.2, 0.3, 0.5, 0.6], [0.0, 1.0, 1.0, 0.0])
     curve = rk.hazard.HazardCurve([0.1, 0.11], [1e-3, 1e-3 * (1 - 1e-9)])
-    scale = rk.hazard.allowed_scale(rock, 6000.0, curve)
+    scale = float(rk.hazard.allowed_scale(rock, 6000.0, curve))
     assert 2.0 < scale / (0.1 / 0.11) and scale < 3.0
     for factor, probability in ((1.5, 1.0), (0.999 * scale, 0.0515), (1.001 * scale, 0.0485), (7.0, 1.0)):
         np.testing.assert_allclose(
@@ -405,11 +407,12 @@ SLOPES = [
 @pytest.mark.parametrize("name", ["first unknown", "last unknown", "one known"])
 def test_derivatives_where_rates_are_unknown(name):
     """In reverse mode. Nothing hangs on a rate that is not known, and results are proportional to all those known."""
-    known = np.isfinite(CURVES[name].rates) & (CURVES[name].rates > 0)
+    rates = np.asarray(CURVES[name].rates)
+    known = np.isfinite(rates) & (rates > 0)
     for function in SLOPES:
-        value, slopes = function(CURVES[name])
+        value, slopes = jax.device_get(function(CURVES[name]))
         assert np.all(slopes.rates[~known] == 0)
-        np.testing.assert_allclose(slopes.rates[known] @ CURVES[name].rates[known], value, rtol=1e-12)
+        np.testing.assert_allclose(slopes.rates[known] @ rates[known], value, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -499,13 +502,24 @@ def test_wrong_arguments(call, error):
 # --------------------------------------------------------------------------------------- fits
 
 
+MOST = 27  # levels of a fit
+
+
+def fitted(levels, toppled, trials):
+    """A fit to `MOST` levels, so that all are compiled as one: those without a trial say nothing."""
+    unused = MOST - len(levels)
+    return jax.device_get(
+        rk.hazard.fit_fragility(
+            np.array([*levels, *np.linspace(0.1, 2.0, unused)]), np.append(toppled, [0] * unused),
+            np.append(trials, [0] * unused),
+        )
+    )  # fmt: skip
+
+
 def test_fit_to_counts_at_two_levels():
     """Two counts fix the line: z = Phi^-1(share) at each level, with the variance p (1 - p)/(n phi^2)."""
     levels, toppled, trials = np.array([0.2, 0.5]), np.array([3, 17]), np.array([20, 25])
-    # The levels without a trial say nothing.
-    fit = rk.hazard.fit_fragility(
-        np.append(levels, [0.1, 0.3, 2.0]), np.append(toppled, [0, 0, 0]), np.append(trials, [0, 0, 0])
-    )
+    fit = fitted(levels, toppled, trials)
     assert fit.status == rk.hazard.FitStatus.successful
     p, x = toppled / trials, np.log(levels)
     z = ndtri(p)
@@ -524,7 +538,7 @@ def test_fit_recovers_a_fragility():
     rng = np.random.default_rng(3)
     levels = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (300, 200)))
     toppled = rng.uniform(size=levels.shape) < ndtr(np.log(levels / 0.35) / 0.4)
-    fits = jax.vmap(rk.hazard.fit_fragility)(levels, toppled)
+    fits = jax.device_get(jax.jit(jax.vmap(rk.hazard.fit_fragility))(levels, toppled))
     assert np.all(fits.status == rk.hazard.FitStatus.successful)
     off = np.log(np.stack([fits.fragility.median / 0.35, fits.fragility.dispersion / 0.4], -1))
     assert np.abs(off.mean(0)).max() < 0.03
@@ -536,7 +550,8 @@ def test_fit_to_single_outcomes_is_the_fit_to_their_counts():
     levels = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
     toppled, trials = np.array([1, 2, 4, 3, 5]), np.array([6, 6, 6, 4, 5])
     single = np.concatenate([np.arange(n) < k for k, n in zip(toppled, trials)])
-    a, b = rk.hazard.fit_fragility(levels, toppled, trials), rk.hazard.fit_fragility(np.repeat(levels, trials), single)
+    assert single.size == MOST
+    a, b = fitted(levels, toppled, trials), rk.hazard.fit_fragility(np.repeat(levels, trials), single)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)):
         np.testing.assert_allclose(x, y, rtol=1e-10)
     assert a.highest_survived == 0.4 and a.lowest_toppled == 0.1
@@ -560,10 +575,7 @@ def test_fit_to_single_outcomes_is_the_fit_to_their_counts():
     ],
 )
 def test_fit_says_what_the_data_do_not(levels, toppled, status, between):
-    unused = 5 - len(levels)  # levels without a trial, so that all are compiled as one
-    fit = rk.hazard.fit_fragility(
-        np.array(levels + [0.5] * unused), np.array(toppled + [0] * unused), np.array([1] * len(levels) + [0] * unused)
-    )
+    fit = fitted(levels, toppled, [1] * len(levels))
     assert fit.status == getattr(rk.hazard.FitStatus, status)
     assert (fit.highest_survived, fit.lowest_toppled) == between
     numbers = [fit.fragility.median, fit.fragility.dispersion, fit.log_likelihood, *fit.covariance.ravel()]
@@ -639,11 +651,11 @@ def test_files_of_several_branches(file):
     found = rk.hazard.read_hazard_curves(paths)
     assert found.kinds == tuple(kinds)
     assert found.curves.levels.shape == found.curves.rates.shape == (3, 2, 5)
-    np.testing.assert_allclose(found.at(0, 2).rates[1], -np.log1p(-0.8 * 0.65) / 50, rtol=1e-12)
-    survival = jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 1000.0, curve))(found.at(1))
+    np.testing.assert_allclose(np.asarray(found.at(0, 2).rates)[1], -np.log1p(-0.8 * 0.65) / 50, rtol=1e-12)
+    survival = jax.jit(jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 1000.0, curve)))(found.at(1))
     single = [rk.hazard.survival_probability(ROCK, 1000.0, found.at(1, branch)) for branch in range(3)]
     np.testing.assert_allclose(survival, single, rtol=1e-13)
-    sites = jax.vmap(jax.vmap(lambda curve: rk.hazard.toppling_rate(ROCK, curve)))(found.curves)
+    sites = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda curve: rk.hazard.toppling_rate(ROCK, curve))))(found.curves))
     np.testing.assert_allclose(sites[2, 1], rk.hazard.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
 
 

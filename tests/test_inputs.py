@@ -48,7 +48,7 @@ def history():
 @functools.cache
 def histories():
     """Two histories as jax.vmap returns them, of which neither is asked for under it."""
-    return jax.tree.map(lambda x: jnp.asarray(np.stack([x, x])), history())
+    return jax.device_put(jax.tree.map(lambda x: np.stack([x, x]), history()))
 
 
 # What is called, and the argument, what is allowed and the value in the message.
@@ -405,19 +405,17 @@ def sharded(x):
 
 
 RAISING = {
-    "vmap": lambda x: jax.vmap(jax.jit(area))(x),
-    "vmap, inside": lambda x: jax.jit(jax.vmap(area))(x),
-    "grad": lambda x: jax.vmap(jax.jit(jax.grad(area)))(x),
-    "hessian": lambda x: jax.jit(jax.vmap(jax.hessian(area)))(x),
-    "checkpoint": lambda x: jax.jit(jax.vmap(jax.grad(jax.checkpoint(area))))(x),
-    "scan": lambda x: jax.jit(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0])(x),
-    "grad of a scan": lambda x: jax.jit(jax.grad(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0]))(
-        x
-    ),
-    "while": lambda x: jax.jit(
+    "vmap": jax.vmap(jax.jit(area)),
+    "vmap, inside": jax.jit(jax.vmap(area)),
+    "grad": jax.vmap(jax.jit(jax.grad(area))),
+    "hessian": jax.jit(jax.vmap(jax.hessian(area))),
+    "checkpoint": jax.jit(jax.vmap(jax.grad(jax.checkpoint(area)))),
+    "scan": jax.jit(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0]),
+    "grad of a scan": jax.jit(jax.grad(lambda x: jax.lax.scan(lambda c, a: (c + area(a), None), 0.0, x)[0])),
+    "while": jax.jit(
         lambda x: jax.lax.while_loop(lambda c: c[0] < 2, lambda c: (c[0] + 1, c[1] + area(x[c[0]])), (0, 0.0))
-    )(x),
-    "cond": lambda x: jax.jit(lambda a: jax.lax.cond(a < 1, area, lambda a: a, a))(x[-1]),
+    ),
+    "cond": jax.jit(lambda x: jax.lax.cond(x[-1] < 1, area, lambda a: a, x[-1])),
     "shard_map": lambda x: jax.jit(dealt(jax.vmap(area)))(x),
     "sharded": lambda x: jax.jit(jax.vmap(area))(sharded(x)),
 }

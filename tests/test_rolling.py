@@ -49,23 +49,34 @@ class Wheel(NamedTuple):
         return turning, horizontal / GRAVITY, normal / GRAVITY
 
 
+@jax.jit
+def of_rolling(radius, alpha, p, ratio, states, balance):
+    """Accelerations at states, threshold, balance, its slope by the radius, and the work up to a given angle."""
+    moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
+
+    def told(state):
+        opening, speed, push, lift = state
+        return p**2 * moments.acceleration(Angle.of(opening), speed / p, push, 1 + lift)
+
+    slope = jax.grad(lambda r: rk.models.Rolling(r).moments(rk.Block(alpha, p)).saddle)(radius)
+    return jax.vmap(told)(states), moments.threshold, moments.saddle, slope, moments.work(balance)
+
+
 @pytest.mark.parametrize("radius", [0.0, 0.3, 0.8])
 def test_the_equation_is_newtons(radius):
     """At states below and beyond its balance, under horizontal and vertical shaking; what follows from it at rest."""
     alpha, p, ratio = 0.3, 2.5, 0.7
-    moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
     wheel = Wheel(alpha, p, ratio, radius, 0.9)
-    for opening, speed, push, lift in ((0.0, 0.4, 0.5, 0.0), (0.25, 1.0, -0.2, 0.3), (0.7, 2.0, 0.1, -0.4)):
-        given = (jnp.asarray(x) for x in (speed / p, push, 1 + lift))
-        told = p**2 * moments.acceleration(Angle.of(opening), *given)
-        assert float(told) == pytest.approx(wheel.forces(opening, speed, push, lift)[0], rel=1e-12)
-    assert float(moments.threshold) == pytest.approx(np.tan(alpha), rel=1e-14)
+    states = np.array([(0.0, 0.4, 0.5, 0.0), (0.25, 1.0, -0.2, 0.3), (0.7, 2.0, 0.1, -0.4)])
     balance = float(np.arctan2(np.sin(alpha), np.cos(alpha) - radius))
-    assert float(moments.saddle) == pytest.approx(balance, rel=1e-12)
-    slope = jax.grad(lambda r: rk.models.Rolling(r).moments(rk.Block(alpha, p)).saddle)(radius)
+    told, threshold, saddle, slope, work = jax.device_get(of_rolling(radius, alpha, p, ratio, states, balance))
+    for acceleration, state in zip(told, states):
+        assert float(acceleration) == pytest.approx(wheel.forces(*state)[0], rel=1e-12)
+    assert float(threshold) == pytest.approx(np.tan(alpha), rel=1e-14)
+    assert float(saddle) == pytest.approx(balance, rel=1e-12)
     assert float(slope) == pytest.approx(np.sin(balance) ** 2 / np.sin(alpha), rel=1e-10)
     height = np.hypot(np.sin(alpha), np.cos(alpha) - radius) + radius
-    assert float(moments.work(jnp.asarray(balance))) == pytest.approx(height - 1, rel=1e-12)
+    assert float(work) == pytest.approx(height - 1, rel=1e-12)
 
 
 def test_the_judge_of_records_is_newtons():

@@ -180,18 +180,23 @@ def test_errors_for_few_motions():
 
 def test_a_single_measure_is_the_lognormal_fit():
     levels, trials = np.geomspace(0.1, 0.8, 12), 20.0
-    fell = [1, 1, 2, 4, 7, 8, 11, 12, 15, 17, 18, 19]
-    one, other = rk.hazard.fit_probit({"PGA": levels}, fell, trials), rk.hazard.fit_fragility(levels, fell, trials)
+    fell = np.array([1, 1, 2, 4, 7, 8, 11, 12, 15, 17, 18, 19])
+    other = rk.hazard.fit_fragility(levels, fell, trials)
+    # All of them many times over have the same maximum, and `N` rows are those of the program above.
+    one = rk.hazard.fit_probit({"PGA": np.tile(levels, N // 12)}, np.tile(fell, N // 12), trials)
     assert float(one.fragility.median) == pytest.approx(float(other.fragility.median), rel=1e-9)
     assert float(one.fragility.dispersion) == pytest.approx(float(other.fragility.dispersion), rel=1e-9)
+
+
+MANY = N // 4  # the program of the fits above
 
 
 @pytest.mark.parametrize(
     "measures, fell, status",
     [
-        ({"PGA": 3 * [0.1, 0.2, 0.3, 0.4]}, 3 * [0, 0, 1, 1], rk.hazard.FitStatus.separable),
-        ({"PGA": 3 * [0.1, 0.2, 0.3, 0.4]}, 3 * [1, 1, 1, 1], rk.hazard.FitStatus.separable),
-        ({"PGA": 3 * [0.2, 0.2, 0.2, 0.2]}, 3 * [0, 1, 0, 1], rk.hazard.FitStatus.not_converged),
+        ({"PGA": MANY * [0.1, 0.2, 0.3, 0.4]}, MANY * [0, 0, 1, 1], rk.hazard.FitStatus.separable),
+        ({"PGA": MANY * [0.1, 0.2, 0.3, 0.4]}, MANY * [1, 1, 1, 1], rk.hazard.FitStatus.separable),
+        ({"PGA": MANY * [0.2, 0.2, 0.2, 0.2]}, MANY * [0, 1, 0, 1], rk.hazard.FitStatus.not_converged),
     ],
 )
 def test_fits_that_fail_say_so(measures, fell, status):

@@ -72,6 +72,10 @@ def slopes(function):
     return np.array([float(jax.jvp(function, (a,), (1.0,))[1]) for a in AT])
 
 
+def same(x):
+    return x
+
+
 def mesh():
     return Mesh(np.array(jax.devices()), ("scenes",))
 
@@ -91,8 +95,8 @@ WAYS = {
         lambda carry: carry[0] < AT.size, lambda carry: (carry[0] + 1, carry[1].at[carry[0]].set(f(AT[carry[0]]))),
         (0, jnp.zeros_like(AT)),
     )[1],
-    "cond": lambda f: jnp.stack([jax.lax.cond(a > 0, f, lambda a: a, a) for a in AT]),
-    "switch, batched": lambda f: jax.vmap(lambda a: jax.lax.cond(a > 0, f, lambda a: a, a))(AT),
+    "cond": lambda f: jnp.stack([jax.lax.cond(a > 0, f, same, a) for a in AT]),
+    "switch, batched": lambda f: jax.vmap(lambda a: jax.lax.cond(a > 0, f, same, a))(AT),
     "shard_map": lambda f: jax.jit(dealt(jax.vmap(f)))(AT),
     "sharded": lambda f: jax.jit(jax.vmap(f))(jax.device_put(AT, NamedSharding(mesh(), PartitionSpec("scenes")))),
     "filter_jit": lambda f: jnp.stack([eqx.filter_jit(f)(a) for a in AT]),
@@ -159,7 +163,8 @@ def test_eager_jit_and_vmap_to_the_bit():
     many = jax.vmap(lambda block, pulse: rk.outcome(block, pulse, **QUICK))(
         jax.tree.map(lambda x: jnp.broadcast_to(x, AT.shape), BLOCK), rk.SinePulse(AT, jnp.full(AT.shape, 0.8))
     )
-    compiled = [jax.jit(functools.partial(rk.outcome, **QUICK))(BLOCK, rk.SinePulse(a, 0.8)) for a in AT]
+    program = jax.jit(functools.partial(rk.outcome, **QUICK))
+    compiled = [program(BLOCK, rk.SinePulse(a, 0.8)) for a in AT]
     for name in ("max_rotation", "max_velocity", "time_of_max", "margin", "clearance", "error", "impact_count"):
         eager = np.array([getattr(each, name) for each in one])
         np.testing.assert_array_equal(eager, getattr(many, name))
@@ -167,13 +172,12 @@ def test_eager_jit_and_vmap_to_the_bit():
 
 
 def exported(function, platforms, shape=()):
-    like = jax.ShapeDtypeStruct(shape, jnp.float64)
-    return jax.export.export(jax.jit(function), platforms=platforms)(like)
+    return jax.export.export(function, platforms=platforms)(jax.ShapeDtypeStruct(shape, jnp.float64))
 
 
 def test_a_program_for_other_processes(function, values, tmp_path):
     """Serialised, loaded where the package is not, and run."""
-    program = exported(function, ["cpu"])
+    program = exported(jax.jit(function), ["cpu"])
     assert "jaxrock" not in str(program.mlir_module()).split("loc(")[0]
     path = tmp_path / "program"
     path.write_bytes(program.serialize())
@@ -192,14 +196,18 @@ def test_a_program_for_other_processes(function, values, tmp_path):
     assert of_nonsense != 0
 
 
+# Function, shape, most letters; each is traced once for all platforms.
+LOWERED = (
+    (jax.jit(of_housner), (), 1.5e6),
+    (jax.jit(jax.vmap(of_housner)), (1024,), 3e6),
+    (jax.jit(jax.vmap(jax.grad(of_housner))), (1024,), 6e6),
+)
+
+
 @pytest.mark.parametrize("platform", ["cuda", pytest.param("rocm", marks=SLOW), "tpu"])
 def test_programs_for_accelerators(platform):
     """Lowered where there is none: no code for this processor in it, no call back to Python, of bounded size."""
-    for function, shape, most in (
-        (of_housner, (), 1.5e6),
-        (jax.vmap(of_housner), (1024,), 3e6),
-        (jax.vmap(jax.grad(of_housner)), (1024,), 6e6),
-    ):
+    for function, shape, most in LOWERED:
         text = exported(function, [platform], shape).mlir_module()
         assert "custom_call" not in text or "jaxrock_" not in text
         assert "callback" not in text

@@ -98,8 +98,7 @@ def test_a_motion_with_an_array():
             return found.max_rotation, (found.margin, found.impact_count)
 
         both = jax.value_and_grad(peak, (0, 1), has_aux=True)
-        found = jax.vmap(both, in_axes=(0, None))(heights, CORNERS)
-        return jax.tree.map(np.asarray, found)
+        return jax.device_get(jax.jit(jax.vmap(both, in_axes=(0, None)))(heights, CORNERS))
 
     (own, slopes), (theirs, their_slopes) = answers(of_own), answers(of_record)
     (peaks, (margins, impacts)), (their_peaks, (their_margins, counts)) = own, theirs
@@ -232,8 +231,8 @@ def test_a_model_of_ones_own_in_series():
         return found.max_rotation, found.margin
 
     strengths = np.array([0.9 - 1e-6, 0.9, 0.9 + 1e-6, 1.0])
-    found = jax.vmap(jax.value_and_grad(answer, has_aux=True))(strengths)
-    (peaks, margins), slopes = jax.tree.map(np.asarray, found)
+    found = jax.jit(jax.vmap(jax.value_and_grad(answer, has_aux=True)))(strengths)
+    (peaks, margins), slopes = jax.device_get(found)
     assert float(slopes[1]) == pytest.approx(float(peaks[2] - peaks[0]) / 2e-6, rel=1e-6)
     assert float(peaks[3]) == pytest.approx(float(theirs.max_rotation), rel=1e-12)
     assert float(margins[3]) == pytest.approx(float(theirs.margin), rel=1e-11)

@@ -4,10 +4,22 @@ from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments, pair, word_of
-from jaxrock._checks import Range, Values, acute, check_shapes, checked, rate, ratio, size, strength, with_throw
+from jaxrock._checks import (
+    Range,
+    Values,
+    acute,
+    check_shapes,
+    checked,
+    one_program,
+    rate,
+    ratio,
+    size,
+    strength,
+    with_throw,
+)
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.outline import Outline
@@ -126,8 +138,7 @@ class AsymmetricBlock(Owner):
         first, second, gravity = size("R1", R1), size("R2", R2), size("gravity", gravity)
         gyration = _gyration("gyration_radius", gyration_radius)
         check_shapes(R1=first, R2=second, gyration_radius=gyration, gravity=gravity)
-        kappa = first**2 / (first**2 + gyration**2)
-        return cls(alpha1, alpha2, jnp.sqrt(gravity * kappa / first), kappa, second / first, restitution)
+        return cls(alpha1, alpha2, *_of_radii(first, second, gyration, gravity), restitution)
 
     @classmethod
     @with_throw
@@ -157,10 +168,9 @@ class AsymmetricBlock(Owner):
         kappa = checked("inertia_ratio", inertia_ratio, "be in [1/2, 1]", lambda x: (x >= 0.5) & (x <= 1))
         p1, p2 = rate("p1", p1), rate("p2", p2)
         check_shapes(p1=p1, p2=p2, inertia_ratio=kappa)
-        square = (p2 / p1) ** 2
-        inner = 1 - 4 * square**2 * kappa * (1 - kappa)
-        checked("p2", jnp.broadcast_to(p2, inner.shape), _LARGEST, lambda _: inner >= 0)
-        return cls(alpha1, alpha2, p1, kappa, (1 + jnp.sqrt(inner)) / (2 * square * kappa), restitution)
+        same, is_possible, radii = _of_rates(p1, p2, kappa)
+        checked("p2", same, _LARGEST, lambda _: is_possible)
+        return cls(alpha1, alpha2, p1, kappa, radii, restitution)
 
     @classmethod
     @with_throw
@@ -274,14 +284,16 @@ class AsymmetricBlock(Owner):
     @property
     def p2(self) -> Real:
         """Frequency parameter about corner 2 [rad/s]."""
-        return self.p1 * jnp.sqrt(self.inertia_ratio2 / (self.inertia_ratio * self.radius_ratio))
+        return _second_rate(self)
 
     @property
+    @one_program
     def restitution1(self) -> Real:
         """Angular velocity after an impact that ends the stay on side 1 over that before it."""
         return self.law.ratio(self.corners[0], jnp.zeros_like(self.p1))
 
     @property
+    @one_program
     def restitution2(self) -> Real:
         """The same for an impact that ends the stay on side 2."""
         return self.law.ratio(self.corners[1], jnp.zeros_like(self.p1))
@@ -304,3 +316,23 @@ class AsymmetricBlock(Owner):
         """The block seen from behind: its sides exchanged."""
         radii = None if self.given_radius_ratio is None else 1 / self.given_radius_ratio
         return AsymmetricBlock(self.alpha2, self.alpha1, self.p2, self.inertia_ratio2, radii, self.law.mirrored)
+
+
+@one_program
+def _of_radii(first: Real, second: Real, gyration: Real, gravity: Real) -> tuple[Real, Real, Real]:
+    """Frequency parameter and inertia ratio of side 1, and R2/R1."""
+    kappa = first**2 / (first**2 + gyration**2)
+    return jnp.sqrt(gravity * kappa / first), kappa, second / first
+
+
+@one_program
+def _of_rates(p1: Real, p2: Real, kappa: Real) -> tuple[Real, Bool[Array, "..."], Real]:
+    """p2 for every block, whether there is such a block, and R2/R1."""
+    square = (p2 / p1) ** 2
+    inner = 1 - 4 * square**2 * kappa * (1 - kappa)
+    return jnp.broadcast_to(p2, inner.shape), inner >= 0, (1 + jnp.sqrt(inner)) / (2 * square * kappa)
+
+
+@one_program
+def _second_rate(block: AsymmetricBlock) -> Real:
+    return block.p1 * jnp.sqrt(block.inertia_ratio2 / (block.inertia_ratio * block.radius_ratio))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import Values, checked, not_negative, with_throw
+from jaxrock._checks import Values, checked, not_negative, one_program, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.elementary import sine_cosine, sine_lag
@@ -50,12 +50,14 @@ class Edge(eqx.Module):
         elif self.radius.ndim != 0:
             raise ValueError(f"Argument `radius` must be one number without `angle`, but has {self.radius.shape}.")
 
+    @one_program
     def at(self, opening: ArrayLike) -> Real:
         """Radius over R where a block touches the ground that has opened by an angle."""
         if self.angle is None:
             return jnp.asarray(self.radius)
         return self._first + jnp.sum(self._bends * self._beyond(opening), -1)
 
+    @one_program
     def rise(self, opening: ArrayLike) -> Real:
         """By how much the centre of mass is higher than over a sharp corner, over R: the integral of
         sin(x - y) radius(y)."""
@@ -66,6 +68,7 @@ class Edge(eqx.Module):
         beyond = self._beyond(opening)
         return found + jnp.sum(self._bends * beyond**3 * sine_lag(beyond), -1)  # x - sin(x)
 
+    @one_program
     def run(self, opening: ArrayLike) -> Real:
         """By how much the point of contact is farther out than a sharp corner, over R: the integral of
         cos(x - y) radius(y)."""
@@ -112,7 +115,8 @@ class Edge(eqx.Module):
 
 
 def _grows(angle):
-    return angle > jnp.concatenate([-jnp.ones_like(angle[:1]), angle[:-1]])
+    arrays = np if isinstance(angle, np.ndarray) else jnp  # NumPy compiles nothing
+    return angle > arrays.concatenate([-arrays.ones_like(angle[:1]), angle[:-1]])
 
 
 def fitted_edge(opening: Float[np.ndarray, " n"], run: Float[np.ndarray, " n"], knots: int) -> Edge:

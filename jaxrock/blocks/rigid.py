@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, check_shapes, rate, size, with_throw
+from jaxrock._checks import acute, check_shapes, one_program, rate, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.restitution import (
@@ -77,8 +77,8 @@ class Block(Owner):
         """
         width, height, gravity = size("width", width), size("height", height), size("gravity", gravity)
         check_shapes(width=width, height=height, gravity=gravity)
-        half_diagonal = jnp.hypot(width, height) / 2
-        return cls.from_radius(jnp.arctan2(width, height), half_diagonal, restitution, gravity=gravity)
+        alpha, half_diagonal = _of_rectangle(width, height)
+        return cls.from_radius(alpha, half_diagonal, restitution, gravity=gravity)
 
     @classmethod
     @with_throw
@@ -111,11 +111,12 @@ class Block(Owner):
         """
         radius, gravity = size("R", R), size("gravity", gravity)
         if inertia_ratio is None:
-            return cls(alpha, jnp.sqrt(3 * gravity / (4 * radius)), restitution)
+            return cls(alpha, _rate_of_rectangle(gravity, radius), restitution)
         ratio = ratio_of_inertia("inertia_ratio", inertia_ratio)
         return cls(alpha, jnp.sqrt(ratio * gravity / radius), law_of(restitution, Housner(ratio)))
 
     @property
+    @one_program
     def restitution(self) -> Inexact[Array, "..."]:
         """Angular velocity after an impact over that before it; if it depends on the speed, of the gentlest."""
         return self.law.ratio(self.corners, jnp.zeros_like(self.p))
@@ -129,6 +130,17 @@ class Block(Owner):
     def half_diagonal(self) -> Inexact[Array, "..."]:
         """Distance from pivot to centre of mass of the rectangle of this p under 9.81 m/s^2 [m]."""
         return 3 * GRAVITY / (4 * self.p**2)
+
+
+@one_program
+def _of_rectangle(width: Inexact[Array, "..."], height: Inexact[Array, "..."]) -> tuple[Array, Array]:
+    """Slenderness angle, and half the diagonal."""
+    return jnp.arctan2(width, height), jnp.hypot(width, height) / 2
+
+
+@one_program
+def _rate_of_rectangle(gravity: Inexact[Array, "..."], radius: Inexact[Array, "..."]) -> Array:
+    return jnp.sqrt(3 * gravity / (4 * radius))
 
 
 class Side(eqx.Module):

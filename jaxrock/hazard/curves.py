@@ -12,6 +12,7 @@ from jaxrock._checks import (
     as_real,
     checked,
     if_known,
+    is_traced,
     level as at_level,
     positive,
     scalar,
@@ -80,7 +81,10 @@ class HazardCurve(eqx.Module):
         """
         probabilities = share("probabilities", probabilities)
         time = scalar("investigation_time", positive("investigation_time", investigation_time))
-        return cls(levels, -jnp.log1p(-probabilities) / time, measure)
+        if is_traced((probabilities, time)):
+            return cls(levels, -jnp.log1p(-probabilities) / time, measure)
+        with np.errstate(divide="ignore"):  # a probability of 1 tells no rate
+            return cls(levels, -np.log1p(-np.asarray(probabilities)) / np.asarray(time), measure)
 
     def rate(self, level: Values) -> Real:
         """Annual rate of shakings of intensity `level` or more that the curve knows; of the shape of `level`."""
@@ -119,24 +123,33 @@ class HazardCurve(eqx.Module):
         **Raises:** ValueError for a level that is not beyond the curve, or if fewer than two rates are known.
         """
         check_one(self)
-        start, end = self.levels[0], self.levels[-1]
+        known = not is_traced((self, lowest, highest))
+        arrays, given = (np, np.asarray) if known else (jnp, jnp.asarray)  # NumPy compiles nothing
+        own = given(self.levels)
+        start, end = own[0], own[-1]
         lowest = checked("lowest", lowest, "be positive and below the first level", lambda x: (x > 0) & (x < start))
-        highest = checked("highest", highest, "be finite and above the last level", lambda x: (x > end) & (x < jnp.inf))
-        levels = jnp.concatenate([scalar("lowest", lowest)[None], self.levels, scalar("highest", highest)[None]])
-        known = jnp.isfinite(self.rates) & (self.rates > 0)
-        rates = checked("rates", self.rates, "be known at two levels or more", lambda _: jnp.sum(known) >= 2)
-        first, last = jnp.argmax(known), known.size - 1 - jnp.argmax(known[::-1])
+        highest = checked("highest", highest, "be finite and above the last level", lambda x: (x > end) & (x < np.inf))
+        low, high = (given(scalar(name, x))[None] for name, x in (("lowest", lowest), ("highest", highest)))
+        levels = arrays.concatenate([low, own, high])
+        with np.errstate(over="ignore"):  # it is checked what comes of it
+            return HazardCurve(levels, self._continued(levels, arrays, given), self.measure)
+
+    def _continued(self, levels, arrays, given):
+        """Rates at levels, the first and the last of which are beyond the curve."""
+        own = given(self.levels)
+        known = arrays.isfinite(given(self.rates)) & (given(self.rates) > 0)
+        rates = given(checked("rates", self.rates, "be known at two levels or more", lambda _: known.sum() >= 2))
+        first, last = arrays.argmax(known), known.size - 1 - arrays.argmax(known[::-1])
 
         def law(a, b):
-            exponent = jnp.log(rates[a] / rates[b]) / jnp.log(self.levels[b] / self.levels[a])
-            found = rates[a] * (levels / self.levels[a]) ** -exponent
+            exponent = arrays.log(rates[a] / rates[b]) / arrays.log(own[b] / own[a])
+            found = rates[a] * (levels / own[a]) ** -exponent
             said = "be levels up to which the power laws stay below the largest number"
-            return checked("lowest` and `highest", found, said, lambda rate: rate < jnp.inf)
+            return given(checked("lowest` and `highest", found, said, lambda rate: rate < np.inf))
 
-        inner = jnp.pad(rates, 1)
-        inner = jnp.where(levels > self.levels[last], law(last - 1, last), inner)
-        inner = jnp.where(levels < self.levels[first], law(first, first + 1), inner)
-        return HazardCurve(levels, inner, self.measure)
+        inner = arrays.pad(rates, 1)
+        inner = arrays.where(levels > own[last], law(last - 1, last), inner)
+        return arrays.where(levels < own[first], law(first, first + 1), inner)
 
 
 def _can_be_rates(x):

@@ -16,8 +16,10 @@ from jaxrock._checks import (
     check_shapes,
     checked,
     if_known,
+    is_traced,
     level as at_level,
     not_negative,
+    one_program,
     positive,
     share,
 )
@@ -67,13 +69,18 @@ class LogNormalFragility(AbstractFragility):
     def __call__(self, level: Values) -> Real:
         level = if_known(at_level, "level", level)
         check_shapes(level=level, median=self.median)
-        z = jnp.log(level / self.median) / self.dispersion
-        return jax.lax.erfc(-z / math.sqrt(2)) / 2
+        return _lognormal(level, self.median, self.dispersion)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
         # Eight standard deviations away the probability is 0 or 1 to rounding.
         return self.median * jnp.exp(self.dispersion * jnp.array([-8.0, -4.0, 0.0, 4.0, 8.0]))
+
+
+@one_program
+def _lognormal(level: Real, median: Real, dispersion: Real) -> Real:
+    z = jnp.log(level / median) / dispersion
+    return jax.lax.erfc(-z / math.sqrt(2)) / 2
 
 
 class TabulatedFragility(AbstractFragility):
@@ -99,13 +106,17 @@ class TabulatedFragility(AbstractFragility):
         self.probabilities = beside("probabilities", probabilities, levels)
 
     def __call__(self, level: Values) -> Real:
-        level = if_known(at_level, "level", level)
-        between = jnp.interp(jnp.log(level), jnp.log(self.levels), self.probabilities)
-        return jnp.where(level < self.levels[0], 0.0, between)
+        return _interpolated(if_known(at_level, "level", level), self.levels, self.probabilities)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
         return self.levels
+
+
+@one_program
+def _interpolated(level: Real, levels: Real, probabilities: Real) -> Real:
+    between = jnp.interp(jnp.log(level), jnp.log(levels), probabilities)
+    return jnp.where(level < levels[0], 0.0, between)
 
 
 def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
@@ -142,7 +153,8 @@ def outcomes(toppled: Values, levels: Real, trials: Real) -> Real:
     if np.dtype(getattr(toppled, "dtype", float)) == bool:
         toppled = jnp.asarray(toppled, levels.dtype)
     toppled = beside("toppled", as_real("toppled", toppled), levels)
-    return checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= trials))
+    most = trials if is_traced(trials) else np.asarray(trials)
+    return checked("toppled", toppled, "be from 0 to `trials`", lambda x: (x >= 0) & (x <= most))
 
 
 def alike(*arrays: Real) -> tuple[Real, ...]:
@@ -293,27 +305,30 @@ def probit_line(abscissas, toppled, survived):
     always climbs.
     """
 
-    def newton(line, abscissas, toppled, survived):
+    def newton(abscissas, slope, curvature):
         rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
-        _, slope, curvature = probit(line @ rows, toppled, survived)
         return jnp.linalg.solve(rows @ (-curvature[:, None] * rows.T), rows @ slope)
 
     fixed = jax.lax.stop_gradient((abscissas, toppled, survived))
-    shares = 0.5 ** jnp.arange(8.0)
+    shares = 0.5 ** jnp.arange(8, dtype=abscissas.dtype)
 
     def step(carry):
-        line, _, count = carry
-        change = newton(line, *fixed)
+        line, derivatives, _, count = carry
+        change = newton(fixed[0], *derivatives)
         candidates = line + shares[:, None] * change
-        climbed = jax.vmap(lambda line: probit(line[0] + line[1:] @ fixed[0], *fixed[1:])[0])(candidates)
-        return candidates[jnp.argmax(climbed)], jnp.max(jnp.abs(change)), count + 1
+        # All at every candidate, though only the best one's slopes are needed: `probit` is compiled once.
+        climbed, *found = jax.vmap(lambda line: probit(line[0] + line[1:] @ fixed[0], *fixed[1:]))(candidates)
+        best = jnp.argmax(climbed)
+        return candidates[best], tuple(x[best] for x in found), jnp.max(jnp.abs(change)), count + 1
 
     dtype = abscissas.dtype
-    tight = jnp.sqrt(jnp.finfo(dtype).eps)
-    start = jnp.zeros(1 + len(abscissas), dtype), jnp.asarray(jnp.inf, dtype), 0
-    line, change, _ = jax.lax.while_loop(lambda carry: (carry[1] > tight) & (carry[2] < 50), step, start)
+    tight, ratio = jnp.sqrt(jnp.finfo(dtype).eps), math.sqrt(2 / math.pi)
+    level = ratio * (fixed[1] - fixed[2]), -(ratio**2) * (fixed[1] + fixed[2])  # derivatives where z is 0
+    start = jnp.zeros(1 + len(abscissas), dtype), level, jnp.asarray(jnp.inf, dtype), 0
+    line, _, change, _ = jax.lax.while_loop(lambda carry: (carry[2] > tight) & (carry[3] < 50), step, start)
     # One step more, with derivatives by the data: those of first order are exact.
-    return line + newton(line, abscissas, toppled, survived), change <= tight
+    _, *derivatives = probit(line[0] + line[1:] @ abscissas, toppled, survived)
+    return line + newton(abscissas, *derivatives), change <= tight
 
 
 def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
@@ -323,10 +338,9 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
     less the better outcomes are parted.) Of clusters by their labels, of which there are `count`, by the scatter of
     their scores.
     """
-    found = []
-    for index in range(len(abscissas)):
-        others = jnp.concatenate([abscissas[:index], abscissas[index + 1 :]])
-        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), others, abscissas[index][None]])
+
+    def test(tested, others):
+        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), others, tested[None]])
         if len(others):
             line = probit_line(others, toppled, survived)[0]
         else:
@@ -339,5 +353,11 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
             scatter = combination @ information @ combination
         else:
             scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
-        found.append(jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter)))
-    return jnp.stack(found)
+        return jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter))
+
+    if len(abscissas) == 1:
+        return test(abscissas[0], abscissas[:0])[None]
+    rests = np.array([np.delete(np.arange(len(abscissas)), index) for index in range(len(abscissas))])
+    return jax.lax.map(
+        lambda index: test(abscissas[index], abscissas[jnp.asarray(rests)[index]]), np.arange(len(rests))
+    )

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
 from jaxrock._arguments import arguments, list_of, path_of
-from jaxrock._checks import whole
+from jaxrock._checks import is_traced, placed, whole
 from jaxrock._described import described
 from jaxrock._text import check_end, file_error, text_lines
 from jaxrock.hazard.curves import HazardCurve
@@ -69,7 +68,9 @@ class HazardCurves(eqx.Module):
         for name, index, count in (("site", site, len(self.names)), ("branch", branch or 0, len(self.kinds))):
             whole(name, index, 0, count - 1)
         rows = slice(None) if branch is None else branch
-        return HazardCurve(self.curves.levels[rows, site], self.curves.rates[rows, site], self.curves.measure)
+        curves = self.curves
+        levels, rates = (x if is_traced(x) else np.asarray(x) for x in (curves.levels, curves.rates))
+        return HazardCurve(levels[rows, site], rates[rows, site], curves.measure)
 
 
 def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> HazardCurves:
@@ -103,10 +104,10 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
             if not np.array_equal(file[what], first[what]):
                 which = "sites" if what in ("names", "positions") else what
                 raise file_error(path.name, f"differs in its {which} from file `{found[0].name}`.")
-    rates = jnp.asarray(np.stack([file["rates"] for file in files]))
-    curves = HazardCurve(jnp.broadcast_to(jnp.asarray(first["levels"]), rates.shape), rates, first["measure"])
+    rates = np.stack([file["rates"] for file in files])
+    curves = HazardCurve(np.broadcast_to(first["levels"], rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
-    longitude, latitude, depth = jnp.asarray(first["positions"]).T
+    longitude, latitude, depth = placed(list(np.asarray(first["positions"]).T))
     return HazardCurves(curves, longitude, latitude, depth, kinds=kinds, names=tuple(first["names"]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, as_real, checked, is_traced, placed, put_down, shown
+from jaxrock._checks import Values, as_real, checked, is_traced, one_program, placed, put_down, shown
 from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
@@ -165,14 +165,13 @@ class Observations(eqx.Module):
             _list(f"blocks.{name}", getattr(blocks, name), count) for name in leaves
         )
         facing = checked("facing", _list("facing", facing, count), "be 1, -1 or 0", _is_facing)
-        # By momentum the numerators of both restitutions are the same, and their ratio is I1/I2.
-        ratio = jnp.where((first > 0) & (second > 0), first / second, (p2 / p1) ** 2 / radii)
-        ways = [jnp.where(facing == 0, sign, facing) for sign in (1.0, -1.0)]
-        ways = jnp.stack(ways if np.any(np.asarray(facing) == 0) else ways[:1])
+        ratio, both = _of_two_impacts(first, second, p1, p2, radii)
+        one_way, two_ways = _ways(facing)
+        ways = two_ways if np.any(np.asarray(facing) == 0) else one_way
         other = OtherSide(alpha2 / alpha1, radii, inertia, ratio, ways)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
         if isinstance(blocks.law, PerSide):
-            restitution = jnp.where(jnp.isnan(restitution), jnp.sqrt(first * second), restitution)
+            restitution = _where(restitution != restitution, both, restitution)
         return cls(alpha1, p1, seen, restitution, other=other, **known)
 
     @property
@@ -301,3 +300,18 @@ def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:
         raise ValueError(f'Argument `{name}` must be given where `seen` is "rotation".')
     array = _list(name, 1.0 if value is None else value, measured.size)
     return checked(name, _where(measured, array, 1.0), "be in (0, pi/2)", lambda x: (x > 0) & (x < np.pi / 2))
+
+
+@one_program
+def _of_two_impacts(first: Rocks, second: Rocks, p1: Rocks, p2: Rocks, radii: Rocks) -> tuple[Rocks, Rocks]:
+    """Ratio of the restitutions of both sides, and the root of their product."""
+    # By momentum the numerators of both restitutions are the same, and their ratio is I1/I2.
+    ratio = jnp.where((first > 0) & (second > 0), first / second, (p2 / p1) ** 2 / radii)
+    return ratio, jnp.sqrt(first * second)
+
+
+@one_program
+def _ways(facing: Rocks) -> tuple[Real, Real]:
+    """Signs of the motion, (ways, rocks): if it is known how all rocks stood, and if not."""
+    both = jnp.stack([jnp.where(facing == 0, sign, facing) for sign in (1.0, -1.0)])
+    return both[:1], both

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
+from jaxrock._checks import one_program
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -95,7 +96,7 @@ class RollingMoments(AbstractMoments):
     def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
         """Of a block, or a side."""
         made = cls(Angle.of(alpha), ratio, edge, jnp.ones_like(alpha), alpha)
-        return replace(made, saddle=first_zero(lambda x: made.rolled(Angle.of(x)).reach, alpha))
+        return replace(made, saddle=_balance(made))
 
     def times(self, factor: Scalar | float) -> "RollingMoments":
         """As for any moments."""
@@ -160,6 +161,12 @@ class RollingMoments(AbstractMoments):
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; infinite, because it may roll on to a firmer part."""
         return jnp.full_like(hold, jnp.inf)
+
+
+@one_program
+def _balance(moments: RollingMoments) -> Scalar:
+    """The opening angle at which the centre of mass is over the point of contact, at most pi/2."""
+    return first_zero(lambda x: moments.rolled(Angle.of(x)).reach, moments.saddle)
 
 
 def _alike(first: Edge, second: Edge) -> tuple[Edge, Edge]:

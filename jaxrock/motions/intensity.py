@@ -77,6 +77,11 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     return peak
 
 
+def peaks_of_motion(motion: AbstractMotion) -> tuple[Inexact[Array, ""], Inexact[Array, ""]]:
+    """`peak_acceleration` and `peak_velocity` at once, without a warning of a record's baseline."""
+    return _peaks(motion)[:2]
+
+
 def _peaks(motion: AbstractMotion):
     """As `_peaks_of`, by a few programs for records of any lengths."""
     return _peaks_of(with_room(motion))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-from jaxrock._checks import is_traced, size, strength
+from jaxrock._checks import is_traced, placed, size, strength
 from jaxrock._parameters import Owner, parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
 from jaxrock.motions.record import AbstractChosen, Padded, Record, Straight, roomy
@@ -46,8 +46,8 @@ class JoinedRecords(Owner):
         samples = library.pad(samples, (0, places - samples.size))
         dt = library.pad(dt, (0, owners - dt.size), mode="edge")
         with jax.ensure_compile_time_eval():
-            first, count, owner = (jnp.asarray(np.pad(x, (0, n - x.size), mode="edge"), jnp.int32) for x, n in whole)
-            samples, dt = (x if library is jnp else jnp.asarray(x) for x in (samples, dt))
+            first, count, owner = (placed(np.pad(x, (0, n - x.size), mode="edge").astype(np.int32)) for x, n in whole)
+            samples, dt = (x if library is jnp else placed(x) for x in (samples, dt))
         return cls(samples, dt, first, count, owner, roomy(int(sizes.max())))
 
     @property

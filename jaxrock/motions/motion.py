@@ -100,15 +100,7 @@ class AbstractMotion(Owner):
         **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
         value after it.
         """
-        time = if_known(not_nan, "time", time).astype(self.knots.dtype)
-        knots = self.knots
-
-        def at(t):
-            piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
-            value = self.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
-            return where((t >= 0) & (t < knots[-1]), value, 0.0)
-
-        return jax.vmap(at)(time.ravel()).reshape(time.shape)
+        return _acceleration(self, if_known(not_nan, "time", time))
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
@@ -135,6 +127,18 @@ class AbstractMotion(Owner):
         return Summed(self, -other) if isinstance(other, AbstractMotion) else NotImplemented
 
     __array_ufunc__ = None  # an array of NumPy times a motion is a motion, and not an array of motions
+
+
+@jax.jit
+def _acceleration(motion: AbstractMotion, time: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+    knots = motion.knots
+
+    def at(t):
+        piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
+        value = motion.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
+        return where((t >= 0) & (t < knots[-1]), value, 0.0)
+
+    return jax.vmap(at)(time.ravel().astype(knots.dtype)).reshape(time.shape)
 
 
 class _Changed(AbstractMotion):

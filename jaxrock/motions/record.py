@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, is_traced, not_negative, size, strength, with_throw
+from jaxrock._checks import Values, is_traced, not_negative, placed, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
@@ -195,5 +195,9 @@ def _padded(part):
 def _with_room(samples, dt, more: int):
     # Known samples go through NumPy: of JAX's padding there would be a program for every number of samples.
     room = [(0, 0)] * (samples.ndim - 1) + [(0, more)]
-    roomier = jnp.pad(samples, room) if is_traced(samples) else jnp.asarray(np.pad(np.asarray(samples), room))
+    if is_traced(samples):
+        roomier = jnp.pad(samples, room)
+    else:
+        with jax.ensure_compile_time_eval():  # known to what is traced, too
+            roomier = placed(np.pad(np.asarray(samples), room))
     return roomier, dt, dt * (samples.shape[-1] - 1)

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
-from jaxrock.motions.intensity import peak_acceleration, peak_velocity
+from jaxrock.motions.intensity import peaks_of_motion
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record, with_room
@@ -94,8 +94,7 @@ class Suite(AbstractNamed):
         if len(self.names) != len(own):
             raise ValueError(f"Argument `names` must name {len(own)} motions, but has {len(self.names)} names.")
         self.sources = self.names if sources is None else sources
-        self.peak_acceleration = jnp.concatenate([_each(peak_acceleration, group) for group in self.groups])
-        self.peak_velocity = jnp.concatenate([_each(peak_velocity, group) for group in self.groups])
+        self.peak_acceleration, self.peak_velocity = map(jnp.concatenate, zip(*map(_peaks, self.groups)))
         if is_traced(self.peak_acceleration):
             peaks, failed = (self.peak_acceleration, self.peak_velocity), ~jnp.all(self.peak_acceleration > _LEAST)
             self.peak_acceleration, self.peak_velocity = watched(
@@ -203,8 +202,9 @@ def _numbered(names: list[str]) -> list[str]:
     return found
 
 
-def _each(measure: Callable, group: AbstractMotion):
-    group = with_room(group)  # and who draws up a suite is not warned of every record's baseline
+def _peaks(group: AbstractMotion):
+    """Peak accelerations and velocities of its motions."""
+    group = with_room(group)
     if size_of(group) == 1:  # of what is traced for one motion, there are programs already
-        return jnp.reshape(measure(one_of_many(group, 0)), (1,))
-    return jax.vmap(lambda index: measure(one_of_many(group, index)))(jnp.arange(size_of(group)))
+        return [jnp.reshape(peak, (1,)) for peak in peaks_of_motion(one_of_many(group, 0))]
+    return jax.vmap(lambda index: peaks_of_motion(one_of_many(group, index)))(jnp.arange(size_of(group)))

@@ -135,9 +135,7 @@ class Emitter:
             return self._apply(equation, inputs, active)
         if is_compound(name):
             return self.run(written(name, [x.aval for x in equation.invars], equation.params), inputs, active)
-        vectors = flat([x for x in inputs if not isinstance(x, Memory)])
-        vectors += [start for x in inputs if isinstance(x, Memory) for start in x.starts or ()]
-        depth = max((self._depths.get(id(x), 0) for x in vectors), default=0)
+        depth = max(map(self._depth, inputs), default=0)
         if depth == len(self.before):
             results = self._apply(equation, inputs, active)
         else:
@@ -146,12 +144,21 @@ class Emitter:
         self.remember(flat([x for x in results if not isinstance(x, Memory)]), depth)
         return results
 
+    def _depth(self, value) -> int:
+        """In how many loops a value is made anew."""
+        if isinstance(value, np.ndarray):
+            return max(map(self._depth, value.flat), default=0)
+        if isinstance(value, Memory):
+            return max(map(self._depth, value.starts or ()), default=0)
+        return self._depths.get(id(value), 0)
+
     def remember(self, values: list, depth: int) -> None:
         """That values are made anew in so many of the loops that are being written."""
-        values = [x for x in values if not isinstance(x, ir.Constant)]  # which many share, and nothing makes
-        self._alive += values
-        # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
-        self._depths.update((id(x), min(depth, self._depths.get(id(x), depth))) for x in values)
+        for value in values:
+            if not isinstance(value, ir.Constant):  # which many share, and nothing makes
+                self._alive.append(value)
+                # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
+                self._depths[id(value)] = min(depth, self._depths.get(id(value), depth))
 
     def _apply(self, equation, inputs: list, active) -> list:
         name, parameters = equation.primitive.name, equation.params
@@ -250,7 +257,10 @@ class Emitter:
 
 def _each(function: Callable, *inputs):
     """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
-    if not any(isinstance(x, np.ndarray) for x in inputs):
+    for x in inputs:
+        if isinstance(x, np.ndarray):
+            break
+    else:
         return function(*inputs)
     inputs = np.broadcast_arrays(*map(boxed, inputs))
     results = np.empty(inputs[0].shape, object)
@@ -261,9 +271,15 @@ def _each(function: Callable, *inputs):
 
 def flat(values: list) -> list:
     """The single vectors in vectors and arrays."""
-    if any(isinstance(value, Memory) for value in values):
-        raise Unsupported("a long list that changes")
-    return [x for value in values for x in (value.ravel() if isinstance(value, np.ndarray) else [value])]
+    vectors = []
+    for value in values:
+        if isinstance(value, np.ndarray):
+            vectors += value.ravel().tolist()
+        elif isinstance(value, Memory):
+            raise Unsupported("a long list that changes")
+        else:
+            vectors.append(value)
+    return vectors
 
 
 def like(values: list, vectors: list) -> list:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.flexible.response import FlexibleResponse
@@ -17,14 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@jax.jit
-def _acceleration(motion, time):
-    return motion.acceleration(time)
-
-
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
     """Ground acceleration at times [g]."""
-    return np.asarray(_acceleration(motion, time))
+    return np.asarray(motion.acceleration(time))
 
 
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,10 +88,15 @@ def _bending_history(response: FlexibleResponse, axes):
     return axes
 
 
+@jax.jit
+def _manifolds(moments: Coefficients, opening):
+    return jax.vmap(moments.manifold)(opening)
+
+
 def _manifold(axis: "Axes", moments: Coefficients, alpha: float) -> None:
     """The stable manifolds of both upright saddles, and the unstable ones, dotted."""
     opening = np.linspace(0, 2, 101)
-    manifold = np.asarray(jax.vmap(moments.manifold)(jnp.asarray(opening * alpha))) / alpha
+    manifold = np.asarray(_manifolds(moments, opening * alpha)) / alpha
     for side in (1, -1):
         label = "stable manifold" if side > 0 else None
         axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)

@@ -1,5 +1,6 @@
 """The history of a block under a motion."""
 
+import functools
 from typing import Annotated, overload
 
 import equinox as eqx
@@ -236,10 +237,16 @@ def simulate(
     engine = engine_of(engine, model, motion)
     block, start = standing(block, model), start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
-    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    rotation, velocity = _evaluate(path, time)
+    time, rotation, velocity = _equally_spaced(path, samples)
     response = Response(time, rotation, velocity, summary, path)
     return response if throw else marked_result(response, (block, motion, model, start, duration))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _equally_spaced(path: Trajectory, samples: int):
+    """Times from 0 to the duration, rotation and velocity."""
+    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
+    return time, *_evaluate(path, time)
 
 
 @jax.jit

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._parameters import check_single
+from jaxrock._parameters import check_single, in_real_numbers
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -147,6 +147,7 @@ def outcome(
         )
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
+    block, motion = in_real_numbers(block, motion)
     block, start = standing(block, model), start_of(initial, throw)
     in_place = isinstance(engine, Series) and is_in_place(motion)
     result = _outcome(block, motion if in_place else padded(motion), model, start, engine)

@@ -1,5 +1,7 @@
 """How a response depends on the parameters of its scene, and how far that can be trusted."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -140,15 +142,22 @@ def sensitivity(
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
 
     def results(values):
-        changed = rebuilt(block, motion, dict(zip(names, values)))
+        changed = rebuilt(block, motion, dict(zip(names, jnp.unstack(values))))
         result = outcome(*changed, model, engine=engine)
         return jnp.stack([getattr(result, name) for name in _RESULTS]), result
 
     rows, result = jax.jacfwd(results, has_aux=True)(values)
+    return _told(names, values, uplift_threshold(block, model), rows, result)
+
+
+@functools.partial(jax.jit, static_argnames="names")
+def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> Sensitivity:
+    """What derivatives (results, parameters) at values of the parameters tell: one program, for the operations are
+    many."""
     valid = (result.status == Status.successful) & result.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]
-    strength = uplift_threshold(block, model) / jnp.abs(amplitude)
+    strength = threshold / jnp.abs(amplitude)
     rows = jnp.concatenate([rows, -rows[:, [names.index("amplitude")]] * amplitude / strength], axis=1)
     independent = len(names)
     values = jnp.append(values, strength)

@@ -300,7 +300,8 @@ _period = Range("be positive and finite, from 1e-5 to 1e6", 0.0, np.inf, lambda 
 
 def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"]:
     """A list of numbers in a range, as an array."""
-    array = jnp.atleast_1d(allowed(name, values))
+    array = allowed(name, values)
+    array = array if array.ndim else array.reshape(1)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"Argument `{name}` must be a list of at least one value, but has shape {array.shape}.")
     return array

@@ -193,7 +193,7 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
             f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
             f"{array.dtype}."
         )
-    return np.asarray(jnp.asarray(array))  # in the precision of the session
+    return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
 
 
 def surface(
