@@ -19,7 +19,9 @@ import jaxrock as rk
 from references import peer_problems as problems
 
 SCENES = 2000
-DAMPED = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: 0.05 * v)
+DAMPED = rk.models.Equation(
+    lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: 0.05 * v
+)
 
 
 def solver(model, engine):

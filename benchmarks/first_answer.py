@@ -90,7 +90,7 @@ QUESTIONS = {
     ),
     "asymmetric": (
         "asymmetric rock, vertical shaking, `vmap`",
-        "rock = rk.AsymmetricBlock(0.15, 0.25, 2.0)\n"
+        "rock = rk.blocks.AsymmetricBlock(0.15, 0.25, 2.0)\n"
         "motion = rk.SinePulse(0.3, 0.8).with_vertical(rk.SinePulse(0.1, 0.3))\n"
         "answer = jax.vmap(lambda a: rk.outcome(rock, a * motion))(jnp.linspace(0.5, 2.0, 1000))",
         6.0, 0.8,

@@ -72,7 +72,7 @@ def main():
 
     suite = rk.motions.Suite(motions(500, 2000, 10_000))
     rocks = rk.Block(np.array([0.15, 0.25]), np.array([2.5, 3.5]))
-    sides = rk.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.2, 0.3]), np.array([2.5, 3.5]))
+    sides = rk.blocks.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.2, 0.3]), np.array([2.5, 3.5]))
     for name, two in (("blocks", rocks), ("asymmetric blocks", sides)):
         run = timed(lambda two=two: rk.hazard.suite_outcomes(two, suite, facing="both", progress=False))
         rows.append((f"500 motions as recorded x 2 {name} x 2 facings", *run))

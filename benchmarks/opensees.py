@@ -184,7 +184,7 @@ def best(function, repeats):
 
 def cases():
     """Name, the model in OpenSees, jaxrock's history, the judge of both, and the same for many."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.01)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01)
     length, mass = float(block.length), float(block.density * block.width * block.height)
     bending = TALL["youngs_modulus"] * TALL["width"] ** 3 / 12
     rigid = rk.Block.from_dimensions(TALL["width"], TALL["height"])

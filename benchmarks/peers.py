@@ -147,7 +147,7 @@ def main():
         file.write_text(json.dumps(data, indent=0))
     elif not options.draw:
         if set(options.peers) - ONE_DEVICE:
-            rk.use_cpu_devices()
+            rk.studies.use_cpu_devices()
         measure(options, data, file)
     report.write(data, {name: peer[2] for name, peer in PEERS.items()}, HERE)
 

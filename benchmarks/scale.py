@@ -156,7 +156,7 @@ def perform(task, arguments, devices):
     jax.config.update("jax_enable_x64", True)
     import jaxrock as rk
 
-    rk.use_cpu_devices(devices)
+    rk.studies.use_cpu_devices(devices)
     print(json.dumps(TASKS[task](*arguments)))
 
 

@@ -23,8 +23,6 @@ from jaxrock._moved import moved as _moved
 from jaxrock._parameters import parameter as parameter
 from jaxrock._surface import shown as _shown
 from jaxrock.blocks import restitution as restitution
-from jaxrock.blocks.asymmetric import AsymmetricBlock as AsymmetricBlock
-from jaxrock.blocks.flexible import FlexibleBlock as FlexibleBlock
 from jaxrock.blocks.rigid import Block as Block
 from jaxrock.engines.taylor.careful import Series as Series
 from jaxrock.keeping.compiled import keep_compiled as keep_compiled
@@ -33,7 +31,6 @@ from jaxrock.models.rigid import (
     Linear as Linear,
 )
 from jaxrock.models.spring import Spring as Spring
-from jaxrock.models.user_equation import Equation as Equation
 from jaxrock.motions import intensity as intensity
 from jaxrock.motions.files.example import example_record as example_record
 from jaxrock.motions.files.reading import read_record as read_record
@@ -51,7 +48,6 @@ from jaxrock.motions.pulses.sinusoidal import (
     SinePulse as SinePulse,
 )
 from jaxrock.motions.record import Record as Record
-from jaxrock.responses.contact import contact_forces as contact_forces
 from jaxrock.responses.history import simulate as simulate
 from jaxrock.responses.outcome import outcome as outcome
 from jaxrock.status import Status as Status
@@ -60,14 +56,10 @@ from jaxrock.studies import (
     similarity as similarity,
 )
 from jaxrock.studies.critical import critical_amplitudes as critical_amplitudes
-from jaxrock.studies.sensitivities import sensitivity as sensitivity
 from jaxrock.studies.spectra import (
     overturning_map as overturning_map,
     rocking_spectrum as rocking_spectrum,
-    self_similar_spectrum as self_similar_spectrum,
 )
-from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
-from jaxrock.sweeps.grid import Grid as Grid
 from jaxrock.sweeps.sweep import sweep as sweep
 
 if _typing.TYPE_CHECKING:

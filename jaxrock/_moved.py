@@ -5,7 +5,7 @@ import warnings
 from typing import Any
 
 _MOVED = {
-    "blocks": "Rock draw_blocks",
+    "blocks": "AsymmetricBlock FlexibleBlock Rock draw_blocks",
     "hazard": """
         AbstractFragility FitStatus FragilityFit HazardCurve HazardCurves LogNormalFragility ProbitFit
         SimulatedFragility SimulatedSurface SuiteOutcomes SurfaceFit SurfaceFragility TabulatedFragility
@@ -19,14 +19,16 @@ _MOVED = {
         calibrate_block estimate_motion feasible_region find_record fit_history log_density read_observations
         sample_motion unexceeded_motion
     """,
-    "models": "AbstractEquation Coefficients Terms",
+    "models": "AbstractEquation Coefficients Equation Terms",
     "motions": """
         AbstractMotion Components Origin Suite WithVertical read_components record_of_trace write_at2 write_csv
     """,
-    "responses": "Contact FlexibleOutcome FlexibleResponse Outcome Response outcome_flexible simulate_flexible",
+    "responses": """
+        Contact FlexibleOutcome FlexibleResponse Outcome Response contact_forces outcome_flexible simulate_flexible
+    """,
     "studies": """
-        Borders Critical OverturningMap Region Sensitivity SensitivityMap Spectrum critical_durations
-        overturning_borders sensitivity_map
+        Borders Critical Grid OverturningMap Region Sensitivity SensitivityMap Spectrum critical_durations
+        overturning_borders self_similar_spectrum sensitivity sensitivity_map use_cpu_devices
     """,
 }
 _HOMES = {name: space for space, names in _MOVED.items() for name in names.split()}

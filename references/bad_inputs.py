@@ -88,11 +88,11 @@ def curve():
 
 
 def flexible():
-    return rk.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2)
+    return rk.blocks.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2)
 
 
 def rock():
-    return rk.AsymmetricBlock(0.2, 0.3, 2.0)
+    return rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0)
 
 
 def response_of(name: str):
@@ -170,21 +170,21 @@ CALLS: dict[str, Call] = {
         rk.Block.from_radius, {"alpha": 0.2, "R": 2.0, "restitution": 0.9, "inertia_ratio": 0.7, "gravity": 9.81}
     ),
     "AsymmetricBlock": Call(
-        rk.AsymmetricBlock,
+        rk.blocks.AsymmetricBlock,
         {**RIGID, "p1": 2.0, "inertia_ratio": 0.75, "radius_ratio": 1.1, "restitution": (0.9, 0.9)},
     ),
     "AsymmetricBlock.from_radii": Call(
-        rk.AsymmetricBlock.from_radii, {**RIGID, "R1": 1.0, "R2": 1.1, "gyration_radius": 0.5, "gravity": 9.81}
+        rk.blocks.AsymmetricBlock.from_radii, {**RIGID, "R1": 1.0, "R2": 1.1, "gyration_radius": 0.5, "gravity": 9.81}
     ),
     "AsymmetricBlock.from_frequencies": Call(
-        rk.AsymmetricBlock.from_frequencies, {**RIGID, "p1": 2.0, "p2": 2.1, "inertia_ratio": 0.75}
+        rk.blocks.AsymmetricBlock.from_frequencies, {**RIGID, "p1": 2.0, "p2": 2.1, "inertia_ratio": 0.75}
     ),
     "AsymmetricBlock.from_corners": Call(
-        rk.AsymmetricBlock.from_corners,
+        rk.blocks.AsymmetricBlock.from_corners,
         {"corner1": [0.3, 0.0], "corner2": [-0.2, 0.0], "centre": [0.0, 1.0], "gyration_radius": 0.5},
     ),
     "AsymmetricBlock.from_outline": Call(
-        rk.AsymmetricBlock.from_outline,
+        rk.blocks.AsymmetricBlock.from_outline,
         {
             "outline": [[0.0, 0.0], [1.0, 0.0], [0.8, 3.0], [0.0, 3.0]],
             "supports": (1, 0),
@@ -194,7 +194,7 @@ CALLS: dict[str, Call] = {
         },
     ),
     "AsymmetricBlock.from_mesh": Call(
-        rk.AsymmetricBlock.from_mesh,
+        rk.blocks.AsymmetricBlock.from_mesh,
         {"mesh": stone(), "azimuth": 0.3, "base": "wide", "unit": "m", "tolerance": 0.01, "gravity": 9.81},
     ),
     "Rock.from_mesh": Call(rk.blocks.Rock.from_mesh, {"mesh": "/nowhere/a.stl", "unit": "m", "tolerance": 0.01}),
@@ -210,7 +210,7 @@ CALLS: dict[str, Call] = {
         {"rock": stone(), "azimuth": 0.3, "draws": 3, "tolerance": (0.01, 0.02), "resolution": 1e-3, "seed": 1},
     ),
     "FlexibleBlock": Call(
-        rk.FlexibleBlock,
+        rk.blocks.FlexibleBlock,
         {
             "width": 1.0,
             "height": 5.0,
@@ -303,7 +303,7 @@ CALLS: dict[str, Call] = {
     "Spring": Call(rk.Spring, {"kind": "SM1", "law": "linear"}),
     "Rolling": Call(rk.models.Rolling, {"edge": 0.2, "other": 0.1, "inertia_ratio": 0.7}),
     "Equation": Call(
-        rk.Equation,
+        rk.models.Equation,
         {"restoring": lambda x, block: block.alpha - x, "arm": None, "dissipation": None, "falls_flat": True},
     ),
     "Series": Call(rk.Series, {"order": 8, "tolerance": 1e-9, "max_steps": 100}),
@@ -313,7 +313,7 @@ CALLS: dict[str, Call] = {
     "simulate": Call(rk.simulate, {**SCENE, "initial": (0.0, 0.0), "duration": 2.0, "samples": 24}),
     "Response.__call__": Call(response_of("__call__"), {"time": [0.1, 0.2]}),
     "contact_forces": Call(
-        rk.contact_forces,
+        rk.responses.contact_forces,
         {"response": None, "block": block(), "inertia_ratio": 0.75},
         may_be="friction|least_normal",
     ),
@@ -337,7 +337,7 @@ CALLS: dict[str, Call] = {
         True,
         "derivative|value|intensity",
     ),
-    "sensitivity": Call(rk.sensitivity, SCENE, True, ".*"),
+    "sensitivity": Call(rk.studies.sensitivity, SCENE, True, ".*"),
     "sensitivity_map": Call(
         rk.studies.sensitivity_map,
         {"uplift_strength": [0.5], "pulse_duration": [2.0], "shape": 0.0, "alpha": 0.2, "restitution": 0.9, **QUICK},
@@ -348,7 +348,7 @@ CALLS: dict[str, Call] = {
         rk.rocking_spectrum, {"alpha": 0.2, "motion": pulse(), "period": [3.0], "restitution": 0.9, **QUICK}, True
     ),
     "self_similar_spectrum": Call(
-        rk.self_similar_spectrum, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
+        rk.studies.self_similar_spectrum, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True
     ),
     "overturning_map": Call(
         rk.overturning_map, {**RANGES, "alpha": 0.2, "restitution": 0.9, "pulse": rk.SinePulse}, True, "max_rotation"
@@ -525,7 +525,7 @@ CALLS: dict[str, Call] = {
     "Observations.asymmetric": Call(
         rk.inverse.Observations.asymmetric,
         {
-            "blocks": rk.AsymmetricBlock([0.2, 0.3], 0.3, 2.0),
+            "blocks": rk.blocks.AsymmetricBlock([0.2, 0.3], 0.3, 2.0),
             "seen": ["survived", "toppled"],
             "restitution": 0.9,
             "facing": [1, 0],
@@ -681,7 +681,7 @@ CALLS: dict[str, Call] = {
         rk.read_record, {"path": "/nowhere/a.at2", "format": "at2", "dt": 0.01, "unit": "g", "column": 0}
     ),
     # What is left
-    "use_cpu_devices": Call(rk.use_cpu_devices, {"count": 1}, raises=(RuntimeError,)),
+    "use_cpu_devices": Call(rk.studies.use_cpu_devices, {"count": 1}, raises=(RuntimeError,)),
     "sweep": Call(
         lambda function, **given: rk.sweep(function, **given),
         {
@@ -862,7 +862,7 @@ def _of_refusal(error: Exception) -> str | None:
 
 def _of_result(call: Call, result: Any) -> str | None:
     """Numbers that are not finite, where nothing says why."""
-    result = result.values if isinstance(result, rk.Grid) else result  # its axes are what was given
+    result = result.values if isinstance(result, rk.studies.Grid) else result  # its axes are what was given
     leaves = jax.tree_util.tree_leaves_with_path(result)
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     if isinstance(result, rk.responses.Outcome | rk.responses.FlexibleOutcome):

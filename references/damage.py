@@ -25,7 +25,9 @@ def record() -> rk.Record:
     return rk.Record(0.5 * np.sin(2 * np.pi * time / 0.7) * np.exp(-((time - 2) ** 2)), 0.02)
 
 
-def swept(store: Path | None = None, *, axes: dict = AXES, block: int = BLOCK, load: bool = True) -> rk.Grid | None:
+def swept(
+    store: Path | None = None, *, axes: dict = AXES, block: int = BLOCK, load: bool = True
+) -> rk.studies.Grid | None:
     """Outcomes of blocks under a record."""
     motion = record()
     return rk.sweep(
@@ -34,7 +36,7 @@ def swept(store: Path | None = None, *, axes: dict = AXES, block: int = BLOCK, l
     )  # fmt: skip
 
 
-def bits(grid: rk.Grid) -> list[tuple]:
+def bits(grid: rk.studies.Grid) -> list[tuple]:
     """All that a grid holds, to the last bit."""
     arrays = [*grid.axes.values(), *jax.tree.leaves(grid.values)]
     return [(x.dtype.str, x.shape, x.tobytes()) for x in map(np.asarray, arrays)]
@@ -110,7 +112,7 @@ def damaged(original: Path, copy: Path, seed: int) -> str:
 def loaded(path: Path, right: list[tuple]) -> str:
     """What becomes of it when it is loaded: `right`, `refused` with its path; anything else fails."""
     try:
-        found = rk.Grid.load(path)
+        found = rk.studies.Grid.load(path)
     except (ValueError, FileNotFoundError) as error:
         assert str(path) in str(error), f"a message without the path: {error}"
         return "refused"
@@ -128,7 +130,7 @@ def resumed(path: Path, right: list[tuple], function=swept) -> str:
             assert str(path) in str(error), f"a message without the path: {error}"
             return "refused"
     assert bits(found) == right, "a wrong answer, silently"
-    assert bits(rk.Grid.load(path)) == right, "what was mended is not right"
+    assert bits(rk.studies.Grid.load(path)) == right, "what was mended is not right"
     assert len(said) <= 1 and all(str(path) in str(warning.message) for warning in said)
     return "mended" if said else "right"
 

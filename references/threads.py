@@ -46,31 +46,31 @@ def message(function: Callable) -> str:
     return "no refusal"
 
 
-def checked(restitution: float) -> rk.Grid:
+def checked(restitution: float) -> rk.studies.Grid:
     """A sweep whose arguments are checked within it."""
     return rk.sweep(
         lambda e, p: rk.Block(0.2, p, e).restitution * p, e=[0.5, restitution], p=[1.0, 2.0, 3.0], progress=False
     )
 
 
-def stored(folder: Path) -> rk.Grid:
+def stored(folder: Path) -> rk.studies.Grid:
     """A sweep of a store of its own, resumed."""
     path = folder / f"{uuid.uuid4().hex}.zarr"
     assert swept(path, load=False) is None
     return swept(path)
 
 
-def shared(folder: Path) -> rk.Grid:
+def shared(folder: Path) -> rk.studies.Grid:
     """A sweep of one store that all threads and processes write."""
     return swept(folder / "shared.zarr")
 
 
-def saved(folder: Path, ending: str) -> rk.Grid:
+def saved(folder: Path, ending: str) -> rk.studies.Grid:
     """Results that were saved and loaded."""
     path = folder / f"{uuid.uuid4().hex}{ending}"
     axes = {"k": np.arange(50.0)}
-    rk.Grid(axes, {"square": axes["k"] ** 2, "even": axes["k"] % 2 == 0, "count": np.arange(50)}).save(path)
-    return rk.Grid.load(path)
+    rk.studies.Grid(axes, {"square": axes["k"] ** 2, "even": axes["k"] % 2 == 0, "count": np.arange(50)}).save(path)
+    return rk.studies.Grid.load(path)
 
 
 def questions(folder: Path, few: bool = False) -> dict[str, Callable]:

@@ -36,7 +36,7 @@ def one_scene() -> None:
     assert_type(found.status, rk.Status)
     if found.status == rk.Status.successful:
         print(found.margin.item(), rk.Status[found.status])
-    contact = rk.contact_forces(response, block)
+    contact = rk.responses.contact_forces(response, block)
     assert_type(contact.sticks(0.5), jax.Array)
 
 
@@ -59,7 +59,7 @@ def many_scenes() -> None:
         p=[1.5, 2.0],
         progress=False,
     )
-    assert_type(grid, rk.Grid)
+    assert_type(grid, rk.studies.Grid)
     print(grid.shape, grid.values.margin.shape)
     spectrum = rk.rocking_spectrum(0.2, record, [2.0, 3.0], progress=False)
     assert_type(spectrum.max_rotation, jax.Array)
@@ -67,7 +67,7 @@ def many_scenes() -> None:
     assert_type(surface.state, jax.Array)
     ends = rk.critical_amplitudes(block, record, intensity=(1.0, 6.0), progress=False)
     print(ends.value[: int(ends.count)])
-    told = rk.sensitivity(block, record)
+    told = rk.studies.sensitivity(block, record)
     print(told.names, told.max_rotation.elasticity)
 
 
@@ -139,7 +139,7 @@ def own_physics() -> None:
     brittle = rk.Block(0.2, 2.0, restitution=Brittle(jnp.asarray(0.95), jnp.asarray(4.0)))
     ramp = Ramp(jnp.asarray(0.5), jnp.asarray(0.7))
     print(rk.outcome(brittle, ramp).margin)
-    model = rk.Equation(
+    model = rk.models.Equation(
         restoring=lambda opening, block: jnp.sin(block.alpha - opening),
         arm=lambda opening, block: jnp.cos(block.alpha - opening),
         dissipation=Damper(jnp.asarray(0.2)),
@@ -150,11 +150,11 @@ def own_physics() -> None:
 
 def rocks() -> None:
     """Two sides, and a flexible column: docs/how_to/rock.md, docs/concepts/flexible.md."""
-    rock = rk.AsymmetricBlock.from_corners(
+    rock = rk.blocks.AsymmetricBlock.from_corners(
         corner1=(0.32, -0.61), corner2=(-0.25, -0.58), centre=(0.0, 0.0), gyration_radius=0.45
     )
     print(bool(rk.outcome(rock, -1 * rk.SinePulse(0.5, 0.6)).overturned))
-    column = rk.FlexibleBlock(0.5, 2.0, 30e9, 2500.0, 0.02, masses=3)
+    column = rk.blocks.FlexibleBlock(0.5, 2.0, 30e9, 2500.0, 0.02, masses=3)
     assert_type(rk.outcome(column, rk.SinePulse(0.3, 0.6)), rk.responses.FlexibleOutcome)
     wild = rk.Block(jnp.asarray(-0.2), 2.0, throw=False)
     print(rk.outcome(wild, rk.SinePulse(0.4, 0.6), throw=False).status == rk.Status.not_finite)

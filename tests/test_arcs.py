@@ -73,7 +73,7 @@ def test_the_edge_of_certain_loss():
 
     amplitudes = np.linspace(0.6, 0.9, 61)
     exact = jax.vmap(lambda a: found(a, rk.Housner(), rk.Series()))(amplitudes)
-    lanes = jax.vmap(lambda a: found(a, rk.Equation(sine, cosine), rk.Diffrax()))(amplitudes)
+    lanes = jax.vmap(lambda a: found(a, rk.models.Equation(sine, cosine), rk.Diffrax()))(amplitudes)
     assert (lanes.status == rk.Status.successful).all()
     np.testing.assert_array_equal(lanes.overturned, exact.overturned)
 
@@ -94,20 +94,20 @@ def test_history_to_rest():
 
 def test_series_engine_refuses_functions():
     with pytest.raises(ValueError, match="Argument `engine` must be a Diffrax"):
-        rk.outcome(BLOCK, PULSE, rk.Equation(sine, cosine), engine=rk.Series())
+        rk.outcome(BLOCK, PULSE, rk.models.Equation(sine, cosine), engine=rk.Series())
 
 
 @pytest.mark.parametrize("parts", [{}, {"restoring": sine, "acceleration": sine}, {"acceleration": sine, "arm": sine}])
 def test_equation_needs_one_description(parts):
     with pytest.raises(ValueError, match="Give either `restoring`"):
-        rk.Equation(**parts)
+        rk.models.Equation(**parts)
 
 
 @pytest.mark.parametrize(
     "model",
     [
-        pytest.param(rk.Equation(sine, cosine), marks=pytest.mark.slow),  # fast: `test_dissipation`
-        rk.Equation(acceleration=lambda x, v, push, block: -sine(x, block) - push * cosine(x, block)),
+        pytest.param(rk.models.Equation(sine, cosine), marks=pytest.mark.slow),  # fast: `test_dissipation`
+        rk.models.Equation(acceleration=lambda x, v, push, block: -sine(x, block) - push * cosine(x, block)),
     ],
     ids=["moments", "acceleration"],
 )
@@ -124,7 +124,7 @@ def test_equation_of_the_built_in_model(model):
 
 def test_dissipation():
     """Viscous dissipation takes 2 c v^2 per time from the energy of a freely rocking block: judged by quadrature."""
-    model = rk.Equation(sine, cosine, lambda x, v, block: 0.3 * v)
+    model = rk.models.Equation(sine, cosine, lambda x, v, block: 0.3 * v)
     response = rk.simulate(
         BLOCK,
         rk.Record([0.0], 0.1),
@@ -201,7 +201,7 @@ def test_derivative_with_respect_to_a_model_parameter():
             return self.size * velocity
 
     def of(size):
-        model = rk.Equation(sine, cosine, Damping(size))
+        model = rk.models.Equation(sine, cosine, Damping(size))
         return rk.outcome(BLOCK, PULSE, model, engine=rk.Diffrax(rtol=1e-10)).max_rotation
 
     value, slope = jax.jit(lambda c: jax.jvp(of, (c,), (1.0,)))(0.1)

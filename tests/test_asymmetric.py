@@ -28,7 +28,7 @@ def scene(case):
     """Block, motion, model and initial state of a case."""
     b = case["block"]
     kappa = b["p"][0] ** 2 * b["R"][0] / b["gravity"]
-    block = rk.AsymmetricBlock.from_frequencies(*b["alpha"], *b["p"], kappa, tuple(b["restitution"]))
+    block = rk.blocks.AsymmetricBlock.from_frequencies(*b["alpha"], *b["p"], kappa, tuple(b["restitution"]))
     motion = motion_of(*case["horizontal"])
     if case["vertical"] is not None:
         motion = motion.with_vertical(case["vertical"]["factor"] * motion_of(*case["vertical"]["motion"]))
@@ -68,14 +68,14 @@ def stack(scenes, size=64):
 def stack_columns(numbers, size=64):
     """Scenes from columns of parameters, the last one repeated."""
     x = np.pad(numbers, ((0, 0), (0, size - numbers.shape[1])), mode="edge")
-    return rk.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:])
+    return rk.blocks.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:])
 
 
 def drawn(size=64):
     """Random blocks and pulses of even difficulty."""
     draw = np.random.default_rng(1).uniform
     alpha1, alpha2 = draw(0.1, 0.5, (2, size))
-    block = rk.AsymmetricBlock(alpha1, alpha2, draw(1.5, 4, size), draw(0.6, 0.9, size))
+    block = rk.blocks.AsymmetricBlock(alpha1, alpha2, draw(1.5, 4, size), draw(0.6, 0.9, size))
     return block, rk.SinePulse(draw(0.1, 1.2, size), draw(0.4, 2.0, size))
 
 
@@ -115,7 +115,7 @@ def test_equal_sides_are_a_block():
     """With equal sides an asymmetric block is Housner's, also in its restitution; every number to rounding."""
     block, motion = drawn()
     alpha, p = np.asarray(block.alpha1), np.asarray(block.p1)
-    equal = rk.AsymmetricBlock(alpha, alpha, p, np.full(p.shape, 0.75))
+    equal = rk.blocks.AsymmetricBlock(alpha, alpha, p, np.full(p.shape, 0.75))
     found = jax.device_get(under_sine(equal, motion))
     restitution = np.asarray(rk.Block(alpha, p).restitution)
     blocks, pulses = zip(alpha, p, restitution), zip(*map(np.asarray, (motion.amplitude, motion.period)))
@@ -156,7 +156,7 @@ def test_derivatives():
     @jax.jacfwd
     def derivatives(x):
         engine = rk.Series(order=6)  # a shorter program
-        return rk.outcome(rk.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:]), engine=engine).margin
+        return rk.outcome(rk.blocks.AsymmetricBlock(*x[:4]), rk.SinePulse(*x[4:]), engine=engine).margin
 
     found = np.asarray(derivatives(np.stack(numbers)))
     steps = 1e-5 * np.concatenate([np.eye(6), -np.eye(6)])
@@ -170,7 +170,7 @@ def test_derivatives():
 def all_of(block, motion, initial, duration, time):
     """Outcome, impact times, states at times, and forces of the ground."""
     response = rk.simulate(block, motion, initial=initial, duration=duration)
-    forces = rk.contact_forces(response, block)
+    forces = rk.responses.contact_forces(response, block)
     return rk.outcome(block, motion, initial=initial), response.impact_times, jnp.stack(response(time)), forces
 
 
@@ -198,10 +198,10 @@ def test_vertical_motion_and_contact_forces():
 def test_housner_friction():
     """A rectangle needs 3 tan(alpha)/(4 + tan^2(alpha)) at an impact; one that never moves, the motion's peak."""
     case = next(case for case in CASES if case["name"] == "sine and vertical sine")
-    usual = rk.AsymmetricBlock(0.3, 0.3, 2.0)
+    usual = rk.blocks.AsymmetricBlock(0.3, 0.3, 2.0)
     pair = float(usual.restitution1), float(usual.restitution2)
     # As the block above: compiled once.
-    block = rk.AsymmetricBlock.from_frequencies(0.3, 0.3, 2.0, 2.0, 0.75, pair)
+    block = rk.blocks.AsymmetricBlock.from_frequencies(0.3, 0.3, 2.0, 2.0, 0.75, pair)
     motion = rk.SinePulse(0.2, 1.0).with_vertical(0.0 * rk.SinePulse(1.0, 1.0))
     *_, found = all_of(block, motion, (0.0, 0.0), 1.0, np.zeros(len(case["result"]["states"])))
     tangent = np.tan(0.3)
@@ -240,45 +240,53 @@ def test_outlines(name):
     rolls = min(contact - float(a) for contact, a in zip(wanted["next_contact"], wanted["alpha"])) < 0
     if rolls:
         with pytest.raises(ValueError, match="rolls onto that face"):
-            rk.AsymmetricBlock.from_outline(vertices, supports=supports)
+            rk.blocks.AsymmetricBlock.from_outline(vertices, supports=supports)
         return
     for points in (vertices, vertices[::-1]):
         positions = supports if points is vertices else tuple(len(vertices) - 1 - i for i in supports)
-        block = rk.AsymmetricBlock.from_outline(points, supports=positions, gravity=wanted["gravity"])
+        block = rk.blocks.AsymmetricBlock.from_outline(points, supports=positions, gravity=wanted["gravity"])
         # Far from the origin the coordinates themselves hold fewer digits of the shape.
         digits = 3e-15 * max(1, np.abs(vertices).max() / np.ptp(vertices, axis=0).min())
         found = {name: [getattr(block, f"{name}{side}") for side in (1, 2)] for name in ("alpha", "p", "restitution")}
         for key, values in found.items():
             np.testing.assert_allclose(values, np.array(wanted[key], float), rtol=digits, err_msg=key)
     if len({wanted["right_corner"][1], wanted["left_corner"][1], vertices[:, 1].min()}) == 1:
-        flat = rk.AsymmetricBlock.from_outline(vertices, gravity=wanted["gravity"])
+        flat = rk.blocks.AsymmetricBlock.from_outline(vertices, gravity=wanted["gravity"])
         np.testing.assert_allclose(flat.alpha1, block.alpha1, rtol=1e-15)
 
 
 def test_constructors_agree():
     """From radii, frequencies and corners; a flat base without its ratio of radii."""
-    block = rk.AsymmetricBlock.from_corners((0.25, 0.0), (-0.15, 0.0), (0.0, 1.0), np.sqrt(0.35))
-    flat = rk.AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio)
-    other = rk.AsymmetricBlock.from_frequencies(block.alpha1, block.alpha2, block.p1, block.p2, block.inertia_ratio)
+    block = rk.blocks.AsymmetricBlock.from_corners((0.25, 0.0), (-0.15, 0.0), (0.0, 1.0), np.sqrt(0.35))
+    flat = rk.blocks.AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio)
+    other = rk.blocks.AsymmetricBlock.from_frequencies(
+        block.alpha1, block.alpha2, block.p1, block.p2, block.inertia_ratio
+    )
     for same in (flat, other, block.mirrored.mirrored):
         for name in ("p2", "radius_ratio", "restitution1", "restitution2"):
             np.testing.assert_allclose(getattr(same, name), getattr(block, name), rtol=1e-13)
 
 
 BAD = {
-    "slenderness": (lambda: rk.AsymmetricBlock(0.2, 1.6, 2.0), "Argument `alpha2` must be in"),
-    "inertia": (lambda: rk.AsymmetricBlock(0.2, 0.2, 2.0, 1.2), "Argument `inertia_ratio` must be in"),
-    "energy": (lambda: rk.AsymmetricBlock(0.2, 0.2, 2.0, restitution=(1.1, 0.95)), "energy kept by two impacts"),
-    "frequency": (lambda: rk.AsymmetricBlock.from_frequencies(0.2, 0.2, 2.0, 3.0), "the largest about any corner"),
+    "slenderness": (lambda: rk.blocks.AsymmetricBlock(0.2, 1.6, 2.0), "Argument `alpha2` must be in"),
+    "inertia": (lambda: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, 1.2), "Argument `inertia_ratio` must be in"),
+    "energy": (lambda: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=(1.1, 0.95)), "energy kept by two impacts"),
+    "frequency": (
+        lambda: rk.blocks.AsymmetricBlock.from_frequencies(0.2, 0.2, 2.0, 3.0),
+        "the largest about any corner",
+    ),
     "falls by itself": (
-        lambda: rk.AsymmetricBlock.from_corners((0.1, 0), (-0.3, 0), (0.2, 1), 0.3),
+        lambda: rk.blocks.AsymmetricBlock.from_corners((0.1, 0), (-0.3, 0), (0.2, 1), 0.3),
         "must be positive",
     ),
-    "crossing": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (1, 0), (0, 1.2)]), "must not cross itself"),
-    "a line": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (2, 2)]), "must enclose an area"),
-    "a tip": (lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 1), (-1, 1)]), "must have a flat base"),
+    "crossing": (
+        lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (1, 0), (0, 1.2)]),
+        "must not cross itself",
+    ),
+    "a line": (lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (2, 2)]), "must enclose an area"),
+    "a tip": (lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (-1, 1)]), "must have a flat base"),
     "position": (
-        lambda: rk.AsymmetricBlock.from_outline([(0, 0), (1, 0), (1, 2), (0, 2)], supports=(1, 4)),
+        lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 0), (1, 2), (0, 2)], supports=(1, 4)),
         "`supports` must be a whole number from -4 to 3, but is",
     ),
 }

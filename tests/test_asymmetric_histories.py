@@ -45,7 +45,7 @@ def test_both_sides_are_told():
     data = free_rocking()
     assert data.min() < -0.02 and np.sum(np.diff(np.sign(data)) != 0) >= 5
     data = data + size * np.random.default_rng(0).normal(size=TIME.size)
-    guess = rk.AsymmetricBlock(0.18, 0.35, 2.7, KAPPA, restitution=(0.9, 0.9))
+    guess = rk.blocks.AsymmetricBlock(0.18, 0.35, 2.7, KAPPA, restitution=(0.9, 0.9))
     found = rk.inverse.fit_history(TIME, data, guess, starts=2, spread=0.05)
     assert found.status == rk.inverse.HistoryStatus.successful, found.warnings
     assert found.names == tuple(TRUTH)
@@ -53,10 +53,10 @@ def test_both_sides_are_told():
     assert np.all(np.abs(found.values - list(TRUTH.values())) < 4 * errors)
     assert np.all(errors / found.values < 0.05)
     assert found.scatter == pytest.approx(size, rel=0.2)
-    assert isinstance(found.block, rk.AsymmetricBlock) and float(found.block.alpha1) == found["alpha1"]
+    assert isinstance(found.block, rk.blocks.AsymmetricBlock) and float(found.block.alpha1) == found["alpha1"]
 
 
 def test_names_are_those_of_the_block():
-    block = rk.AsymmetricBlock(0.2, 0.3, 2.5)
+    block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5)
     with pytest.raises(ValueError, match="be different names out of alpha1, alpha2, p1"):
         rk.inverse.fit_history(TIME, np.cos(TIME), block, parameters=("alpha", "p"))

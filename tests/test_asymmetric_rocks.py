@@ -21,7 +21,7 @@ WORDS = ["survived", "toppled", "rotation"] * 4
 
 
 def rocks(ratio=1.35, facing=FACING, words=WORDS, inertia_ratio=0.7, **more):
-    blocks = rk.AsymmetricBlock(ALPHA, ratio * ALPHA, P, inertia_ratio)
+    blocks = rk.blocks.AsymmetricBlock(ALPHA, ratio * ALPHA, P, inertia_ratio)
     return rk.inverse.Observations.asymmetric(blocks, words, facing=facing, **(KNOWN | more))
 
 
@@ -53,7 +53,7 @@ def test_ways_are_those_of_the_mirrored_rock_and_their_mean():
         mean = np.exp(unknown[k]) if k == 0 else unknown[k]
         np.testing.assert_allclose(((here + there) / 2)[:, known], mean[:, known], rtol=1e-11)
     # Seen from behind, with sides exchanged, it stands the other way round. (What is uncertain belongs to side 1.)
-    blocks = rk.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P, 0.7).mirrored
+    blocks = rk.blocks.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P, 0.7).mirrored
     both = {"alpha_sd": 0.04 * 1.35 * ALPHA, "p_sd": 0.02 * blocks.p1}
     behind = facts(rk.inverse.Observations.asymmetric(blocks, WORDS, facing=-FACING, **(KNOWN | both)))
     for found, expected in zip(behind, one):
@@ -70,7 +70,9 @@ def test_other_names_compile_nothing():
 
 def test_restitutions():
     """Of two impacts, one on each side, the energy kept is the square; their ratio is that of moments of inertia."""
-    blocks = rk.AsymmetricBlock.from_radii(*np.array([[0.2, 0.3], [0.35, 0.25], [1.0, 1.2], [1.3, 1.1], [0.6, 0.7]]))
+    blocks = rk.blocks.AsymmetricBlock.from_radii(
+        *np.array([[0.2, 0.3], [0.35, 0.25], [1.0, 1.2], [1.3, 1.1], [0.6, 0.7]])
+    )
     seen = rk.inverse.Observations.asymmetric(blocks, ["survived"] * 2)
     for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
         np.testing.assert_allclose(getattr(seen.blocks, name), getattr(blocks, name), rtol=1e-14)
@@ -78,7 +80,7 @@ def test_restitutions():
     assert float((given.restitution1 * given.restitution2)[0]) == pytest.approx(0.81)
     np.testing.assert_allclose(given.restitution1 / given.restitution2, blocks.restitution1 / blocks.restitution2)
     np.testing.assert_allclose(given.restitution1[1], blocks.restitution1[1])
-    pair = rk.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.7, 0.9))
+    pair = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.7, 0.9))
     found = rk.inverse.Observations.asymmetric(pair, ["survived"]).of(np.array([0])).blocks
     np.testing.assert_allclose([found.restitution1, found.restitution2], [[0.7], [0.9]])
 
@@ -134,7 +136,7 @@ def test_impossible_rocks_are_named_by_their_line(tmp_path, header, line, messag
 
 
 def fallen(sign, amplitude, period, alpha1, alpha2, p1, inertia_ratio):
-    block = rk.AsymmetricBlock(alpha1, alpha2, p1, inertia_ratio)
+    block = rk.blocks.AsymmetricBlock(alpha1, alpha2, p1, inertia_ratio)
     return {"fallen": rk.outcome(block, rk.SinePulse(sign * amplitude, period)).overturned}
 
 
@@ -193,7 +195,7 @@ def test_unexceeded_motions_of_two_sides():
 @pytest.mark.slow
 def test_the_command_for_rocks_with_two_sides(tmp_path, capsys):
     header = "name,alpha1_rad,alpha1_rad_sd,alpha2_rad,p1_rad_per_s,p2_rad_per_s,facing,observed"
-    p2 = np.asarray(rk.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P).p2)
+    p2 = np.asarray(rk.blocks.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P).p2)
     words = ["toppled"] * 6 + ["survived"] * 6
     rows = [
         f"r{i},{ALPHA[i]},{0.04 * ALPHA[i]},{1.35 * ALPHA[i]},{P[i]},{p2[i]},{('', '1', '-1')[i % 3]},{words[i]}"

@@ -19,7 +19,7 @@ SCALE = np.array([0.5, 0.8, 1.2])
 def oval(azimuth):
     """Stout along 0.3 rad, slender across; its two sides differ."""
     wide = 0.06 * np.cos(2 * (azimuth - 0.3))
-    return rk.AsymmetricBlock.from_corners((0.2 + wide, -1.0), (-0.24 - wide, -1.0), (0.0, 0.0), 0.6)
+    return rk.blocks.AsymmetricBlock.from_corners((0.2 + wide, -1.0), (-0.24 - wide, -1.0), (0.0, 0.0), 0.6)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_half_a_turn_is_a_mirror(found):
 
     def other(azimuth):
         wide = 0.06 * np.cos(2 * (azimuth - 0.3))
-        return rk.AsymmetricBlock.from_corners((0.24 + wide, -1.0), (-0.2 - wide, -1.0), (0.0, 0.0), 0.6)
+        return rk.blocks.AsymmetricBlock.from_corners((0.24 + wide, -1.0), (-0.2 - wide, -1.0), (0.0, 0.0), 0.6)
 
     mirrored = rk.studies.azimuth_outcomes(other, PAIR, AZIMUTH[:3] + np.pi, SCALE, orientation=0.2, **QUICK)
     np.testing.assert_allclose(mirrored.margin, found.margin[:3], rtol=1e-6)

@@ -147,7 +147,7 @@ def test_names_in_any_order():
 
 @pytest.mark.slow
 def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
-    make = lambda alpha, p: rk.AsymmetricBlock(alpha, 1.3 * alpha, p)
+    make = lambda alpha, p: rk.blocks.AsymmetricBlock(alpha, 1.3 * alpha, p)
     ways = np.where(np.random.default_rng(2).random(12) < 0.5, 1, -1)
     fell = [bool(rk.outcome(make(TRUE[k], P), int(way) * motions()[k]).overturned) for k, way in enumerate(ways)]
     unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}

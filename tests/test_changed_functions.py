@@ -162,7 +162,7 @@ def pulse(size, amplitude, duration):
 
 def of_model(answer):
     def entry(function):
-        model = rk.Equation(sine, None, function)
+        model = rk.models.Equation(sine, None, function)
         return lambda: answer(model)
 
     return entry, dissipation
@@ -319,7 +319,9 @@ def test_precision_is_that_of_the_scene(dtype):
         return 0.3
 
     block = rk.Block(*(jnp.asarray(x, dtype) for x in (0.2, 2.0)))
-    model = current_model(rk.Equation(restoring), block, rk.SinePulse(jnp.asarray(0.3, dtype), jnp.asarray(1.0, dtype)))
+    model = current_model(
+        rk.models.Equation(restoring), block, rk.SinePulse(jnp.asarray(0.3, dtype), jnp.asarray(1.0, dtype))
+    )
     assert seen == [(dtype,) * 4 + (False,)]
     assert jax.eval_shape(lambda b: model.moments(b).threshold, block).dtype == dtype
     assert len(seen) == 1
@@ -327,7 +329,7 @@ def test_precision_is_that_of_the_scene(dtype):
 
 @pytest.mark.parametrize("block", [rk.Block(0.2, 2.0), rk.Block(0.2, 2.0, 0.7), AsymmetricBlock(0.2, 0.3, 2.0)])
 def test_functions_see_every_kind_of_block(block):
-    model = rk.Equation(lambda x, b: jnp.sin(b.alpha - x) * b.p / b.restitution)
+    model = rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x) * b.p / b.restitution)
     found = current_model(model, block)
     for side in block.sides if isinstance(block, AsymmetricBlock) else (block,):
         expected = np.sin(np.asarray(side.alpha)) * np.asarray(side.p) / np.asarray(side.restitution)
@@ -340,7 +342,7 @@ def test_a_model_that_holds_an_equation():
     """Functions are found wherever they are in a model, and models without any are left alone."""
 
     class Stiffer(rk.models.AbstractEquation):
-        inner: rk.Equation
+        inner: rk.models.Equation
 
         def moments(self, block):
             return self.inner.moments(block).times(2.0)
@@ -349,7 +351,7 @@ def test_a_model_that_holds_an_equation():
         def is_series(self):
             return False
 
-    model = current_model(Stiffer(rk.Equation(sine)), BLOCK)
+    model = current_model(Stiffer(rk.models.Equation(sine)), BLOCK)
     assert isinstance(model.inner._acceleration, UserFunction)
     assert current_model(model, BLOCK) is model
     assert current_model(rk.Housner(), BLOCK) == rk.Housner()
@@ -400,7 +402,11 @@ FACTORS = jnp.array([0.5, 1.6])
 HELD = {
     "series": ({"model": Softer(FACTORS), "engine": SHORT["engine"], "progress": False}, SHORT, 1e-9),
     "functions": (
-        {"model": rk.Equation(acceleration=SofterMoment(FACTORS)), "engine": rk.Diffrax(rtol=1e-7), "progress": False},
+        {
+            "model": rk.models.Equation(acceleration=SofterMoment(FACTORS)),
+            "engine": rk.Diffrax(rtol=1e-7),
+            "progress": False,
+        },
         {"progress": False},
         1e-4,
     ),

@@ -76,7 +76,7 @@ def test_labels_are_the_names_of_records(grid, tmp_path):
     assert grid.to_xarray().margin.sel(motion="of 310", scale=SCALES[3]) == grid.values.margin[2, 3]
     for kind in ("nc", "zarr"):
         grid.save(tmp_path / f"found.{kind}")
-        again = rk.Grid.load(tmp_path / f"found.{kind}")
+        again = rk.studies.Grid.load(tmp_path / f"found.{kind}")
         assert list(again.axes["motion"]) == names
         np.testing.assert_array_equal(again.values.margin, grid.values.margin)
 

@@ -59,7 +59,7 @@ def store(finished, tmp_path):
 
 @pytest.fixture(scope="module")
 def grid():
-    return rk.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
+    return rk.studies.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
 
 
 # Damaged files.
@@ -105,14 +105,14 @@ def test_what_is_damaged_is_named_and_computed_again(store, right, file, how):
     named = str(store / file.removesuffix("/c/0"))
     if how is vanish and file in RECORDS:  # as if it had never been computed
         with pytest.raises(ValueError, match="is not finished: 4 of 5 blocks"):
-            rk.Grid.load(store)
+            rk.studies.Grid.load(store)
         assert run(store).resumed == 350
     else:
         with pytest.raises(ValueError, match=f"is damaged: .*{named}"):
-            rk.Grid.load(store)
+            rk.studies.Grid.load(store)
         with pytest.warns(UserWarning, match=f"is damaged: .*{named}.* is computed again"):
             run(store, load=False)
-    assert damage.bits(rk.Grid.load(store)) == right
+    assert damage.bits(rk.studies.Grid.load(store)) == right
     assert run(store).resumed == 450
 
 
@@ -128,7 +128,7 @@ def test_one_warning_names_all_that_is_damaged(store, right):
 def test_without_any_description_a_store_is_refused(store):
     flip(store / "zarr.json")
     flip(store / "jaxrock_blocks" / "store.json")
-    for use in (run, rk.Grid.load):
+    for use in (run, rk.studies.Grid.load):
         with pytest.raises(ValueError, match=f"{store} is damaged: nothing can be known of it"):
             use(store)
 
@@ -140,7 +140,7 @@ def test_a_block_of_another_store_is_not_taken(store, tmp_path):
     for file in ("sine/c/1/0", "above/c/1/0", "count/c/1/0", "pair/c/1/0/0", "jaxrock_blocks/c/1/0/0/0"):
         shutil.copy(other / file, store / file)
     with pytest.raises(ValueError, match="is damaged"):
-        rk.Grid.load(store)
+        rk.studies.Grid.load(store)
 
 
 def test_what_was_not_computed_is_no_result_to_other_readers_either(store):
@@ -161,21 +161,21 @@ def test_blocks_without_any_number_are_told_from_none(tmp_path):
     assert damage.bits(grids[0]) == damage.bits(grids[1]) and grids[1].resumed == 3
     (tmp_path / "a.zarr/value/c/1").unlink()
     with pytest.raises(ValueError, match="value/c/1"):
-        rk.Grid.load(tmp_path / "a.zarr")
+        rk.studies.Grid.load(tmp_path / "a.zarr")
 
 
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])
 def test_files_that_nobody_saved_are_refused(tmp_path, ending):
     path = tmp_path / f"a{ending}"
     with pytest.raises(FileNotFoundError, match=str(path)):
-        rk.Grid.load(path)
+        rk.studies.Grid.load(path)
     data = xarray.Dataset({"x": ("k", np.arange(3.0))}, {"k": np.arange(3.0)}, {"layout": "outer"})
     if ending == ".nc":
         data.to_netcdf(path, engine="h5netcdf")
     else:
         data.to_zarr(path, consolidated=False)
     with pytest.raises(ValueError, match=f"{path}"):
-        rk.Grid.load(path)
+        rk.studies.Grid.load(path)
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(840, marks=pytest.mark.slow)])
@@ -200,7 +200,7 @@ SAVES = """
 import os, resource, sys
 import numpy as np
 import jaxrock as rk
-grid = rk.Grid({"k": np.arange(12000.0)}, {f"r{n}": np.arange(12000.0) + n for n in range(5)})
+grid = rk.studies.Grid({"k": np.arange(12000.0)}, {f"r{n}": np.arange(12000.0) + n for n in range(5)})
 for ending in (".zarr", ".nc"):
     folder = os.path.join(sys.argv[1], "of " + ending[1:])
     os.mkdir(folder)
@@ -220,7 +220,7 @@ for ending in (".zarr", ".nc"):
             resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
         assert os.listdir(folder) == ["a" + ending + ".whole"], os.listdir(folder)
     grid.save(path)
-    again = rk.Grid.load(path)
+    again = rk.studies.Grid.load(path)
     assert all((again.values[name] == grid.values[name]).all() for name in grid.values)
     print("alive after", ending, flush=True)
 """
@@ -329,7 +329,7 @@ def test_an_interrupted_save_leaves_nothing(tmp_path, grid, ending):
     takes, path = seconds(lambda: grid.save(tmp_path / f"whole{ending}")), tmp_path / f"a{ending}"
     for _ in often_interrupted(lambda: grid.save(path), takes, wanted=4, seed=2):
         if path.exists():
-            assert damage.bits(rk.Grid.load(path)) == damage.bits(grid)
+            assert damage.bits(rk.studies.Grid.load(path)) == damage.bits(grid)
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         assert [other.name for other in tmp_path.iterdir()] == [f"whole{ending}"]
 
@@ -346,7 +346,7 @@ SAVING = """
 import itertools, sys
 import numpy as np
 import jaxrock as rk
-grid = rk.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
+grid = rk.studies.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
 for number in itertools.count():
     for ending in (".nc", ".zarr"):
         grid.save(f"{sys.argv[1]}/{number}{ending}")
@@ -365,7 +365,7 @@ def test_a_killed_save_leaves_all_or_nothing(tmp_path, grid):
         finally:
             process.kill()
     there = [path for path in tmp_path.iterdir() if not path.name.endswith(".partial")]
-    assert len(there) >= 4 and all(damage.bits(rk.Grid.load(path)) == damage.bits(grid) for path in there)
+    assert len(there) >= 4 and all(damage.bits(rk.studies.Grid.load(path)) == damage.bits(grid) for path in there)
 
 
 # Two writers, and threads.
@@ -449,7 +449,7 @@ def test_other_versions_do_not_go_on(store, monkeypatch, part, change):
         monkeypatch.setattr(name + "code", lambda: "other code")
     with pytest.raises(ValueError, match=f"{store} was made by another sweep: other {part}. Take"):
         run(store)
-    assert rk.Grid.load(store).shape == (9, 50)
+    assert rk.studies.Grid.load(store).shape == (9, 50)
 
 
 @pytest.mark.parametrize(
@@ -458,7 +458,7 @@ def test_other_versions_do_not_go_on(store, monkeypatch, part, change):
 )
 def test_object_stores_are_refused_by_name(path, grid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for argument, use in (("store", run), ("path", grid.save), ("path", rk.Grid.load)):
+    for argument, use in (("store", run), ("path", grid.save), ("path", rk.studies.Grid.load)):
         with pytest.raises(ValueError, match=f"Argument `{argument}` must be a path of a file system, but is '.*a"):
             use(path)
     assert not list(tmp_path.iterdir())
@@ -496,7 +496,7 @@ def test_names_that_are_no_names_of_their_own_are_refused(tmp_path, results, mes
     with pytest.raises(ValueError, match=message):
         rk.sweep(lambda x: jax.tree.map(lambda value: value * x, results), x=[1.0, 2.0], **side_by_side)
     values = jax.tree.map(lambda value: np.broadcast_to(value, (2, *np.shape(value))), results)
-    grid = rk.Grid({"x": np.arange(2.0)}, values, False)
+    grid = rk.studies.Grid({"x": np.arange(2.0)}, values, False)
     for use in (grid.to_xarray, lambda: grid.save(tmp_path / "a.nc"), lambda: grid.save(tmp_path / "a.zarr")):
         with pytest.raises(ValueError, match=message):
             use()
@@ -506,9 +506,9 @@ def test_names_that_are_no_names_of_their_own_are_refused(tmp_path, results, mes
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])
 def test_other_names_come_back(tmp_path, ending):
     values = {"Sa(0.5 s)": np.arange(2.0), "α": {"β": np.arange(2)}, "a.b": np.array([True, False])}
-    grid = rk.Grid({"x y": np.arange(2.0)}, values)
+    grid = rk.studies.Grid({"x y": np.arange(2.0)}, values)
     grid.save(tmp_path / f"a{ending}")
-    again = rk.Grid.load(tmp_path / f"a{ending}")
+    again = rk.studies.Grid.load(tmp_path / f"a{ending}")
     assert set(again.values) == {"Sa(0.5 s)", "α.β", "a.b"} and damage.bits(again) == damage.bits(grid)
 
 
@@ -516,7 +516,7 @@ def test_other_names_come_back(tmp_path, ending):
 def test_what_a_format_does_not_take_is_refused(tmp_path, ending, bad):
     for value in bad:
         with pytest.raises(ValueError, match="'?`?odd'?`?"):
-            rk.Grid({"x": np.arange(2.0)}, {"odd": np.array([value, value])}).save(tmp_path / f"a{ending}")
+            rk.studies.Grid({"x": np.arange(2.0)}, {"odd": np.array([value, value])}).save(tmp_path / f"a{ending}")
     assert not list(tmp_path.iterdir())
 
 
@@ -526,7 +526,7 @@ def test_a_description_is_told_from_one_that_was_changed(store):
     text["attributes"]["jaxrock_store"] = text["attributes"]["jaxrock_store"].replace('"block": [2', '"block": [3')
     (store / "zarr.json").write_text(json.dumps(text))
     with pytest.raises(ValueError, match=f"is damaged: {store / 'zarr.json'}"):
-        rk.Grid.load(store)
+        rk.studies.Grid.load(store)
 
 
 def test_the_table_of_promises_names_tests_that_are_there():

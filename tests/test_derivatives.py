@@ -282,7 +282,7 @@ def bisected(function, lower, upper):
 
 
 def test_an_overturned_block_has_no_peak_to_differentiate():
-    found = rk.sensitivity(rk.Block(0.2, 2.0), rk.ExponentialPulse(0.6, 0.8, -1.0), rk.Linear())
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.ExponentialPulse(0.6, 0.8, -1.0), rk.Linear())
     assert bool(found.outcome.overturned) and not bool(found.valid)
     assert np.all(np.isnan(found.max_rotation.elasticity)) and np.all(np.isfinite(found.margin.derivative))
     assert found.max_rotation.status == rk.studies.SlopeStatus.missing and np.isnan(found.max_rotation.reach)
@@ -338,7 +338,7 @@ def test_an_impact_at_the_end_of_the_motion():
 def test_sensitivity_of_a_scene():
     """Elasticities obey similarity, agree with the outcome's derivatives, and vanish with nothing to depend on."""
     pulse = rk.ExponentialPulse(0.3, 0.8, -1.0)
-    found = rk.sensitivity(rk.Block(0.2, 2.0), pulse, rk.Linear())
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), pulse, rk.Linear())
     assert bool(found.valid)
     named = dict(zip(found.names, np.asarray(found.max_rotation.elasticity)))
     assert found.names == ("alpha", "p", "restitution", "amplitude", "duration", "shape", "uplift_strength")
@@ -386,7 +386,7 @@ def moved(found, motion, changes):
 def test_distances_tell_how_far_is_too_far():
     """Moving the parameters by the distance to the boundary, along the steepest way, leads close to it."""
     block, motion, _ = USES["a wave"]
-    found = rk.sensitivity(block, motion, rk.Linear())
+    found = rk.studies.sensitivity(block, motion, rk.Linear())
     way = np.asarray(found.margin.elasticity)[:-1]
     there = moved(found, motion, -float(found.boundary_distance) * way / np.linalg.norm(way))
     assert 0 < float(found.boundary_distance) < 0.05
@@ -399,7 +399,7 @@ def test_whether_a_slope_can_be_followed(case):
     """Steps along the steepest way: a thousandth of the reach does what the slopes say, within a hundredth of it; and
     where they are useless, steps of 1e-6 do something else altogether."""
     block, motion, status = USES[case]
-    found = rk.sensitivity(block, motion, rk.Linear())
+    found = rk.studies.sensitivity(block, motion, rk.Linear())
     assert found.outcome.status == rk.Status.successful and not bool(found.outcome.overturned)
     assert found.margin.status == getattr(rk.studies.SlopeStatus, status)
     way = np.asarray(found.margin.elasticity)[:-1]
@@ -420,7 +420,7 @@ def test_whether_a_slope_can_be_followed(case):
 @pytest.mark.slow
 def test_sensitivity_map():
     found = rk.studies.sensitivity_map([0.7, 0.9], [0.5, 1.0, 1.5], -1.0, model=rk.Linear(), restitution=0.9)
-    single = rk.sensitivity(rk.Block(0.2, 1.0, 0.9), rk.ExponentialPulse(0.2 / 0.9, 1.0, -1.0), rk.Linear())
+    single = rk.studies.sensitivity(rk.Block(0.2, 1.0, 0.9), rk.ExponentialPulse(0.2 / 0.9, 1.0, -1.0), rk.Linear())
     assert found.sensitivity.max_rotation.elasticity.shape == (2, 3, 7)
     np.testing.assert_allclose(
         found.sensitivity.max_rotation.elasticity[1, 1], single.max_rotation.elasticity, rtol=1e-9, atol=1e-12

@@ -26,7 +26,7 @@ folder, kind = sys.argv[4:6]
 import jaxrock as rk
 if count > 1:
     jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
-rk.use_cpu_devices(1 + own % 2)
+rk.studies.use_cpu_devices(1 + own % 2)
 import jax.numpy as jnp
 import numpy as np
 from jaxrock.sweeps.store import Store

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import tomllib
 import types
 from pathlib import Path
 
@@ -15,6 +16,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 # Recipes are tried by tests/test_log_density.py, many processes by tests/test_distributed.py, examples below.
 ELSEWHERE = {"docs/inverse.md", "docs/how_to/cluster.md", "docs/examples.md"}
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def snippets(page):
@@ -57,6 +59,17 @@ def test_what_is_said_of_others_runs_where_they_are(other):
     exec(compile(ours[0] + theirs, other, "exec"), {"__name__": "__main__"})
 
 
+def test_the_readme_of_an_index_points_to_nothing_that_is_not_there():
+    """An index shows it without the files beside it; the package is built with these replacements."""
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
+    shown = whole = (ROOT / "README.md").read_text()
+    for each in hook["fancy-pypi-readme"]["substitutions"]:
+        shown = re.sub(each["pattern"], each["replacement"], shown)
+    assert set(LINK.findall(whole)) and not [link for link in LINK.findall(shown) if "://" not in link]
+    for table in ("What there is", "How fast, how right"):
+        assert f"## {table}\n\n" in shown
+
+
 def anchors(text):
     """Names of the headings of a page, as readers of Markdown make them."""
     told = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
@@ -67,7 +80,7 @@ def anchors(text):
 @pytest.mark.parametrize("page", PAGES)
 def test_every_link_of_a_page_leads_somewhere(page):
     text = (ROOT / page).read_text()
-    for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)):
+    for link in LINK.findall(re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)):
         if link.startswith("http"):
             continue
         path, _, anchor = link.partition("#")

@@ -12,8 +12,8 @@ import jaxrock as rk
 from jaxrock.plot.bodies import Body
 
 BLOCK = rk.Block.from_dimensions(0.6, 1.8)
-ROCK = rk.AsymmetricBlock.from_corners([0.3, 0.0], [-0.2, 0.0], [0.0, 0.9], 0.5)
-COLUMN = rk.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, masses=4)
+ROCK = rk.blocks.AsymmetricBlock.from_corners([0.3, 0.0], [-0.2, 0.0], [0.0, 0.9], 0.5)
+COLUMN = rk.blocks.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, masses=4)
 
 
 @pytest.fixture(autouse=True)

@@ -29,7 +29,7 @@ STRONG = rk.SinePulse(5.2974 / 9.81, 1.6)  # Diamantopoulos & Fragiadakis, figur
 
 def beside_scipy(shape, motion, duration, **more):
     """Largest differences of rotation and top over their peaks, and of impacts [s]."""
-    block = rk.FlexibleBlock(**shape, **more)
+    block = rk.blocks.FlexibleBlock(**shape, **more)
     found = rk.simulate(block, motion, duration=duration, samples=SAMPLES)
     assert found.status == rk.Status.successful
     chain = Chain(block, motion)
@@ -61,7 +61,7 @@ def test_every_law_against_an_independent_chain(masses, base, rotations, p_delta
 
 def drift(masses, duration, **more):
     """By how much the energy varies after the pulse, over its mean, without damping and loss at impacts."""
-    block = rk.FlexibleBlock(**SHORT, damping_ratio=0.0, masses=masses, restitution=1.0, **more)
+    block = rk.blocks.FlexibleBlock(**SHORT, damping_ratio=0.0, masses=masses, restitution=1.0, **more)
     motion = rk.SinePulse(0.3, 1.0)
     found = rk.simulate(block, motion, duration=duration, samples=SAMPLES)
     assert found.status == rk.Status.successful and found.impact_count > 0
@@ -82,7 +82,7 @@ def test_energy_is_conserved_with_every_law(base, rotations):
 
 def peaks(modulus, base, p_delta):
     """Peak of a stiff column of three masses over the rigid column's on the same spring, less 1."""
-    block = rk.FlexibleBlock(
+    block = rk.blocks.FlexibleBlock(
         5.0, 25.0, modulus, 2500.0, 0.01, 3, base=base, rotations="finite", p_delta=p_delta, restitution=0.9
     )
     rigid = rk.outcome(rk.Block(block.alpha, block.p, 0.9), STRONG, model=rk.Spring("mmSM", base, masses=3))
@@ -104,7 +104,7 @@ def test_the_rigid_limit(base, p_delta):
 @pytest.mark.parametrize("damping", [0.0, 0.01])
 def test_what_is_linear_stays_so(base, damping):
     """The same steps with nothing beside the linear phase: the linear block's own answer."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=damping, base=base)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=damping, base=base)
     scene = NonlinearScene.of(block, PULSE, jnp.asarray(20.0))
 
     @jax.jit
@@ -125,7 +125,7 @@ def test_small_rotations_are_a_limit():
         shape = dict(width=50 * alpha, height=50.0, youngs_modulus=30e9 * (0.1 / alpha) ** 2, density=2500.0)
         pulse = rk.SinePulse(5 * alpha, 1.6)
         small, finite = (
-            rk.outcome(rk.FlexibleBlock(**shape, damping_ratio=0.01, rotations=kind), pulse, duration=5.0)
+            rk.outcome(rk.blocks.FlexibleBlock(**shape, damping_ratio=0.01, rotations=kind), pulse, duration=5.0)
             for kind in ("small", "finite")
         )
         off.append(float(finite.max_rotation / small.max_rotation) - 1)
@@ -138,7 +138,7 @@ def test_small_rotations_are_a_limit():
 @pytest.mark.parametrize("base", ["sine", pytest.param("plastic", marks=pytest.mark.slow)])
 def test_the_balance_is_a_saddle_of_the_energy(base):
     """No force there; one way down, at the rate of the growing mode; the others up."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0, masses=4, base=base, rotations="finite", p_delta=True)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0, masses=4, base=base, rotations="finite", p_delta=True)
 
     @jax.jit
     def found(block):
@@ -179,7 +179,7 @@ def by_amplitude():
 
     def one(amplitude):
         def numbers(a):
-            block = rk.FlexibleBlock(**TALL, damping_ratio=0.01, masses=3, **WHOLE)
+            block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01, masses=3, **WHOLE)
             found = rk.outcome(block, rk.SinePulse(a, 1.6), duration=20.0)
             return (found.max_rotation, found.margin), found
 
@@ -209,7 +209,7 @@ def test_derivatives_and_differences(by_amplitude):
     @jax.jit
     @jax.vmap
     def peak_of(x):
-        block = rk.FlexibleBlock(5.0, 50.0, 30e9 * x[0], 2500.0, 0.01 * x[1], 3, **WHOLE)
+        block = rk.blocks.FlexibleBlock(5.0, 50.0, 30e9 * x[0], 2500.0, 0.01 * x[1], 3, **WHOLE)
         return rk.outcome(block, PULSE, duration=8.0).max_rotation
 
     x = np.ones(2)
@@ -222,7 +222,10 @@ def test_derivatives_and_differences(by_amplitude):
 def test_numbers_of_single_precision_among_others(law):
     """All is computed in the usual precision, whatever was given: steps keep it."""
     shape = {name: np.float32(value) for name, value in TALL.items()}
-    block, pulse = rk.FlexibleBlock(**shape, damping_ratio=0.01, masses=2, **law), rk.SinePulse(np.float32(0.5), 1.6)
+    block, pulse = (
+        rk.blocks.FlexibleBlock(**shape, damping_ratio=0.01, masses=2, **law),
+        rk.SinePulse(np.float32(0.5), 1.6),
+    )
 
     def step(block, pulse, stop):
         scene = scene_of(block, pulse, stop)
@@ -237,7 +240,7 @@ def test_numbers_of_single_precision_among_others(law):
 
 def test_single_precision_is_refused():
     """Which would be wrong in the third digit, and not say so."""
-    block = f"rk.FlexibleBlock(**{TALL}, damping_ratio=0.01, masses=2, **{WHOLE})"
+    block = f"rk.blocks.FlexibleBlock(**{TALL}, damping_ratio=0.01, masses=2, **{WHOLE})"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", f"import jaxrock as rk; rk.outcome({block}, rk.SinePulse(0.5, 1.6))"],
         cwd=Path(rk.__file__).parents[1],
@@ -260,4 +263,4 @@ def test_single_precision_is_refused():
 )
 def test_wrong_arguments(change, message):
     with pytest.raises(ValueError, match=message):
-        rk.FlexibleBlock(**(TALL | dict(damping_ratio=0.01) | change))
+        rk.blocks.FlexibleBlock(**(TALL | dict(damping_ratio=0.01) | change))

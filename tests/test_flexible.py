@@ -29,11 +29,11 @@ def test_the_unit_column_is_a_cantilever(masses):
 
 def test_first_period():
     """12.38 sqrt(density/modulus) h/tan(alpha); the column of masses is 2R long and tends to its own continuum."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0)
     assert block.first_period == pytest.approx(12.38 * np.sqrt(2500 / 30e9) * 25 / 0.1, rel=2e-4)
     lengthened = block.first_period * (block.length / 50) ** 1.5
     errors = [
-        2 * np.pi / rk.FlexibleBlock(**TALL, damping_ratio=0.0, masses=n).frequencies[0] / lengthened - 1
+        2 * np.pi / rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0, masses=n).frequencies[0] / lengthened - 1
         for n in (6, 11, 21)
     ]
     assert errors[0] == pytest.approx(0.0185, abs=2e-3)
@@ -47,7 +47,7 @@ phases = jax.jit(lambda numbers: (locked_phase(numbers), rocking_phase(numbers))
 @pytest.mark.parametrize("damping", ["stiffness", "modal", "rayleigh"])
 def test_modes_span_the_motion_and_solve_the_equations(damping):
     """project undoes modes; each rocking mode satisfies the equations of column and base."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.02, damping=damping)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.02, damping=damping)
     numbers = jax.device_get(numbers_of(block))
     locked, (rocking, whole) = jax.device_get(phases(numbers))
     n = numbers.rotation.size
@@ -90,7 +90,7 @@ def test_peaks_and_impacts(case):
     """Peaks of the source are those of 8001 samples: never above the true ones, and a little below them."""
     shape, more, peaks, impacts = HISTORIES[case]
     amplitude = 5.2974 / 9.81 if shape is SHORT else 0.5
-    block = rk.FlexibleBlock(**shape, **more)
+    block = rk.blocks.FlexibleBlock(**shape, **more)
     response = rk.simulate(block, rk.SinePulse(amplitude, 1.6), duration=20.0, samples=2)
     assert response.status == rk.Status.successful
     found = response.outcome
@@ -103,7 +103,7 @@ def test_peaks_and_impacts(case):
 @pytest.mark.slow
 def test_against_an_independent_integration():
     """Histories to 1e-6 of the peak (the goal; 1e-8 here, the integrator's own), impacts to 1e-8 s."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.01, masses=4)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01, masses=4)
     response = rk.responses.simulate_flexible(block, PULSE, duration=10.0)
     at, impacts = independent(block, PULSE, 10.0)
     times = np.linspace(0.01, 9.99, 300)
@@ -117,7 +117,7 @@ def test_against_an_independent_integration():
 @pytest.mark.slow
 def test_energy_is_conserved_between_impacts():
     """After the pulse, without damping: to 1e-10 of the whole between impacts; at an impact the kinetic part falls."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0)
     response = rk.responses.simulate_flexible(block, PULSE, duration=20.0, samples=2)
     edges = [1.6, *response.impact_times, 20.0]
     assert len(edges) == 5
@@ -135,7 +135,7 @@ def test_energy_is_conserved_between_impacts():
 @pytest.mark.slow
 def test_the_work_of_the_ground_is_the_gain_of_energy():
     """Under the pulse: energy = - integral of the ground's force times velocity, by Gauss's quadrature."""
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.0)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0)
     response = rk.responses.simulate_flexible(block, PULSE, duration=20.0, samples=2)
     nodes, weights = np.polynomial.legendre.leggauss(40)
     edges = np.linspace(0, 1.6, 9)
@@ -207,7 +207,7 @@ def test_the_rigid_limit(amplitude, duration):
     moduli, pulse = np.array([1e11, 1e12, 1e13, 1e14, 1e15, 1e17]), rk.SinePulse(amplitude, 0.8)
 
     def errors(moduli, damping):
-        blocks = [rk.FlexibleBlock(1.0, 5.0, E, 2500.0, damping) for E in moduli]
+        blocks = [rk.blocks.FlexibleBlock(1.0, 5.0, E, 2500.0, damping) for E in moduli]
         rigid = rigid_peak(blocks[0], amplitude, 0.8)
         found = [rk.responses.outcome_flexible(b, pulse, duration=duration) for b in blocks]
         assert all(f.status == rk.Status.successful for f in found)
@@ -223,7 +223,7 @@ def test_the_rigid_limit(amplitude, duration):
 @pytest.mark.slow
 def test_vibrations_do_not_hide_the_peak():
     """A million turns of the fastest mode within a step: the greatest rotation is found all the same."""
-    block = rk.FlexibleBlock(1.0, 5.0, 1e16, 2500.0, 0.0)
+    block = rk.blocks.FlexibleBlock(1.0, 5.0, 1e16, 2500.0, 0.0)
     found = rk.responses.outcome_flexible(block, rk.SinePulse(0.3, 0.8), duration=1.6)
     assert float(found.max_rotation) == pytest.approx(rigid_peak(block, 0.3, 0.8), rel=1e-7)
     assert found.status == rk.Status.successful
@@ -238,7 +238,7 @@ def by_amplitude():
     margin by the amplitude."""
 
     def margin(modulus, damping, amplitude):
-        block = rk.FlexibleBlock(5.0, 50.0, modulus, 2500.0, damping, 3)
+        block = rk.blocks.FlexibleBlock(5.0, 50.0, modulus, 2500.0, damping, 3)
         found = rk.outcome(block, rk.SinePulse(amplitude, 1.6), duration=20.0)
         return found.margin, found
 
@@ -292,7 +292,7 @@ def test_derivatives_and_finite_differences():
     """By modulus, density, damping and size: forward mode against central differences of the values."""
 
     def peaks(x):
-        block = rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2])
+        block = rk.blocks.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2])
         found = rk.responses.outcome_flexible(block, PULSE, duration=12.0)
         return jnp.stack([found.max_rotation, found.max_displacement, found.max_bending])
 
@@ -310,7 +310,7 @@ def test_derivatives_and_an_independent_integration():
     optimize = pytest.importorskip("scipy.optimize")
 
     def block(x):
-        return rk.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2], masses=3)
+        return rk.blocks.FlexibleBlock(x[3], x[4], 1e9 * x[0], 1e3 * x[1], x[2], masses=3)
 
     def peak(x):
         return rk.outcome(block(x), PULSE, duration=7.0).max_rotation
@@ -337,7 +337,7 @@ def test_a_thousand_blocks_at_once():
 
     def peak(E):
         return rk.responses.outcome_flexible(
-            rk.FlexibleBlock(5.0, 50.0, E, 2500.0, 0.01), PULSE, duration=12.0
+            rk.blocks.FlexibleBlock(5.0, 50.0, E, 2500.0, 0.01), PULSE, duration=12.0
         )  # fmt: skip
 
     found = jax.jit(jax.vmap(peak))(moduli)
@@ -357,12 +357,12 @@ def test_stiff_columns(damping):
     With damping in proportion to stiffness the rates of many modes come close to one number; what rounding does there
     must not make the base chatter.
     """
-    block = rk.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, damping, 20)
+    block = rk.blocks.FlexibleBlock(0.5, 5.0, 300e9, 2500.0, damping, 20)
     response = rk.responses.simulate_flexible(block, rk.SinePulse(0.15, 0.8), duration=1.6, samples=2)
     assert float(block.frequencies[-1]) > 1e5
     assert response.status == rk.Status.successful
     assert int(response.trajectory.nodes.steps.max()) < 200
-    stiffer = rk.FlexibleBlock(0.5, 5.0, 3000e9, 2500.0, damping, 20)
+    stiffer = rk.blocks.FlexibleBlock(0.5, 5.0, 3000e9, 2500.0, damping, 20)
     rigid = rigid_peak(block, 0.15, 0.8)
     off = float(response.max_rotation) / rigid - 1
     assert off == pytest.approx(0, abs=3e-3)
@@ -376,7 +376,7 @@ def test_stiff_columns(damping):
 @pytest.mark.slow
 def test_small_budgets_have_a_status():
     found = rk.responses.outcome_flexible(
-        rk.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1
+        rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.0), PULSE, duration=12.0, max_steps=1
     )
     assert found.status == rk.Status.step_budget_exhausted
 
@@ -396,11 +396,11 @@ def test_small_budgets_have_a_status():
 )
 def test_wrong_arguments(change, message):
     with pytest.raises(ValueError, match=message):
-        rk.FlexibleBlock(**(TALL | dict(damping_ratio=0.01) | change))
+        rk.blocks.FlexibleBlock(**(TALL | dict(damping_ratio=0.01) | change))
 
 
 def test_wrong_durations():
-    block = rk.FlexibleBlock(**TALL, damping_ratio=0.01)
+    block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01)
     with pytest.raises(ValueError, match="`duration` must be positive"):
         rk.responses.simulate_flexible(block, PULSE, duration=0.0)
     with pytest.raises(ValueError, match="`samples` must be a whole number from 2"):
@@ -409,13 +409,13 @@ def test_wrong_durations():
 
 def test_vertical_motions_raise():
     with pytest.raises(ValueError, match="`motion` must not be vertical for a FlexibleBlock"):
-        rk.outcome(rk.FlexibleBlock(**TALL, damping_ratio=0.01), PULSE.with_vertical(PULSE))
+        rk.outcome(rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01), PULSE.with_vertical(PULSE))
 
 
 @pytest.mark.slow
 def test_second_derivatives():
     """Where the greatest rotation is reached moves with the amplitude: differences of values and of slopes."""
-    block = rk.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
+    block = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
 
     def peak(amplitude):
         return rk.outcome(block, rk.SinePulse(amplitude, 0.8)).max_rotation
@@ -430,7 +430,7 @@ def test_second_derivatives():
 def test_compiled_by_the_user():
     """`outcome` and `simulate` know a flexible block within `jax.jit`, too."""
     shape, more, _, _ = HISTORIES["tall, undamped"]
-    scene = lambda width: (rk.FlexibleBlock(**shape | dict(width=width), **more), rk.SinePulse(0.5, 1.6))
+    scene = lambda width: (rk.blocks.FlexibleBlock(**shape | dict(width=width), **more), rk.SinePulse(0.5, 1.6))
 
     @jax.jit
     def found(width):

@@ -56,7 +56,7 @@ def test_free_rocking_without_errors_is_recovered():
     assert found.agreement == 1
     assert found["restitution"] == found.values[2] == float(found.block.restitution)
     assert len(rk.plot.history_fit(found, TIME)) == 2
-    two_sided = eqx.tree_at(lambda fit: fit.block, found, rk.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P))
+    two_sided = eqx.tree_at(lambda fit: fit.block, found, rk.blocks.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P))
     assert len(rk.plot.history_fit(two_sided, TIME)) == 2
     # Mirrored, it is the same block from the other side.
     mirrored = fit(-free_rocking(TIME))

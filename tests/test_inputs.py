@@ -213,18 +213,18 @@ BAD = {
         "2.0",
     ),
     "self-similar, no ratio": (
-        lambda: rk.self_similar_spectrum([], [2.0]),
+        lambda: rk.studies.self_similar_spectrum([], [2.0]),
         "frequency_ratio",
         LIST,
         "shape (0,)",
     ),
     "self-similar, ratio 0": (
-        lambda: rk.self_similar_spectrum([0.0, 1.0], [2.0]),
+        lambda: rk.studies.self_similar_spectrum([0.0, 1.0], [2.0]),
         "frequency_ratio",
         POSITIVE,
         "0.0",
     ),
-    "self-similar, intensity 0": (lambda: rk.self_similar_spectrum([1.0], [0.0]), "intensity", POSITIVE, "0.0"),
+    "self-similar, intensity 0": (lambda: rk.studies.self_similar_spectrum([1.0], [0.0]), "intensity", POSITIVE, "0.0"),
     "map, no ratio": (lambda: rk.overturning_map([], [2.0]), "frequency_ratio", LIST, "shape (0,)"),
     "map, no intensity": (lambda: rk.overturning_map([1.0], []), "intensity", LIST, "shape (0,)"),
     "map, no axis": (lambda: rk.overturning_map([1.0]), "intensity", "be given, or `uplift_strength` in", "neither is"),
@@ -236,7 +236,7 @@ BAD = {
     ),
     "map, strength 0": (lambda: rk.overturning_map([1.0], uplift_strength=[0.0]), "uplift_strength", POSITIVE, "0.0"),
     "map, no duration": (
-        lambda: rk.self_similar_spectrum(pulse_duration=[], intensity=[1.0]),
+        lambda: rk.studies.self_similar_spectrum(pulse_duration=[], intensity=[1.0]),
         "pulse_duration",
         LIST,
         "shape (0,)",
@@ -608,7 +608,7 @@ print(before, len(caught), results[0].max_rotation.dtype)
 
 
 RIGID = 'rk.Block(0.2, 2.0), {"model": rk.Linear(), "engine": rk.Series(order=4)}'
-FLEXIBLE = "rk.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}"
+FLEXIBLE = "rk.blocks.FlexibleBlock(1.0, 5.0, 1e9, 2500.0, 0.02, 2), {}"
 
 
 @functools.cache
@@ -666,7 +666,7 @@ for make, words in (
     (lambda: rk.Series(max_steps=1.5), "Argument `max_steps` must be a whole number from 1 to 1000000000, but is 1.5."),
     (lambda: rk.motions.Suite([1.0]), "Argument `motions` must be a list of motions, but holds 1.0."),
     (lambda: rk.SinePulse(0.3, 0.8).with_vertical(0.1), "Argument `vertical` must be a motion, but is 0.1."),
-    (lambda: rk.Equation("x"), "Argument `restoring` must be a function, but is 'x'."),
+    (lambda: rk.models.Equation("x"), "Argument `restoring` must be a function, but is 'x'."),
     (lambda: rk.Diffrax(solver="x"), "Argument `solver` must be a solver, but is 'x'."),
     (lambda: rk.inverse.Unknown(0.1, 1.0, log="no"), "Argument `log` must be True or False, but is 'no'."),
     (lambda: rk.Block([], 1.0), "Argument `alpha` must hold at least one number, but has shape (0,)."),
@@ -727,7 +727,7 @@ def test_single_precision_among_double():
 
 def test_a_length_of_time_is_no_number():
     with pytest.raises(ValueError, match="Argument `count` must be a whole number"):
-        rk.use_cpu_devices(np.timedelta64(1, "s"))
+        rk.studies.use_cpu_devices(np.timedelta64(1, "s"))
 
 
 def test_a_hazard_curve_is_not_extended_beyond_numbers():

@@ -119,7 +119,7 @@ def test_what_is_a_users_own_has_no_facts():
     class Mine(rk.SinePulse):
         pass
 
-    equation = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
+    equation = rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
     for own in (Mine(0.3, 0.8), equation, lambda x: x, [1.0, object()]):
         assert facts.facts(own) is None
 

@@ -45,7 +45,7 @@ def rounded(radius=3.0, half=0.5, height=1.0, sides=400):
 
 @pytest.mark.parametrize("azimuth, width", [(0.0, WIDTH), (np.pi / 2, DEPTH), (np.pi, WIDTH)])
 def test_a_box_is_a_rectangle(azimuth, width):
-    found = rk.AsymmetricBlock.from_mesh(box(), azimuth)
+    found = rk.blocks.AsymmetricBlock.from_mesh(box(), azimuth)
     plane = rk.Block.from_dimensions(width, HEIGHT)
     for name in ("alpha1", "alpha2"):
         assert float(getattr(found, name)) == pytest.approx(float(plane.alpha), rel=1e-12)
@@ -77,10 +77,10 @@ def test_a_lopsided_prism_is_its_outline():
     outline = np.array([[-0.3, 0.0], [0.2, 0.0], [0.5, 1.5], [-0.2, 1.2]])
     ends = [np.column_stack([outline[:, 0], np.full(4, y), outline[:, 1]]) for y in (0.0, 0.7)]
     mesh = trimesh.convex.convex_hull(np.concatenate(ends))
-    found, plane = rk.AsymmetricBlock.from_mesh(mesh, 0.0), rk.AsymmetricBlock.from_outline(outline)
+    found, plane = rk.blocks.AsymmetricBlock.from_mesh(mesh, 0.0), rk.blocks.AsymmetricBlock.from_outline(outline)
     for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
         assert float(getattr(found, name)) == pytest.approx(float(getattr(plane, name)), rel=1e-9)
-    turned = rk.AsymmetricBlock.from_mesh(mesh, np.pi)
+    turned = rk.blocks.AsymmetricBlock.from_mesh(mesh, np.pi)
     assert float(turned.alpha1) == pytest.approx(float(plane.alpha2), rel=1e-9)
 
 
@@ -88,9 +88,9 @@ def test_a_rounded_base_is_bounded_and_said():
     """It rolls on to its edge: the ground within the tolerance is narrower, and known in closed form."""
     rock = rk.blocks.Rock.from_mesh(rounded(), tolerance=0.005)
     with pytest.warns(UserWarning, match="The base is rounded: the rock rolls on"):
-        narrow = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+        narrow = rk.blocks.AsymmetricBlock.from_mesh(rock, 0.0)
     with pytest.warns(UserWarning, match="The base is rounded"):
-        wide = rk.AsymmetricBlock.from_mesh(rock, 0.0, base="wide")
+        wide = rk.blocks.AsymmetricBlock.from_mesh(rock, 0.0, base="wide")
     assert rock.section(0.0).right[0] == pytest.approx(np.sqrt(3**2 - 2.995**2), rel=0.02)
     edge = [0.5, 3 - np.sqrt(9 - 0.25)]
     np.testing.assert_allclose(rock.section(0.0, "wide").right, edge, rtol=1e-9)
@@ -98,7 +98,7 @@ def test_a_rounded_base_is_bounded_and_said():
     assert float(narrow.alpha1) < 0.5 * float(wide.alpha1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rk.AsymmetricBlock.from_mesh(rock, np.pi / 2)  # along the cylinder it is flat
+        rk.blocks.AsymmetricBlock.from_mesh(rock, np.pi / 2)  # along the cylinder it is flat
 
 
 @pytest.mark.parametrize("rotation", np.linspace(0.0, 0.9, 7))
@@ -147,7 +147,7 @@ def holed():
 )
 def test_what_is_refused(mesh, given, message):
     with pytest.raises(OSError if message is None else ValueError, match=message):
-        rk.AsymmetricBlock.from_mesh(mesh, 0.0, **given)
+        rk.blocks.AsymmetricBlock.from_mesh(mesh, 0.0, **given)
 
 
 # ------------------------------------------------------------------------------------------------ cuts by a plane
@@ -206,9 +206,11 @@ def test_a_cut_block_beside_its_outline():
     outline = np.array([[-0.3, 0.0], [0.2, 0.0], [0.5, 1.5], [-0.2, 1.2]])
     ends = [np.column_stack([outline[:, 0], np.full(4, y), outline[:, 1]]) for y in (0.0, 0.7)]
     mesh = trimesh.convex.convex_hull(np.concatenate(ends))
-    found = [rk.AsymmetricBlock.from_mesh(mesh, 0.0, plane=plane) for plane in ("cut", "projection")]
+    found = [rk.blocks.AsymmetricBlock.from_mesh(mesh, 0.0, plane=plane) for plane in ("cut", "projection")]
     for name in ("alpha1", "alpha2", "p1", "p2", "restitution1", "restitution2"):
-        cut, projected, plane = (float(getattr(x, name)) for x in (*found, rk.AsymmetricBlock.from_outline(outline)))
+        cut, projected, plane = (
+            float(getattr(x, name)) for x in (*found, rk.blocks.AsymmetricBlock.from_outline(outline))
+        )
         assert cut == pytest.approx(plane, rel=1e-9) and projected == pytest.approx(plane, rel=1e-9)
 
 

@@ -606,7 +606,7 @@ class Damper(eqx.Module):
 
 
 def damped(a, u):
-    model = rk.Equation(
+    model = rk.models.Equation(
         restoring=lambda opening, block: jnp.sin(block.alpha - opening),
         arm=lambda opening, block: jnp.cos(block.alpha - opening),
         dissipation=Damper(0.2),
@@ -624,7 +624,7 @@ SCENES = {
     "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
     "derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin, (0, 1)),
     "two sides, exponential": lambda a, u: (
-        rk.outcome(rk.AsymmetricBlock(a, 1.3 * a, 2.0), rk.ExponentialPulse(u, 1.0, u), **SHORT_SERIES).margin
+        rk.outcome(rk.blocks.AsymmetricBlock(a, 1.3 * a, 2.0), rk.ExponentialPulse(u, 1.0, u), **SHORT_SERIES).margin
     ),
     "a scaled record": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin,
     "its derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin, (0, 1)),
@@ -634,7 +634,7 @@ SCENES = {
     "vertical records": lambda a, u: rk.outcome(rk.Block(a, 2.0), (u * SHORT).with_vertical(0.3 * SHORT)).margin,
     "two sides, vertical": lambda a, u: (
         rk.outcome(
-            rk.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3)), **SHORT_SERIES
+            rk.blocks.AsymmetricBlock(a, 0.25, 2.0), PULSE.with_vertical(rk.SinePulse(0.1 * u, 0.3)), **SHORT_SERIES
         ).margin
     ),
     "spring": lambda a, u: (

@@ -142,7 +142,7 @@ def test_gliding_blocks_are_as_few(case):
     def one(alpha, p, restitution, scale, tilt, speed):
         block = rk.Block(alpha, p, restitution)
         if "asymmetric" in case:
-            block = rk.AsymmetricBlock(alpha, 1.2 * alpha, p, restitution=(restitution, 0.9 * restitution))
+            block = rk.blocks.AsymmetricBlock(alpha, 1.2 * alpha, p, restitution=(restitution, 0.9 * restitution))
         return rk.outcome(block, scale * motion, model, initial=(tilt, speed))
 
     points = alpha, p, np.minimum(restitution, 0.95), random.uniform(0.1, 1.5, 200), tilt, 0.3 * tilt * p

@@ -124,7 +124,7 @@ def under_the_pulse(law):
     """Impacts and peak of a history, the impacts' velocities and what friction they need."""
     block = rk.Block(0.2, 2.0, law)
     found = rk.simulate(block, PULSE, duration=2.8, engine=SHORT, samples=2)
-    friction = rk.contact_forces(found, block).friction_at_impact
+    friction = rk.responses.contact_forces(found, block).friction_at_impact
     return found.impact_count, found.max_rotation, found.impact_velocities, friction
 
 
@@ -213,7 +213,7 @@ def test_sensitivities_name_its_parameters():
 @pytest.mark.slow
 def test_sensitivities_by_its_parameters():
     """As derivatives of the peak."""
-    found = rk.sensitivity(rk.Block(0.2, 2.0, SOFT), PULSE)
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0, SOFT), PULSE)
     slopes = dict(zip(found.names, np.asarray(found.max_rotation.derivative)))
 
     def peak(gentle):
@@ -251,12 +251,12 @@ def test_the_laws_of_momentum():
     general, housner = jax.jit(lambda corners: [law.ratio(corners, jnp.zeros(9)) for law in laws])(corners)
     np.testing.assert_allclose(general, housner, atol=1e-15)
     np.testing.assert_allclose(housner, 1 - 1.5 * np.sin(alpha) ** 2, atol=1e-15)
-    both = rk.AsymmetricBlock(0.2, 0.2, 2.0)
+    both = rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0)
     np.testing.assert_allclose([both.restitution1, both.restitution2], rk.Block(0.2, 2.0).restitution, rtol=1e-15)
 
 
 def test_a_pair_and_its_mirror():
-    block = rk.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.9, 0.8))
+    block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0, restitution=(0.9, 0.8))
     assert (float(block.restitution1), float(block.restitution2)) == (0.9, 0.8)
     assert float(block.mirrored.restitution1) == 0.8
     one = rk.outcome(block, rk.SinePulse(0.6, 1.0), engine=SHORT)
@@ -266,7 +266,7 @@ def test_a_pair_and_its_mirror():
 
 def test_a_rock_with_a_law():
     """An asymmetric block whose sides are alike is a block."""
-    one = rk.outcome(rk.AsymmetricBlock(0.2, 0.2, 2.0, restitution=SOFT), PULSE, engine=SHORT)
+    one = rk.outcome(rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=SOFT), PULSE, engine=SHORT)
     other = rk.outcome(rk.Block(0.2, 2.0, SOFT), PULSE, engine=SHORT)
     for a, b in zip(outcomes(one), outcomes(other)):
         np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -322,7 +322,7 @@ class Base(rk.models.AbstractEquation):
 def test_a_stiff_column_rocks_as_the_rigid_block_on_its_base(law, base):
     """The base's speed sets the ratio, and its law the moment: as the series engine has it of the rigid block."""
     motion = rk.SinePulse(0.3, 0.8)
-    column = rk.FlexibleBlock(5.0, 25.0, 1e18, 2500.0, 0.01, restitution=law, base=base)
+    column = rk.blocks.FlexibleBlock(5.0, 25.0, 1e18, 2500.0, 0.01, restitution=law, base=base)
     found = rk.responses.outcome_flexible(column, motion, duration=6.0)
     p = float(column.p) / np.sqrt(1 + 1 / (2 * 5**2))  # the lumped masses' moment of inertia
     rigid = rk.simulate(

@@ -11,20 +11,20 @@ from pathlib import Path
 import pytest
 
 ASKED = {
-    "sensitivity": "rk.sensitivity(column, pulse)",
+    "sensitivity": "rk.studies.sensitivity(column, pulse)",
     "critical amplitudes": "rk.critical_amplitudes(column, pulse)",
     "critical durations": "rk.studies.critical_durations(column, pulse)",
     "fragility": "rk.hazard.simulated_fragility(column, [pulse], [0.1, 0.2])",
     "fragility surface": "rk.hazard.simulated_surface(column, [pulse], [0.1, 0.2], [0.5, 1.0])",
     "random blocks": "rk.blocks.draw_blocks(column, 3, alpha=0.1)",
-    "contact forces": "rk.contact_forces(response, column)",
+    "contact forces": "rk.responses.contact_forces(response, column)",
     "phase plane": "rk.plot.phase(response)",
 }
 SCRIPT = """
 import matplotlib
 matplotlib.use("Agg")
 import jaxrock as rk
-column = rk.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, masses=2)
+column = rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, masses=2)
 pulse = rk.SinePulse(0.5, 1.6)
 response = object.__new__(rk.responses.FlexibleResponse)
 for words in {words!r}:

@@ -141,7 +141,7 @@ def test_beside_newton(alpha, radius, dip):
     until = 0.8
     wheel = Wheel(alpha, p, 0.75, radius, 0.9)
     response = rk.simulate(block, motion, rk.models.Rolling(radius), initial=(0.08, 0.1), duration=until, **EXACT)
-    contact = rk.contact_forces(response, block)
+    contact = rk.responses.contact_forces(response, block)
     push = lambda t: 0.35 * np.sin(2 * np.pi * t / 0.9)
     times = np.asarray(response.time)[:-1]
     found, fell = by_newton([wheel, wheel], push, DIPS[dip], (0.08, 0.1), times, until)
@@ -181,7 +181,7 @@ def test_long_rocking_is_decided():
 @pytest.mark.slow
 def test_sides_of_their_own():
     """Different edges, slenderness and size on either side."""
-    block = rk.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, restitution=(0.9, 0.85))
+    block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, restitution=(0.9, 0.85))
     model = rk.models.Rolling(0.4, 0.1)
     wheels = [
         Wheel(0.2, 2.5, 0.7, 0.4, 0.9),
@@ -197,8 +197,10 @@ def test_sides_of_their_own():
 @pytest.mark.slow
 def test_a_damper_on_two_sides():
     """A moment that depends on the velocity is told in the unit of time of its own side."""
-    block = rk.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, 1.6, restitution=(0.9, 0.8))
-    model = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: 0.5 * v)
+    block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5, 0.7, 1.6, restitution=(0.9, 0.8))
+    model = rk.models.Equation(
+        lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: 0.5 * v
+    )
     response = rk.simulate(block, rk.RectangularPulse(0.0, 0.1), model, initial=(-0.2, 0.0), duration=0.5, **EXACT)
     p2 = float(block.p2)
     arc = solve_ivp(lambda t, y: [y[1], -(p2**2) * np.sin(0.3 - y[0]) - 0.5 * p2 * y[1]], (0, 0.5), [0.2, 0.0],
@@ -308,7 +310,7 @@ def test_a_mesh_of_a_round_edge():
         np.testing.assert_allclose(R * edge.run(angles), 0.25 * np.sin(angles), atol=0.002)
     model = rk.models.Rolling(*edges)
     with pytest.warns(UserWarning, match="The base is rounded"):
-        block = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+        block = rk.blocks.AsymmetricBlock.from_mesh(rock, 0.0)
     balance = np.arctan2(0.2, rock.centre[2] - 0.25)
     for moments in model.moments_of_sides(block):
         assert float(moments.saddle) == pytest.approx(balance, rel=3e-3)
@@ -328,7 +330,7 @@ def test_a_rock_that_rolls_topples_between_its_bounds():
     rock = rk.blocks.Rock.from_mesh(prism(round_edged()), tolerance=1e-6)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        narrow, wide = (rk.AsymmetricBlock.from_mesh(rock, 0.0, base=base) for base in ("narrow", "wide"))
+        narrow, wide = (rk.blocks.AsymmetricBlock.from_mesh(rock, 0.0, base=base) for base in ("narrow", "wide"))
     amplitudes = np.linspace(0.15, 1.2, 43)
 
     def least(block, model):
@@ -351,7 +353,7 @@ def test_rocks_that_a_mesh_allows():
     rock = rk.blocks.Rock.from_mesh(prism(round_edged()), tolerance=0.005)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        same = rk.AsymmetricBlock.from_mesh(rock, 0.0)
+        same = rk.blocks.AsymmetricBlock.from_mesh(rock, 0.0)
     known = rk.blocks.draw_rocks(rock, 0.0, 3, tolerance=(0.005, 0.005))
     np.testing.assert_allclose(known.alpha1, same.alpha1, rtol=1e-12)
     np.testing.assert_allclose(known.p2, same.p2, rtol=1e-12)

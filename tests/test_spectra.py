@@ -71,7 +71,7 @@ def test_no_impact_limit_of_the_linear_block():
 def test_self_similar_spectrum():
     """In the linear model rotation/alpha depends on intensity and frequency ratio alone."""
     ratio, intensity = np.array([4.0, 8.0, 16.0]), [1.5, 3.0]
-    a, b = (rk.self_similar_spectrum(ratio, intensity, alpha=alpha, **LINEAR) for alpha in (0.05, 0.3))
+    a, b = (rk.studies.self_similar_spectrum(ratio, intensity, alpha=alpha, **LINEAR) for alpha in (0.05, 0.3))
     assert a.max_rotation.shape == (2, 3)
     np.testing.assert_allclose(a.max_rotation, b.max_rotation, rtol=1e-13)
     np.testing.assert_allclose(a.margin, b.margin, rtol=1e-12)
@@ -100,7 +100,7 @@ STRENGTHS, DURATIONS, SHAPES = np.linspace(0.05, 0.98, 12), np.linspace(0.3, 7.0
 def lobes():
     axes = {"uplift_strength": STRENGTHS, "pulse_duration": DURATIONS, "shape": SHAPES}
     given = {"pulse": rk.ExponentialPulse, "alpha": 0.1, **LINEAR}
-    return rk.overturning_map(**axes, **given), rk.self_similar_spectrum(**axes, **given)
+    return rk.overturning_map(**axes, **given), rk.studies.self_similar_spectrum(**axes, **given)
 
 
 def test_single_lobes_over_strength_duration_and_shape(lobes):
@@ -135,7 +135,7 @@ def test_figures_of_single_lobes(lobes, tmp_path):
     axis = rk.plot.overturning(rk.overturning_map(**few, **given), by_duration=True)
     assert "uplift strength" in axis.get_ylabel() and "duration" in axis.get_xlabel()
     assert axis.get_xlim()[1] == pytest.approx(2.0) and axis.get_ylim()[1] < 1
-    similar = rk.self_similar_spectrum(**few, **given)
+    similar = rk.studies.self_similar_spectrum(**few, **given)
     axes = rk.plot.spectrum(similar, by_duration=True)
     np.testing.assert_allclose(axes[0].lines[0].get_xdata(), [0.5, 1.0, 2.0])
     assert [text.get_text() for text in axes[0].get_legend().get_texts()][:2] == ["0.5", "0.8"]
@@ -164,7 +164,7 @@ def test_figures(tmp_path):
     axes = rk.plot.history(response)
     assert len(axes) == 3 and axes[2].get_xlabel() == "time [s]"
     assert "manifold" in rk.plot.phase(response).get_legend().get_texts()[0].get_text()
-    spectrum = rk.self_similar_spectrum([2.0, 4.0], [1.5, 3.0], **LINEAR)
+    spectrum = rk.studies.self_similar_spectrum([2.0, 4.0], [1.5, 3.0], **LINEAR)
     assert len(rk.plot.spectrum(spectrum)) == 2
     _, axis = plt.subplots()
     assert rk.plot.overturning(surface, axis, exact=False) is axis  # with borders: `test_borders`
@@ -194,7 +194,7 @@ TRACED = {
     ),
     "spectrum": lambda a: rk.rocking_spectrum(0.2, a * rk.SinePulse(1.5, 0.8), PERIODS, **QUICK).max_rotation,
     "self-similar spectrum": lambda alpha: (
-        rk.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, **QUICK).max_rotation
+        rk.studies.self_similar_spectrum(FEW_RATIOS + 5, FEW_INTENSITIES, alpha=alpha, **QUICK).max_rotation
     ),
 }
 
@@ -241,7 +241,7 @@ def test_surfaces_go_through_forward_mode(name):
 def elasticity(amplitude):
     """Of the peak by the amplitude, and by everything."""
     scene = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 0.7)
-    found = rk.sensitivity(*scene, QUICK["model"], engine=QUICK["engine"]).max_rotation
+    found = rk.studies.sensitivity(*scene, QUICK["model"], engine=QUICK["engine"]).max_rotation
     return found.derivative[3] * amplitude / found.value, found.elasticity
 
 

@@ -136,7 +136,7 @@ def test_every_process_says_what_a_store_needs(tmp_path, monkeypatch):
 
 def test_results_may_stay_in_the_store(tmp_path, straight):
     assert run(store=tmp_path / "a.zarr", load=False) is None
-    same(straight, rk.Grid.load(tmp_path / "a.zarr"))
+    same(straight, rk.studies.Grid.load(tmp_path / "a.zarr"))
     with xarray.open_dataset(tmp_path / "a.zarr", engine="zarr", chunks=None, consolidated=False) as data:
         assert data["sine"].sel(p=AXES["p"][7]).dims == ("alpha",)
         np.testing.assert_array_equal(data["sine"][:, 7], straight.values["sine"][:, 7])
@@ -147,7 +147,7 @@ def test_an_unfinished_store_is_not_loaded(tmp_path, written):
     with pytest.raises(Killed):
         run(store=tmp_path / "a.zarr")
     with pytest.raises(ValueError, match="is not finished: 2 of 5 blocks"):
-        rk.Grid.load(tmp_path / "a.zarr")
+        rk.studies.Grid.load(tmp_path / "a.zarr")
 
 
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])
@@ -156,7 +156,7 @@ def test_grids_are_saved_and_loaded(tmp_path, ending, outer):
     axes = AXES if outer else {name: values[:9] for name, values in AXES.items()}
     grid = rk.sweep(wave, outer=outer, **axes)
     grid.save(tmp_path / f"a{ending}")
-    same(grid, rk.Grid.load(tmp_path / f"a{ending}"))
+    same(grid, rk.studies.Grid.load(tmp_path / f"a{ending}"))
     with pytest.raises(FileExistsError, match="must be a new file"):
         grid.save(tmp_path / f"a{ending}")
 
@@ -166,7 +166,7 @@ def test_outcomes_come_back(tmp_path):
     data = grid.to_xarray()
     assert set(data) >= {"max_rotation", "status"} and data["margin"].dims == ("k",)
     grid.save(tmp_path / "a.nc")
-    again = rk.Grid.load(tmp_path / "a.nc").values
+    again = rk.studies.Grid.load(tmp_path / "a.nc").values
     assert isinstance(again, rk.responses.Outcome)
     np.testing.assert_array_equal(again.status == rk.Status.undecided, [False, True])
     np.testing.assert_array_equal(again.impact_count, [0, 1])

@@ -286,7 +286,8 @@ def test_a_namespace_offers_no_module_and_another_thing_by_one_name(space):
 
 
 @pytest.mark.parametrize(
-    "name", ["Observations", "HazardCurve", "Suite", "Outcome", "critical_durations", "peak_velocity"]
+    "name",
+    ["Observations", "HazardCurve", "Suite", "Outcome", "critical_durations", "peak_velocity", "Grid", "Equation"],
 )
 def test_old_names_say_where_they_are(name):
     with pytest.warns(DeprecationWarning, match=rf"^`jaxrock.{name}` is `jaxrock.[a-z]+.{name}` now; ") as told:

@@ -21,7 +21,7 @@ RECORDS = [
 MOTIONS = [*RECORDS, rk.SinePulse(np.array([0.6, 1.2]), 0.7)]
 SCALE = np.array([0.4, 1.0, 2.5])
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
-ROCKS = rk.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.3, 0.2]), np.array([2.5, 3.5]))
+ROCKS = rk.blocks.AsymmetricBlock(np.array([0.15, 0.25]), np.array([0.3, 0.2]), np.array([2.5, 3.5]))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_every_scene_is_one_of_its_own(found):
     assert 0.1 < (found.verdict == 1).mean() < 0.9
     for m, motion in ((1, RECORDS[1]), (2, RECORDS[2]), (5, rk.SinePulse(1.2, 0.7))):
         for s, f, b in [(0, 0, 0), (1, 1, 1), (2, 0, 1)]:
-            rock = rk.AsymmetricBlock(*(float(x[b]) for x in (ROCKS.alpha1, ROCKS.alpha2, ROCKS.p1)))
+            rock = rk.blocks.AsymmetricBlock(*(float(x[b]) for x in (ROCKS.alpha1, ROCKS.alpha2, ROCKS.p1)))
             alone = rk.outcome(rock, float(found.facing[f] * SCALE[s]) * motion, **QUICK)
             assert found.verdict[m, s, f, b] == int(alone.overturned)
             rotation = float(alone.max_rotation) / min(float(rock.alpha1), float(rock.alpha2))

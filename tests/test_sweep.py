@@ -274,10 +274,11 @@ print(Traced(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtyp
 @pytest.mark.parametrize(
     "code, printed",
     [
-        ("import jax, jaxrock as rk; print(rk.use_cpu_devices(3), rk.use_cpu_devices(3), jax.device_count())", "3 3 3"),
-        ("import jax, jaxrock as rk; rk.use_cpu_devices(2); jax.devices(); print(rk.use_cpu_devices(2))", "2"),
+        ("import jax; from jaxrock.studies import use_cpu_devices as use; print(use(3), use(3), jax.device_count())",
+         "3 3 3"),
+        ("import jax; from jaxrock.studies import use_cpu_devices as use; use(2); jax.devices(); print(use(2))", "2"),
         ("import os, jaxrock as rk; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-         "print(rk.use_cpu_devices())", "1"),
+         "print(rk.studies.use_cpu_devices())", "1"),
         ("import os, jax; from jaxrock.__main__ import main; main(['run', '--out', '/dev/null']); "
          "print(jax.device_count() == len(os.sched_getaffinity(0)))", "True"),
     ],
@@ -289,9 +290,9 @@ def test_cpu_devices(code, printed):
 def test_cpu_devices_come_too_late():
     assert jax.device_count() == 2
     with pytest.raises(RuntimeError, match="already computes with 2 CPU devices: call `use_cpu_devices` before"):
-        rk.use_cpu_devices(3)
+        rk.studies.use_cpu_devices(3)
     with pytest.raises(ValueError, match="`count` must be a whole number from 1 to 65536, but is 0"):
-        rk.use_cpu_devices(0)
+        rk.studies.use_cpu_devices(0)
 
 
 def test_sweeps_in_threads_keep_their_checks():

@@ -188,7 +188,7 @@ def test_many_scenes_have_a_row_each():
 
 
 def test_a_grid_in_pandas():
-    grid = rk.Grid({"x": np.array([1.0, 2.0, 3.0])}, {"status": STATUS, "double": np.array([2.0, 4.0, 6.0])})
+    grid = rk.studies.Grid({"x": np.array([1.0, 2.0, 3.0])}, {"status": STATUS, "double": np.array([2.0, 4.0, 6.0])})
     frame = grid.to_pandas()
     assert frame["status"].tolist() == ["successful", "undecided", "not_finite"]
     assert frame.loc[2.0, "double"] == 4.0

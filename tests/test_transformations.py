@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import jaxrock as rk
 
 BLOCK = rk.Block(0.2, 2.0, 0.9)
-COLUMN = rk.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
+COLUMN = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
 AT = jnp.linspace(0.28, 0.32, 4)  # the block rocks under all of these
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
 

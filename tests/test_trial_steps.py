@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 import jaxrock as rk
+from jaxrock.blocks import AsymmetricBlock
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=12)}
 BLOCK, SINE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.3, 1.0)
@@ -25,14 +26,14 @@ NUMBERS = {
     "inertia ratio": (lambda x, **k: rk.restitution.Housner(x, **k), 0.75, 1.2),
     "scale of a law": (lambda x, **k: rk.restitution.SpeedDependent(0.9, 0.5, x, **k), 0.5, -0.5),
     "restitution of two sides": (lambda x, **k: rk.restitution.PerSide(x, 1.2, **k), 0.8, 0.9),
-    "inertia of two sides": (lambda x, **k: rk.AsymmetricBlock(0.2, 0.3, 2.0, x, **k), 0.75, 2.0),
-    "second frequency": (lambda x, **k: rk.AsymmetricBlock.from_frequencies(0.2, 0.3, 2.0, x, 0.9, **k), 2.0, 9.0),
-    "distance of a corner": (lambda x, **k: rk.AsymmetricBlock.from_radii(0.2, 0.3, x, 1.0, 0.5, **k), 1.0, -1.0),
+    "inertia of two sides": (lambda x, **k: AsymmetricBlock(0.2, 0.3, 2.0, x, **k), 0.75, 2.0),
+    "second frequency": (lambda x, **k: AsymmetricBlock.from_frequencies(0.2, 0.3, 2.0, x, 0.9, **k), 2.0, 9.0),
+    "distance of a corner": (lambda x, **k: AsymmetricBlock.from_radii(0.2, 0.3, x, 1.0, 0.5, **k), 1.0, -1.0),
     "place of a corner": (
-        lambda x, **k: rk.AsymmetricBlock.from_corners(x * jnp.array([1.0, 0.0]), [-0.2, 0.0], [0.0, 1.0], 0.5, **k),
+        lambda x, **k: AsymmetricBlock.from_corners(x * jnp.array([1.0, 0.0]), [-0.2, 0.0], [0.0, 1.0], 0.5, **k),
         0.2, -0.2,
     ),
-    "stiffness": (lambda x, **k: rk.FlexibleBlock(0.5, 3.0, x, 2000.0, 0.05, **k), 1e9, 0.0),
+    "stiffness": (lambda x, **k: rk.blocks.FlexibleBlock(0.5, 3.0, x, 2000.0, 0.05, **k), 1e9, 0.0),
     "amplitude": (lambda x, **k: rk.SinePulse(x, 1.0, **k), 0.3, NAN),
     "period": (lambda x, **k: rk.SinePulse(0.3, x, **k), 1.0, -1.0),
     "duration": (lambda x, **k: rk.HalfSinePulse(0.3, x, **k), 1.0, 0.0),
@@ -113,7 +114,7 @@ def test_a_duration():
 
 def test_an_asymmetric_block_without_a_duration():
     """The motion, and 10/p of free rocking."""
-    history = rk.simulate(rk.AsymmetricBlock(0.2, 0.3, 2.0), SINE, **QUICK, samples=5)
+    history = rk.simulate(AsymmetricBlock(0.2, 0.3, 2.0), SINE, **QUICK, samples=5)
     np.testing.assert_allclose(history.duration, 1.0 + 10 / 2.0)
 
 

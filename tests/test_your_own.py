@@ -54,7 +54,7 @@ class Damped(rk.models.AbstractEquation):
     damping: jax.Array
 
     def moments(self, block):
-        return rk.Equation(
+        return rk.models.Equation(
             lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x), lambda x, v, b: self.damping * v
         ).moments(block)
 
@@ -333,7 +333,7 @@ def test_a_class_that_closes_over_a_traced_number():
 @pytest.mark.slow
 def test_the_orbit_of_functions_is_drawn():
     """Of functions no manifold is known: the equilibria stand alone."""
-    model = rk.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
+    model = rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x), lambda x, b: jnp.cos(b.alpha - x))
     axis = rk.plot.phase(rk.simulate(BLOCK, rk.SinePulse(0.3, 0.6), model))
     assert axis.get_legend() is None and len(axis.lines) == 4
     plt.close(axis.figure)
@@ -353,7 +353,7 @@ def standing(x, block):
 @pytest.mark.parametrize("call", [rk.outcome, rk.simulate], ids=lambda call: call.__name__)
 def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
     """At the door, alone and under `jax.vmap`: what is compiled calls back to nothing, and JAX can keep it."""
-    model = rk.Equation(*parts)
+    model = rk.models.Equation(*parts)
 
     def scene(a):
         return call(BLOCK, rk.SinePulse(a, 1.0), model)
@@ -366,7 +366,7 @@ def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
 @pytest.mark.slow  # compiles an arc of diffrax
 def test_programs_of_ones_own_equation_call_back_to_nothing():
     """Else JAX would not keep them."""
-    model = rk.Equation(standing)
+    model = rk.models.Equation(standing)
     scene = BLOCK, rk.SinePulse(0.3, 1.0), current_model(model, BLOCK)
     text = _outcome.lower(*scene, (jnp.zeros(()), jnp.zeros(())), rk.Diffrax()).as_text()
     assert "callback" not in text

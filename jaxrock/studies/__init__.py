@@ -1,4 +1,4 @@
-"""Questions about many responses: spectra, overturning maps, critical amplitudes, sensitivities, similarity.
+"""Questions about many responses: spectra, overturning maps, critical amplitudes, sensitivities, similarity; grids.
 
 Imports `responses` and `sweeps`. Start with `spectra`.
 """
@@ -33,6 +33,8 @@ from jaxrock.studies.spectra import (
     rocking_spectrum as rocking_spectrum,
     self_similar_spectrum as self_similar_spectrum,
 )
+from jaxrock.sweeps.devices import use_cpu_devices as use_cpu_devices
+from jaxrock.sweeps.grid import Grid as Grid
 
 
 def __dir__() -> list[str]:
