@@ -307,5 +307,7 @@ def test_what_a_tolerance_leaves_undone_is_told(motion, tolerance, most):
 
 def test_less_is_computed_where_less_is_asked():
     """Orders of steps follow the tolerance, but for what is asked for by itself."""
-    assert [POLICY.order(2, t) for t in (None, 1e-12, 1e-8, 1e-4)] == [16, 15, 11, 8]
-    assert [POLICY.order(5000, t) for t in (None, 1e-12, 1e-8, 1e-4)] == [8, 8, 7, 6]
+    asked = None, 1e-12, 1e-8, 1e-4
+    assert [POLICY.order(2, t, linear=False) for t in asked] == [16, 15, 11, 8]
+    assert [POLICY.order(2, t, linear=True) for t in asked] == [20, 17, 13, 10]
+    assert all([POLICY.order(5000, t, linear) for t in asked] == [8, 8, 7, 6] for linear in (False, True))

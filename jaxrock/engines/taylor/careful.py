@@ -60,8 +60,8 @@ class Series(AbstractEngine):
 
     **Arguments:**
 
-    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 16, and
-      fewer where a `tolerance` leaves room for it.
+    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 20 for
+      linear equations and 16 for others, and fewer where a `tolerance` leaves room for it.
     - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
       ones take less time where there are many scenes, and leave more of them undecided.
     - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
@@ -85,7 +85,7 @@ class Series(AbstractEngine):
             scene=scene,
             stop=stop,
             engine=self,
-            order=self.order or POLICY.order(scene.most_pieces, self.tolerance),
+            order=self.order or POLICY.order(scene.most_pieces, self.tolerance, not scene.moments.trigonometric),
             tolerance=self.tolerance or exact(scene.p.dtype),
             history=history,
             taped=taped,

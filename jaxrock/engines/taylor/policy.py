@@ -9,7 +9,8 @@ import jax.numpy as jnp
 class Policy(NamedTuple):
     """How the series engine goes about it.
 
-    - `pulse_order`, `record_order`: of Taylor steps under motions of few and many pieces; short ones need few terms.
+    - `pulse_order`, `linear_order`, `record_order`: of Taylor steps under motions of few pieces, the same where the
+      equation is linear, whose terms cost little, and under many pieces; short ones need few terms.
     - `many_pieces`: from which number of pieces on a motion counts as a record.
     - `outcome_steps`: step budget of an outcome; `history_steps`: of a history, besides two for each piece.
     - `fast_steps`: after which a scene is left to the careful pass, besides three for each piece.
@@ -19,6 +20,7 @@ class Policy(NamedTuple):
     """
 
     pulse_order: int = 16
+    linear_order: int = 20
     record_order: int = 8
     many_pieces: int = 32
     outcome_steps: int = 100_000
@@ -32,11 +34,13 @@ class Policy(NamedTuple):
         """Whether a motion of so many pieces counts as a record."""
         return pieces > self.many_pieces
 
-    def order(self, pieces: int, tolerance: float | None) -> int:
+    def order(self, pieces: int, tolerance: float | None, linear: bool) -> int:
         """Order of the steps where nobody has set it."""
         digits = math.inf if tolerance is None else -math.log10(tolerance)
         if self.is_record(pieces):  # whose steps are as long as their pieces, whatever the tolerance
             return int(min(self.record_order, max(6, digits / 2 + 3)))
+        if linear:
+            return int(min(self.linear_order, max(10, digits + 5)))
         return int(min(self.pulse_order, max(8, digits + 3)))
 
 
