@@ -95,46 +95,42 @@ def _peaks_of(motion: AbstractMotion):
     passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
     """
     knots = motion.knots
-    nodes, weights = (jnp.asarray(values, knots.dtype) for values in (_NODES, _WEIGHTS))
+    nodes, weights = (jnp.asarray(values, knots.dtype) / 2 for values in (_NODES, _WEIGHTS))
     parts = _PARTS if knots.size - 1 <= _FEW else 1
 
     def in_piece(piece, length):
         step = length / parts
+        begins = step * jnp.arange(parts)
 
+        @jax.vmap
         def jet(local):
             """Acceleration and its first two derivatives."""
             terms = motion.series(piece, jnp.clip(local, 0.0, length), jnp.ones_like(length), 2)
             terms = [*terms, *[jnp.zeros_like(terms[0])] * (3 - len(terms))]
             return terms[0], terms[1], 2 * terms[2]
 
-        def gain(begin, width):
-            """Velocity that is gained."""
-            values = jax.vmap(lambda node: jet(begin + width * (1 + node) / 2)[0])(nodes)
-            return values @ weights * width / 2
+        def gains_and(widths, others):
+            """Velocities gained in as much of every part as is asked for, and the acceleration at other times."""
+            inner = begins[:, None] + widths[:, None] * (0.5 + nodes)
+            values = jet(jnp.concatenate([inner.ravel(), others]))[0]
+            return values[: inner.size].reshape(inner.shape) @ weights * widths, values[inner.size :]
 
-        begins = step * jnp.arange(parts)
-        ends = jax.vmap(lambda local: jet(local)[0])(step * jnp.arange(parts + 1))
+        gains, ends = gains_and(jnp.full(parts, step), step * jnp.arange(parts + 1))
         left, right = ends[:-1], ends[1:]
         turns = left * right < 0
-        place = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
+        zeros = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
 
-        def to_zero(begin, place):
-            def nearer(_, place):
-                value, slope, _ = jet(begin + place)
-                return jnp.clip(place - value / jnp.where(slope == 0, jnp.inf, slope), 0.0, step)
+        def nearer(_, found):
+            zeros, top = found
+            values, slopes, bends = jet(jnp.append(begins + zeros, top))
+            zeros = jnp.clip(zeros - values[:-1] / jnp.where(slopes == 0, jnp.inf, slopes)[:-1], 0.0, step)
+            move = -slopes[-1] / jnp.where(bends == 0, jnp.inf, bends)[-1]
+            return zeros, top + jnp.where(jnp.abs(move) <= step, move, 0.0)
 
-            return gain(begin, jax.lax.fori_loop(0, _NEWTON, nearer, place))
-
-        turning = jnp.where(turns, jax.vmap(to_zero)(begins, place), 0.0)
-
-        def higher(_, top):
-            _, slope, bend = jet(top)
-            move = -slope / jnp.where(bend == 0, jnp.inf, bend)
-            return top + jnp.where(jnp.abs(move) <= step, move, 0.0)
-
-        top = jax.lax.fori_loop(0, _NEWTON, higher, step * jnp.argmax(jnp.abs(ends)))
-        peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(jet(top)[0]))
-        return peak, jax.vmap(gain, (0, None))(begins, step), turning
+        zeros, top = jax.lax.fori_loop(0, _NEWTON, nearer, (zeros, step * jnp.argmax(jnp.abs(ends))))
+        turning, highest = gains_and(zeros, top[None])
+        peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(highest[0]))
+        return peak, gains, jnp.where(turns, turning, 0.0)
 
     peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), motion.lengths)
     velocity = jnp.cumsum(gains.ravel())
