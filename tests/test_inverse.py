@@ -11,6 +11,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.command_line.main import main
 from jaxrock.inverse.observations import SEEN
+from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.scatter import rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import climb
@@ -270,6 +271,24 @@ def test_climbers_find_summits_and_hold_what_is_held():
     np.testing.assert_allclose(climb(hills, starts).points[0], 1.0, atol=1e-4)
     held = climb(hills, starts, np.array([True, False]), group=np.arange(len(starts)))
     np.testing.assert_allclose(held.points, [[1.0, 0.0], [1.0, -2.0]], atol=1e-4)
+
+    def single(x):
+        """In single precision, and not a number where the second climber starts."""
+        value, slope = hills(x)
+        return np.where(x[:, 0] > 2, np.nan, value).astype(np.float32), slope.astype(np.float32)
+
+    found = climb(single, starts)
+    np.testing.assert_allclose(found.points[0], 1.0, atol=1e-3)
+    np.testing.assert_array_equal(found.arrived, [True, False])
+
+
+@pytest.mark.parametrize("dtype, off", [(np.float64, 1e-6), (np.float32, 1e-3)])
+def test_maxima_at_the_end_of_a_range_are_in_it(dtype, off):
+    """A maximum at an end, rounded: in single precision the logarithm of 3 is off by more than it may be in double."""
+    low, high = np.log([0.05, 0.2]), np.log([2.0, 3.0])
+    rounded = np.log(np.nextafter(np.exp([low, high]).astype(dtype), np.array([[0.0], [np.inf]], dtype)))
+    assert (rounded[0] <= low).all() and (rounded[1] >= high).all() and _within(rounded, low, high, dtype)
+    assert not _within(rounded * np.array([[1.0], [1 + off]]), low, high, dtype)
 
 
 WORDS = ["toppled"] * 6 + ["survived"] * 6

@@ -130,7 +130,7 @@ def fit_probit(
         raise ValueError(f"Argument `clusters` must have shape {first.shape}, but has shape {labels.shape}.")
     if errors != "information" and labels.max() < 1:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    logarithms = jnp.log(jnp.stack(lists))
+    logarithms = jnp.log(jnp.stack(lists).astype(jnp.result_type(float)))  # whose sums over outcomes are long
     count = 0 if errors == "information" else int(labels.max()) + 1
     numbers = _fit(logarithms, toppled, trials - toppled, jnp.asarray(labels), count, errors)
     return ProbitFit(tuple(measures), *numbers)

@@ -271,10 +271,16 @@ def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
     logs = np.array([unknown.log for unknown in problem.unknowns.values()])
     places = np.where(logs, np.log(np.where(logs, summits, 1.0)), summits)
     low, high = np.asarray(problem.ends).T
-    slack = 1e-9 * (high - low)
-    if estimate.names != problem.names or not ((places > low - slack) & (places < high + slack)).all():
+    if estimate.names != problem.names or not _within(places, low, high, np.asarray(estimate.summits).dtype):
         raise ValueError("Argument `estimate` must be of these unknowns in these ranges, but is of others.")
     return np.clip(places, low, high)
+
+
+def _within(places: np.ndarray, low: np.ndarray, high: np.ndarray, dtype) -> bool:
+    """Whether places are in their ranges, but for the rounding of numbers of this type."""
+    rounding = np.finfo(dtype).eps * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+    slack = np.maximum(1e-9 * (high - low), 4 * rounding)
+    return bool(((places > low - slack) & (places < high + slack)).all())
 
 
 def diagnostics(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -121,6 +121,6 @@ def _given_up(number: int, points: np.ndarray, values: np.ndarray, group: np.nda
 
 def _finite(values, slopes) -> tuple[np.ndarray, np.ndarray]:
     """What is not a number is no place to climb to."""
-    values, slopes = np.array(values), np.array(slopes)
+    values, slopes = np.array(values, float), np.array(slopes, float)
     bad = ~np.isfinite(values) | ~np.isfinite(slopes).all(axis=1)
     return np.where(bad, _NOWHERE, values), np.where(bad[:, None], 0.0, slopes)
