@@ -75,7 +75,8 @@ def test_parts_of_a_scene(name, traced):
 
 
 def test_all_that_makes_a_scene_takes_throw():
-    named = [getattr(rk, name) for name in dir(rk) if name.endswith(("Block", "Pulse")) or name == "Record"]
+    offered = {name: getattr(space, name) for space in (rk, rk.blocks, rk.motions) for name in dir(space)}
+    named = [kind for name, kind in offered.items() if name.endswith(("Block", "Pulse")) or name == "Record"]
     classes = [kind for kind in named if isinstance(kind, type)]
     made = [kind for kind in classes if not inspect.isabstract(kind)]
     made += [getattr(kind, name) for kind in classes for name in dir(kind) if name.startswith("from_")]
