@@ -47,8 +47,9 @@ jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
 
 
-_MOST = 1.2e9  # bytes that a worker holds before it forgets compiled programs,
-_LEAST_GROWTH = 3e8  # if it has grown by so many since it last did
+# Bytes that a worker holds before it forgets compiled programs, if it has grown by so many since it last did: after the
+# last test of a file, and within one, where the next test may need what was compiled for this.
+_AFTER_A_FILE, _WITHIN, _LEAST_GROWTH = 1.0e9, 1.35e9, 2e8
 _MOST_MAPS = 30_000
 _TESTS = 10  # after so many it is looked how many maps there are, for to read them takes as long as a small test
 _held, _left = [0.0], [_TESTS]  # bytes after they were last forgotten; tests until maps are looked at
@@ -70,16 +71,27 @@ def _has_many_maps() -> bool:
     return maps.read_bytes().count(b"\n") > _MOST_MAPS
 
 
-@pytest.fixture(autouse=True)
-def few_compiled_programs():
+def _collect() -> None:
+    """Give back what is garbage: the collector is told to look seldom, and much waits for it."""
+    gc.collect()
+    if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
+        _OF_C.malloc_trim(0)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
     """Forget compiled programs before they are too many: each takes memory, and maps pages, and past 65,530 maps XLA
     crashes on Linux."""
-    yield
-    if _has_many_maps() or _memory() > max(_MOST, _held[0] + _LEAST_GROWTH):
+    goes_on = nextitem is not None and nextitem.path == item.path
+    most = max(_WITHIN if goes_on else _AFTER_A_FILE, _held[0] + _LEAST_GROWTH)
+    many = _has_many_maps()
+    if not many and _memory() <= most:
+        return
+    _collect()
+    if many or _memory() > most - _LEAST_GROWTH / 2:
+        importlib.import_module("jaxrock.transforms.recipe")._latest.clear()
         jax.clear_caches()
-        gc.collect()
-        if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
-            _OF_C.malloc_trim(0)
+        _collect()
         _held[0] = _memory()
 
 

@@ -20,17 +20,18 @@ from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
 from jaxrock.native.parted import emit_parted, has_parts
-from jaxrock.native.partition import Part, ahead, around_loop, computed
+from jaxrock.native.partition import ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
 from jaxrock.native.unmarked import unmarked
 
 
 class _Piece(NamedTuple):
-    """A part of a program, and the name of its machine code."""
+    """A part of a program by the name of its machine code, with the variables that it takes and makes."""
 
-    part: Part
     name: str
+    inputs: list
+    outputs: list
 
 
 class Plan:
@@ -44,17 +45,18 @@ class Plan:
     def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
         program = unmarked(plain(program) if has_foreign(program.jaxpr) else program)
         program = hoisted(program, _is_before_loops)
-        self._program, self._shared, self._alone = program, shared, alone
-        self._once, self._each, self._rest = ahead(program, shared, is_known, _is_large)
-        own = self._first_own()
-        self._pieces = []
-        for part in around_loop(self._rest) if refilled else [self._rest]:
+        self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
+        self._shared, self._alone = shared, alone
+        self._once, self._each, rest = ahead(program, shared, is_known, _is_large)
+        self._rest, own, self._pieces = rest.inputs, self._first_own(), []
+        # Of what becomes machine code only names stay: programs take more memory than all else.
+        for part in around_loop(rest) if refilled else [rest]:
             is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
             parted = is_loop and has_parts(part.program.jaxpr.eqns[0])
             writes = emit_parted if parted else emit_loop if is_loop else functools.partial(emit, alone=alone)
             name = registered(part.program, [v not in own for v in part.inputs], writes)
             own.update(v for v in part.outputs if not isinstance(v, Literal))
-            self._pieces.append(_Piece(part, name))
+            self._pieces.append(_Piece(name, part.inputs, part.outputs))
 
     @property
     def names(self) -> list[str]:
@@ -63,14 +65,14 @@ class Plan:
 
     def _first_own(self) -> set:
         """Variables that a lane has of its own before its machine code runs."""
-        inputs = {v for v, same in zip(self._program.jaxpr.invars, self._shared) if not same}
+        inputs = {v for v, same in zip(self._inputs, self._shared) if not same}
         return inputs | {v for v in self._each.outputs if not (self._alone and is_long(v.aval.shape))}
 
     @property
     def _own_inputs(self) -> list:
         """Of what is left when XLA has computed its part: what a lane has of its own."""
         own = self._first_own()
-        return [v for v in self._rest.inputs if v in own]
+        return [v for v in self._rest if v in own]
 
     @property
     def own(self) -> list:
@@ -80,7 +82,7 @@ class Plan:
     @property
     def results(self) -> list:
         """Shapes and types of what it returns, of one lane."""
-        return [v.aval for v in self._program.jaxpr.outvars]
+        return [v.aval for v in self._outputs]
 
     @property
     def has_own_lists(self) -> bool:
@@ -103,7 +105,7 @@ class Plan:
 
     def own_of(self, leaves: list) -> list:
         """Of leaves those that are `own`."""
-        values = dict(zip(self._program.jaxpr.invars, leaves))
+        values = dict(zip(self._inputs, leaves))
         return [values[v] for v in self._own_inputs]
 
     def of_collected(self, leaves: list, own: list, sizes, room: int) -> list:
@@ -115,7 +117,7 @@ class Plan:
 
     def _prepared(self, leaves: list) -> dict:
         """Values of variables before machine code runs."""
-        values = dict(zip(self._program.jaxpr.invars, leaves))
+        values = dict(zip(self._inputs, leaves))
         computed(self._once, values, batched=False)
         computed(self._each, values, batched=True)
         own = self._first_own()
@@ -125,10 +127,10 @@ class Plan:
     def _run(self, values: dict, sizes, room: int) -> list:
         """The machine code: what the program returns, the axis of lanes behind."""
         arrays = []
-        for part, name in self._pieces:
-            results = [jax.ShapeDtypeStruct((*v.aval.shape, room), v.aval.dtype) for v in part.outputs]
-            arrays = ran(name, results, sizes, *(values[v] for v in part.inputs))
-            values.update((v, x) for v, x in zip(part.outputs, arrays) if not isinstance(v, Literal))
+        for name, inputs, outputs in self._pieces:
+            results = [jax.ShapeDtypeStruct((*v.aval.shape, room), v.aval.dtype) for v in outputs]
+            arrays = ran(name, results, sizes, *(values[v] for v in inputs))
+            values.update((v, x) for v, x in zip(outputs, arrays) if not isinstance(v, Literal))
         return arrays
 
 
