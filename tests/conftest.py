@@ -88,7 +88,7 @@ def pytest_runtest_teardown(item, nextitem):
     if not many and _memory() <= most:
         return
     _collect()
-    if many or _memory() > most - _LEAST_GROWTH / 2:
+    if many or _memory() > most - _LEAST_GROWTH / 2:  # else it was garbage, and there is room for a while
         importlib.import_module("jaxrock.transforms.recipe")._latest.clear()
         jax.clear_caches()
         _collect()
