@@ -8,12 +8,15 @@ XLA compiles as after `keep_compiled`, and with fewer passes, since nearly every
 third less time. With `XLA_FLAGS=` it compiles as it does by itself.
 """
 
+import atexit
 import ctypes
 import gc
 import importlib
 import importlib.util
 import json
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -41,7 +44,16 @@ gc.set_threshold(200_000, 10, 10)
 if "XLA_FLAGS" not in os.environ:
     importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1".strip()
-os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
+# Every run compiles anew what it tests; but its workers share what they have compiled, and find it again where they
+# have forgotten it.
+_SHARED = "JAXROCK_TESTS_SHARE"
+if _SHARED not in os.environ:
+    os.environ[_SHARED] = tempfile.mkdtemp(prefix="jaxrock-tests-")
+    atexit.register(shutil.rmtree, os.environ[_SHARED], ignore_errors=True)
+os.environ["JAXROCK_CACHE"] = "off"
+jax.config.update("jax_compilation_cache_dir", os.environ[_SHARED])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 matplotlib.use("Agg")
