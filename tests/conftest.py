@@ -44,14 +44,16 @@ gc.set_threshold(200_000, 10, 10)
 if "XLA_FLAGS" not in os.environ:
     importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1".strip()
-# Every run compiles anew what it tests; but its workers share what they have compiled, and find it again where they
-# have forgotten it.
-_SHARED = "JAXROCK_TESTS_SHARE"
-if _SHARED not in os.environ:
-    os.environ[_SHARED] = tempfile.mkdtemp(prefix="jaxrock-tests-")
-    atexit.register(shutil.rmtree, os.environ[_SHARED], ignore_errors=True)
-os.environ["JAXROCK_CACHE"] = "off"
-jax.config.update("jax_compilation_cache_dir", os.environ[_SHARED])
+os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
+
+# What a process has compiled it finds again after it has forgotten it; each has its own place, for what one writes
+# another might read half of. The first one makes and clears away the place of all.
+_PLACE = "JAXROCK_TESTS_COMPILED"
+if _PLACE not in os.environ:
+    os.environ[_PLACE] = tempfile.mkdtemp(prefix="jaxrock-tests-")
+    atexit.register(shutil.rmtree, os.environ[_PLACE], ignore_errors=True)
+_own = Path(os.environ[_PLACE]) / os.environ.get("PYTEST_XDIST_WORKER", "alone")
+jax.config.update("jax_compilation_cache_dir", str(_own))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
