@@ -10,6 +10,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.closed_form import single_lobe
+from jaxrock.studies.spectra import of_any_size
 
 RATIOS, INTENSITIES = np.linspace(0.4, 8.0, 23), np.linspace(1.02, 9.0, 17)
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}  # compiles in half the time
@@ -280,3 +281,16 @@ def test_borders_cannot_be_traced():
 
     with pytest.raises(TypeError, match="Borders are searched .* they cannot be traced"):
         jax.jit(found)(0.2)
+
+
+def test_a_block_of_plain_numbers_is_made_once_in_each_precision():
+    """A small map takes no longer than it has to; and never numbers of another precision, or of another restitution."""
+    block = of_any_size(0.2, 0.9)
+    assert of_any_size(0.2, 0.9) is block
+    assert (float(block.alpha), float(block.p), float(block.restitution)) == (0.2, 1.0, 0.9)
+    assert float(of_any_size(0.2, None).restitution) == float(rk.Block(0.2, 1.0).restitution)
+    with jax.enable_x64(False):
+        assert of_any_size(0.2, 0.9).alpha.dtype == jnp.float32
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"Argument `restitution` must be in \[0, 1\], but is 1.5."):
+            of_any_size(0.2, 1.5)

@@ -1,5 +1,6 @@
 """Whole surfaces: rocking spectra and overturning maps."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -143,7 +144,7 @@ def rocking_spectrum(
     **Source:** Makris & Konstantinidis (2003), the rocking spectrum.
     """
     period = axis("period", period, _period)
-    block = Block(alpha, 1.0, restitution)  # raises here, where values are known
+    block = of_any_size(alpha, restitution)  # raises here, where values are known
 
     scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
     return Spectrum(period, **_only(_PEAKS, surface(_under_motion, (period,), scene, "spectrum", progress)))
@@ -263,7 +264,7 @@ def _either(name: str, values: Values | None, other: str, others: Values | None,
 
 def _scene(axes: _PulseAxes, alpha, restitution, pulse, model, engine) -> tuple:
     """What is the same at all points: a pytree, with the parameters of the pulse that are numbers."""
-    block, lists = Block(alpha, 1.0, restitution), tuple(axes.lists)
+    block, lists = of_any_size(alpha, restitution), tuple(axes.lists)
     numbers = {name: value for name, value in axes.parameters.items() if name not in lists}
     number = jax.ShapeDtypeStruct((), jnp.result_type(block.alpha, *axes.parameters.values(), *axes[:2]))
     made = _Family(current_function(pulse, number, number, **dict.fromkeys(axes.parameters, number)), numbers, lists)
@@ -286,6 +287,19 @@ def _over_pulses(axes: _PulseAxes, scene: tuple, label: str, progress: bool | No
     points = (*axes.lists.values(), axes.intensity, axes.ratio)
     # Neighbours in intensity share a chunk: they move alike.
     return surface(_under_pulse, points, scene, label, progress, columns=True)
+
+
+def of_any_size(alpha: ArrayLike, restitution: Restitution | None) -> Block:
+    """A block that stands for those of every size; the same one for the same plain numbers, because to make it takes a
+    quarter of the time of a small map."""
+    if isinstance(alpha, float) and isinstance(restitution, float | None):
+        return _of_plain_numbers(alpha, restitution, jnp.result_type(float))
+    return Block(alpha, 1.0, restitution)
+
+
+@functools.lru_cache(maxsize=64)
+def _of_plain_numbers(alpha: float, restitution: float | None, precision: np.dtype) -> Block:
+    return Block(alpha, 1.0, restitution)  # in the precision of the session
 
 
 def scaled_law(block: Block) -> AbstractRestitution:

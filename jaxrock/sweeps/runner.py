@@ -25,7 +25,7 @@ class Runner:
     def __init__(self, function: Callable, axes: tuple[np.ndarray, ...], scene, points: int):
         devices = local_devices()
         self._layout = layout(points, len(devices), devices[0].platform)
-        self._mesh = Mesh(np.array(devices), ("devices",))
+        self._mesh = _mesh_of(tuple(devices))
         flat: tuple[list, Any] = jax.tree.flatten(self._at_hand(scene))
         leaves, structure = flat
         self._scene = structure.unflatten(leaves)
@@ -87,7 +87,7 @@ class Runner:
             numbers = order[begin : begin + batch]
             parts = [x[numbers] for x in points]
             if numbers.size < batch:
-                parts = [np.pad(x, (0, batch - numbers.size), mode="edge") for x in parts]
+                parts = [np.concatenate([x, np.repeat(x[-1:], batch - numbers.size)]) for x in parts]
             dealt = [deal(x, self._layout) for x in parts]
             if self._mesh.size > 1:
                 dealt = jax.device_put(dealt, NamedSharding(self._mesh, _DEALT))
@@ -96,6 +96,11 @@ class Runner:
             if len(waiting) > 1:
                 yield waiting.popleft()
         yield from waiting
+
+
+@functools.lru_cache(maxsize=4)
+def _mesh_of(devices: tuple) -> Mesh:
+    return Mesh(np.array(devices), ("devices",))
 
 
 class _Checked(eqx.Module):
