@@ -147,7 +147,7 @@ def rocking_spectrum(
     block = of_any_size(alpha, restitution)  # raises here, where values are known
 
     scene = block.alpha, block.law, motion, current_model(model, block, motion, period), engine
-    return Spectrum(period, **_only(_PEAKS, surface(_under_motion, (period,), scene, "spectrum", progress)))
+    return Spectrum(period, **surface(_under_motion, (period,), scene, "spectrum", progress, names=_PEAKS))
 
 
 @arguments
@@ -189,7 +189,7 @@ def self_similar_spectrum(
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
     scene = _scene(axes, alpha, restitution, pulse, model, engine)
-    results = _only(_PEAKS, _over_pulses(axes, scene, "spectrum", progress))
+    results = _over_pulses(axes, scene, "spectrum", progress, _PEAKS)
     return Spectrum(abscissa=axes.ratio, intensity=axes.intensity, parameters=axes.lists, **results)
 
 
@@ -222,7 +222,7 @@ def overturning_map(
     """
     axes = _PulseAxes.of(frequency_ratio, intensity, pulse_duration, uplift_strength, parameters)
     scene = _scene(axes, alpha, restitution, pulse, model, engine)
-    results = _only(_STATES, _over_pulses(axes, scene, "map", progress))
+    results = _over_pulses(axes, scene, "map", progress, _STATES)
     return OverturningMap(
         frequency_ratio=axes.ratio, intensity=axes.intensity, parameters=axes.lists, scene=scene, **results
     )
@@ -282,11 +282,13 @@ class _Family(eqx.Module):
         return self.pulse(size, extent, **self.numbers, **dict(zip(self.lists, listed)))
 
 
-def _over_pulses(axes: _PulseAxes, scene: tuple, label: str, progress: bool | None) -> dict:
+def _over_pulses(
+    axes: _PulseAxes, scene: tuple, label: str, progress: bool | None, names: tuple[str, ...]
+) -> dict[str, Any]:
     """Outcomes over the outer product of parameters, intensities (rows) and frequency ratios (columns), at p = 1."""
     points = (*axes.lists.values(), axes.intensity, axes.ratio)
     # Neighbours in intensity share a chunk: they move alike.
-    return surface(_under_pulse, points, scene, label, progress, columns=True)
+    return surface(_under_pulse, points, scene, label, progress, columns=True, names=names)
 
 
 def of_any_size(alpha: ArrayLike, restitution: Restitution | None) -> Block:
@@ -325,10 +327,6 @@ def axis(name: str, values: Values, allowed: Range = ratio) -> Float[Array, " n"
 # spectrum and a map of one pulse are one program.
 _PEAKS = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin", "status")
 _STATES = ("state", "max_rotation", "impact_count", "margin", "status")
-
-
-def _only(names: tuple[str, ...], results: dict) -> dict:
-    return {name: results[name] for name in names}
 
 
 def _kept(result: Outcome, block: Block) -> dict:

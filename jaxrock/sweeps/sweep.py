@@ -204,15 +204,21 @@ def surface(
     progress: bool | None,
     outer: bool = True,
     columns: bool = False,
+    names: tuple[str, ...] | None = None,
 ):
     """`function(*point, scene)` over axes that are known to be good; arrays of JAX, the shape of the grid in front.
-    `columns`: neighbours along the last axis but one are computed together.
+    `columns`: neighbours along the last axis but one are computed together. `names`: of a dictionary of results those
+    that are wanted.
 
     Within `jax.jit`, `jax.vmap` or a derivative it is the plain function of arrays, on the device that JAX takes.
     """
-    if is_traced((axes, scene)):
-        return _traced_surface(function, tuple(map(jnp.asarray, axes)), scene, outer)
-    return placed(known_surface(function, axes, scene, label, progress, outer, columns))
+    traced = is_traced((axes, scene))
+    if traced:
+        results = _traced_surface(function, tuple(map(jnp.asarray, axes)), scene, outer)
+    else:
+        results = known_surface(function, axes, scene, label, progress, outer, columns)
+    wanted = results if names is None else {name: results[name] for name in names}
+    return wanted if traced else placed(wanted)
 
 
 def known_surface(
