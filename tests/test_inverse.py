@@ -115,28 +115,36 @@ def log_terms(seen, scatter=SCATTER, **values):
     return np.concatenate(found)[:count]
 
 
-def test_densities_of_measured_rotations_are_integrals_over_the_scatter():
-    """However little the rotation is uncertain: from node to node it goes from none to overturning."""
+@pytest.mark.parametrize(
+    ("period", "low", "high", "scatter", "off", "most"),
+    [
+        # Such rotations are met within one or two hundredths of the amplitude, a tenth of the way from node to node.
+        pytest.param(1.2, 0.12, 0.6, 0.3, 0.45, 1.0, id="from none to overturning between nodes"),
+        # A twentieth more of all reference rotations is off by 0.32 in the mean.
+        pytest.param(0.4, 0.25, 1.2, 0.1, 0.06, 0.4, id="short pulses, under which it grows steadily"),
+    ],
+)
+def test_densities_of_measured_rotations_are_integrals_over_the_scatter(period, low, high, scatter, off, most):
+    """However little the rotation is uncertain."""
     alpha = np.array([0.2, 0.17, 0.23] * 4)
     p, peak, sd = np.array([3.0, 3.5, 2.5] * 4), np.repeat([0.1, 0.08, 0.12, 0.05], 3), np.repeat([0.01, 0.02], 6)
     seen = rk.inverse.Observations(alpha, p, ["rotation"] * 12, rotation=peak, rotation_sd=sd)
-    amplitude = np.geomspace(0.12, 0.6, 80)
-    found = log_terms(seen, 0.3, amplitude=amplitude, period=1.2)
+    amplitude = np.geomspace(low, high, 80)
+    found = log_terms(seen, scatter, amplitude=amplitude, period=period)
     e = np.linspace(-4.5, 4.5, 3001)
-    factors = np.exp(0.3 * e)
+    factors = np.exp(scatter * e)
     exact = np.empty_like(found)
     grid = np.geomspace(amplitude[0] * factors[0], amplitude[-1] * factors[-1], 12_000)
-    weight = np.exp(-((np.log(grid / amplitude[:, None]) / 0.3) ** 2) / 2) / (np.sqrt(2 * np.pi) * 0.3)
+    weight = np.exp(-((np.log(grid / amplitude[:, None]) / scatter) ** 2) / 2) / (np.sqrt(2 * np.pi) * scatter)
     # There are three blocks only.
-    scenes = what_becomes(amplitude=grid, period=1.2, alpha=alpha[:3, None], p=p[:3, None],
+    scenes = what_becomes(amplitude=grid, period=period, alpha=alpha[:3, None], p=p[:3, None],
                           restitution=by_momentum(alpha[:3, None]))  # fmt: skip
     for i in range(12):
         density = np.exp(-(((peak[i] - scenes["peak"][i % 3]) / sd[i]) ** 2) / 2) / (np.sqrt(2 * np.pi) * sd[i])
         density = np.where(scenes["overturned"][i % 3], 0.0, density)
         exact[:, i] = weight @ density * np.log(grid[1] / grid[0])
     exact = np.log(0.98 * exact + 0.01 * 2 / np.pi)
-    # Such rotations are met within one or two hundredths of the amplitude, a tenth of the way from node to node.
-    assert np.sqrt(np.mean((found - exact) ** 2)) < 0.45 and np.max(np.abs(found - exact)) < 1.0
+    assert np.sqrt(np.mean((found - exact) ** 2)) < off and np.max(np.abs(found - exact)) < most
     total = found.sum(axis=1)
     assert np.sum(np.diff(np.sign(np.diff(total))) < 0) == 1  # one maximum
     assert abs(np.log(amplitude[total.argmax()] / amplitude[exact.sum(axis=1).argmax()])) < 0.05
