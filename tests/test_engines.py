@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import jaxrock as rk
-from jaxrock.engines.taylor.policy import POLICY
+from jaxrock.engines.taylor.policy import POLICY, exact
 from references.hard_cases import LANES, SAMPLES, engines, outcomes
 
 RTOL = 1e-8
@@ -307,7 +307,9 @@ def test_what_a_tolerance_leaves_undone_is_told(motion, tolerance, most):
 
 def test_less_is_computed_where_less_is_asked():
     """Orders of steps follow the tolerance, but for what is asked for by itself."""
-    asked = None, 1e-12, 1e-8, 1e-4
+    asked = exact(np.float64), 1e-12, 1e-8, 1e-4
     assert [POLICY.order(2, t, linear=False) for t in asked] == [16, 15, 11, 8]
     assert [POLICY.order(2, t, linear=True) for t in asked] == [20, 17, 13, 10]
     assert all([POLICY.order(5000, t, linear) for t in asked] == [8, 8, 7, 6] for linear in (False, True))
+    half = exact(np.float32)
+    assert [POLICY.order(*kind) for kind in [(2, half, False), (2, half, True), (5000, half, False)]] == [10, 12, 6]

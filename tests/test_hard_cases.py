@@ -411,6 +411,26 @@ def test_extreme_blocks(ratio, alpha):
     assert np.all((found["margin"] < 0) == found["overturned"])
 
 
+@pytest.mark.parametrize("order", [None, 20])
+@pytest.mark.parametrize("many", [False, True], ids=["one", "many"])
+def test_a_long_wait_in_single_precision(order, many):
+    """Of a slow sine the last coefficients vanish, and powers of the time until it lifts the block overflow: their
+    product is no number. From order 19 on the block was said never to move."""
+    scene = jax.tree.map(jnp.float32, (rk.Block(0.2, 1.0, 0.9), rk.SinePulse(0.3, 2 * np.pi / 0.05)))
+
+    def one(scene):
+        return rk.outcome(*scene, rk.Linear(), engine=rk.Series(order=order))
+
+    if many:
+        found = jax.jit(jax.vmap(one))(jax.tree.map(lambda x: jnp.full(100, x), scene))
+    else:
+        found = one(scene)
+    assert found.margin.dtype == jnp.float32
+    told = np.asarray(found.status == rk.Status.successful)
+    assert told.all() or order == 20
+    assert np.all(np.asarray(found.overturned)[told]) and np.all(np.abs(np.asarray(found.margin)[told] + 2.7373) < 1e-3)
+
+
 @pytest.mark.slow
 def test_single_precision():
     """Five digits in float32, with a warning that says how to get more."""

@@ -384,6 +384,7 @@ def test_a_stream_of_obspy(names):
         (channels("HNE", "HNZ"), "must hold two horizontal components, but \\['HNZ'\\] are vertical"),
         (channels("HNE") + channels("HNN", station="XYZ"), "must be of one station, but is of \\['US.ABC', 'US.XYZ'"),
         (3.0, "must hold two or three traces of ObsPy, but is 3.0"),
+        (np.array(0.3), "must hold two or three traces of ObsPy, but is array"),
     ],
 )
 def test_streams_that_are_refused(stream, message):

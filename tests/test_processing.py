@@ -111,6 +111,8 @@ def test_name_and_origin_are_kept(step):
         (lambda: do.filtered(SMOOTH), "`low` and `high` must not both be None"),
         (lambda: do.filtered(SMOOTH, 2.0, 1.0), "`high` must be above `low`"),
         (lambda: do.filtered(SMOOTH, high=50.0), "`high` must be above 0 and below half the sampling rate, 50 Hz"),
+        (lambda: do.filtered(SMOOTH, 1e-30), "`low` must be at least a millionth of the sampling rate, 0.0001 Hz"),
+        (lambda: do.from_velocity(np.ones(9), DT, corner=1e-30), "`corner` must be at least a millionth"),
         (lambda: do.tapered(SMOOTH, 6.0), "`seconds` must be at most half the record"),
         (lambda: do.cut(SMOOTH, 20.0), "must leave a sample"),
         (lambda: do.scaled(SMOOTH), "Just one of the arguments"),

@@ -11,7 +11,7 @@ from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
-from jaxrock.numerics.polynomial import Watch, first_event, meet, step_length
+from jaxrock.numerics.polynomial import Watch, first_event, longest, meet, step_length
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -44,7 +44,8 @@ def wait(
             landing = first_event(series, [watch], zero, needed)
             return landing.x, landing.hits[0] & (landing.jet[1] > 0)
 
-        reachable = ~lifts & ~never & (state.side == 0) & (sum(jnp.abs(c) for c in held) >= high)
+        # What is not a number is looked for, too: it ends in a status.
+        reachable = ~lifts & ~never & (state.side == 0) & ~(sum(jnp.abs(c) for c in held) < high)
         x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
         found.append((where(met, meet(x, drive, level), x), met, x))
         lifted.append((lifts, touching))
@@ -68,7 +69,8 @@ def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order
     parts: list[tuple] = [(shaking.horizontal, stepper.scene.threshold), (shaking.vertical, 1.0)]
     for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
-            length = jnp.minimum(length, step_length(terms, tolerance * scale, room))
+            cap = jnp.minimum(room, longest(len(terms), room.dtype))
+            length = jnp.minimum(length, step_length(terms, tolerance * scale, cap))
     return length
 
 

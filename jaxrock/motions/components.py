@@ -143,7 +143,9 @@ def components_of_stream(stream: Any, unit: Annotated[str, word_of(*PER_G)]) -> 
 
     **Raises:** as `record_of_trace` and `Components`; ValueError for another number of traces, or for two stations.
     """
-    traces = list(stream) if isinstance(stream, Iterable) and not isinstance(stream, (str, bytes)) else []
+    several = isinstance(stream, Iterable) and not isinstance(stream, (str, bytes))
+    several = several and getattr(stream, "shape", None) != ()  # as an array of one number has it
+    traces = list(stream) if several else []
     if len(traces) not in (2, 3):
         said = f"has {len(traces)}" if traces else f"is {shown(stream)}"
         raise ValueError(f"Argument `stream` must hold two or three traces of ObsPy, but {said}.")

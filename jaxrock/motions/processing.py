@@ -57,8 +57,15 @@ def _butterworth(values, dt, low, high, order, zero_phase, beyond="constant") ->
     return scipy.signal.sosfiltfilt(sections, longer, padtype=None)[room : room + values.size]
 
 
+_LOWEST = 1e-6  # corner over sampling rate: of lower ones coefficients of filters lose their digits, and at last all
+
+
 def _corner(name: str, value: float | None, dt: float) -> float | None:
-    if value is not None and not 0 < value < 0.5 / dt:
+    if value is not None and value < _LOWEST / dt:
+        raise ValueError(
+            f"Argument `{name}` must be at least a millionth of the sampling rate, {_LOWEST / dt:g} Hz, but is {value}."
+        )
+    if value is not None and not value < 0.5 / dt:
         raise ValueError(
             f"Argument `{name}` must be above 0 and below half the sampling rate, {0.5 / dt:g} Hz, but is {value}."
         )
@@ -237,7 +244,7 @@ def filtered(
 
     **Returns:** a `Record`.
 
-    **Raises:** ValueError for corners that are not in order, or not below half the sampling rate.
+    **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate.
     """
     samples, dt = _samples(record)
     low, high = _corner("low", low, dt), _corner("high", high, dt)

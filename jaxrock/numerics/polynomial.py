@@ -193,6 +193,11 @@ def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -
     return jnp.minimum(where(last > tiny, root_of(ratio, order), jnp.inf), cap)
 
 
+def longest(order: int, dtype: Any) -> float:
+    """A step whose powers up to this order are finite: where coefficients have vanished nothing else bounds it."""
+    return float(jnp.finfo(dtype).max) ** (1 / (order + 2))
+
+
 def root_of(value: Scalar, degree: int) -> Scalar:
     """The root of this degree (6 or more) of a positive number, to about one per cent.
 

@@ -43,6 +43,7 @@ from jaxrock.numerics.polynomial import (
     jet,
     keeps_sign,
     last_size,
+    longest,
     rescaled,
     step_length,
 )
@@ -61,7 +62,7 @@ class Series(AbstractEngine):
     **Arguments:**
 
     - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 20 for
-      linear equations and 16 for others, and fewer where a `tolerance` leaves room for it.
+      linear equations and 16 for others, and fewer where a `tolerance`, or single precision, leaves room for it.
     - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
       ones take less time where there are many scenes, and leave more of them undecided.
     - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
@@ -81,12 +82,13 @@ class Series(AbstractEngine):
         """This engine at work on a scene; short pieces of a record need few terms."""
         if not isinstance(scene.moments, Coefficients):
             raise ValueError("Argument `engine` must be a Diffrax(...) for a model that is given as functions.")
+        tolerance = self.tolerance or exact(scene.p.dtype)
         return TaylorStepper(
             scene=scene,
             stop=stop,
             engine=self,
-            order=self.order or POLICY.order(scene.most_pieces, self.tolerance, not scene.moments.trigonometric),
-            tolerance=self.tolerance or exact(scene.p.dtype),
+            order=self.order or POLICY.order(scene.most_pieces, tolerance, not scene.moments.trigonometric),
+            tolerance=tolerance,
             history=history,
             taped=taped,
         )
@@ -125,6 +127,11 @@ class TaylorStepper(AbstractStepper):
     def rounding(self) -> float:
         """What a step adds to the error, over the slenderness, however small its last terms are."""
         return min(self.tolerance, exact(self.scene.p.dtype))
+
+    @property
+    def longest(self) -> float:
+        """How long a step may be, in the unit of its series."""
+        return min(16.0, longest(self.order, self.scene.p.dtype))
 
     def advance(self, state: State) -> State:
         """One step of a lane."""
@@ -344,7 +351,7 @@ class _Step(NamedTuple):
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)
-        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, 16.0))
+        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, stepper.longest))
         full = length >= room * (1 - 1e-9)
         length = keep(where(full, room, length), state.local)
         opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))

@@ -81,10 +81,10 @@ class _Part(NamedTuple):
     certain: Flag
 
 
-def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar) -> _Part:
-    """As much of a step as is certain; `least`: what the last coefficients may contribute."""
+def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: float) -> _Part:
+    """As much of a step as is certain, `most` at most; `least`: what the last coefficients may contribute."""
     one, before, first = start.one, terms[1], 2 * terms[2]
-    cap = jnp.minimum(room, 16.0)
+    cap = jnp.minimum(room, most)
     # Under records nearly all steps go as far as there is room: no root is taken for them.
     short = ~(last_size(terms) * cap ** (len(terms) - 1) <= least)
     longest = _if(short, lambda: step_length(terms, least, cap), cap)
@@ -241,7 +241,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     terms = expand(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
     least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
-    part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least)
+    part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least, stepper.longest)
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)

@@ -34,9 +34,9 @@ class Policy(NamedTuple):
         """Whether a motion of so many pieces counts as a record."""
         return pieces > self.many_pieces
 
-    def order(self, pieces: int, tolerance: float | None, linear: bool) -> int:
+    def order(self, pieces: int, tolerance: float, linear: bool) -> int:
         """Order of the steps where nobody has set it."""
-        digits = math.inf if tolerance is None else -math.log10(tolerance)
+        digits = -math.log10(tolerance)
         if self.is_record(pieces):  # whose steps are as long as their pieces, whatever the tolerance
             return int(min(self.record_order, max(6, digits / 2 + 3)))
         if linear:
