@@ -1,5 +1,7 @@
 """A block at rest: waiting for the ground to lift it."""
 
+import functools
+import operator
 from dataclasses import replace
 
 import jax
@@ -29,7 +31,8 @@ def wait(
     room, length = fixed((room, where(jnp.isfinite(length), length, 0.0)))
     zero = jnp.zeros_like(length)
     lifted, found = [], []
-    for drive, level in scene.drives_of(shaking.rescaled(length)):
+    # A ground that does not change is the same at any scale; powers of a long time would overflow.
+    for drive, level in scene.drives_of(shaking.rescaled(where(_changes(shaking), length, 0.0))):
         held, high = fixed((drive, level))
         slope = held[1] if len(held) > 1 else zero
         slack = 8 * eps * high
@@ -69,9 +72,15 @@ def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order
     parts: list[tuple] = [(shaking.horizontal, stepper.scene.threshold), (shaking.vertical, 1.0)]
     for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
-            cap = jnp.minimum(room, longest(len(terms), room.dtype))
+            cap = where(_changes(shaking), jnp.minimum(room, longest(len(terms), room.dtype)), room)
             length = jnp.minimum(length, step_length(terms, tolerance * scale, cap))
     return length
+
+
+def _changes(shaking: Shaking) -> Flag:
+    """Whether the acceleration of the ground has more terms than its first."""
+    later = [*shaking.horizontal[1:], *(shaking.vertical or [])[1:]]
+    return functools.reduce(operator.or_, [c != 0 for c in later], jnp.zeros((), bool))
 
 
 def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag) -> State:
