@@ -72,7 +72,8 @@ def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order
     parts: list[tuple] = [(shaking.horizontal, stepper.scene.threshold), (shaking.vertical, 1.0)]
     for terms, scale in parts:
         if terms is not None and len(terms) > order:  # else a polynomial: exact
-            cap = where(_changes(shaking), jnp.minimum(room, longest(len(terms), room.dtype)), room)
+            cap = jnp.minimum(room, longest(len(terms), room.dtype))
+            cap = where(_changes(shaking), cap, room)  # zeros need none
             length = jnp.minimum(length, step_length(terms, tolerance * scale, cap))
     return length
 
