@@ -11,6 +11,7 @@ Numbers and arrays without one (`ArrayLike`, shapes) are left to the function, w
 import collections.abc
 import functools
 import inspect
+import math
 import os
 import types
 from collections.abc import Callable
@@ -160,7 +161,13 @@ def known(allowed: Range) -> Check:
         number = isinstance(value, (int, float, np.integer, np.floating))
         if not number or isinstance(value, (bool, np.bool_, np.timedelta64)):
             raise ValueError(f"Argument `{name}` must be a number, but is {shown(value)}.")
-        return float(allowed(name, value))
+        try:
+            found = float(value)  # no array of JAX: some transformations would trace it
+        except OverflowError:
+            found = math.inf
+        if not allowed.holds(found):
+            raise ValueError(f"Argument `{name}` must {allowed.allowed}, but is {found}.")
+        return found
 
     return check
 

@@ -301,3 +301,12 @@ def test_a_search_by_optax_under_vmap():
     many = jax.jit(jax.vmap(search))(starts)
     assert (many[:, -1] < 0.1 * many[:, 0]).all()
     np.testing.assert_allclose(many[0], jax.jit(search)(starts[0]), rtol=1e-6)
+
+
+def test_settings_are_made_anywhere():
+    """Also where JAX traces what is known."""
+
+    def scaled(x):
+        return x * rk.Series(tolerance=1e-9).tolerance / rk.Diffrax(rtol=1e-9).rtol
+
+    np.testing.assert_allclose(jax.grad(lambda x: dealt(scaled)(x).sum())(AT), np.ones(4), rtol=1e-15)
