@@ -4,6 +4,7 @@ A surface of one point and of a hundred, and what remains of it when a hundred p
 are computed; and one scene as a call of its own, and in a batch of one. Best of many calls: nothing else may work.
 """
 
+import functools
 from pathlib import Path
 
 import jax
@@ -29,6 +30,14 @@ def of_sine(slenderness, amplitude):
     return rk.outcome(rk.Block(slenderness, 2.0, 0.9), rk.SinePulse(amplitude, 1.0))
 
 
+FREQUENCIES = [2.0]
+
+
+def of_frequency(slenderness, amplitude):
+    """The same; it reads a list."""
+    return rk.outcome(rk.Block(slenderness, FREQUENCIES[0], 0.9), rk.SinePulse(amplitude, 1.0))
+
+
 def surfaces():
     """Functions of the number of points along both axes of what is asked."""
 
@@ -41,11 +50,15 @@ def surfaces():
     def spectrum(count):
         return rk.studies.self_similar_spectrum(*over(count), alpha=0.2, restitution=0.9, **QUIET).margin
 
-    def swept(count):
+    def swept(function, count):
         lists = {"slenderness": np.linspace(0.1, 0.2, count), "amplitude": np.linspace(0.3, 0.5, count)}
-        return rk.sweep(of_sine, **lists, **QUIET).values.margin
+        return rk.sweep(function, **lists, **QUIET).values.margin
 
-    return {"`rk.overturning_map`": a_map, "`self_similar_spectrum`": spectrum, "`rk.sweep`": swept}
+    swept, traced = functools.partial(swept, of_sine), functools.partial(swept, of_frequency)
+    return {
+        "`rk.overturning_map`": a_map, "`self_similar_spectrum`": spectrum,
+        "`rk.sweep`": swept, "`rk.sweep`, traced": traced,
+    }  # fmt: skip
 
 
 def of_surfaces():
@@ -77,7 +90,8 @@ Warm calls, the best of up to {calls}. Fixed: of 10 x 10 points, without what th
 
 {surfaces}
 
-`rk.sweep` traces the function that it is given at every call, to see whether what that reads has changed.
+`rk.sweep` looks whether what its function reads is what it was, and traces it again if not, or where that cannot be
+told (of a function that reads a list, an attribute, an array of NumPy): `rk.sweep`, traced.
 
 One scene in a compiled function, and as a batch of one; as a plain call of a new block or motion, whose numbers are
 looked at and placed one by one.

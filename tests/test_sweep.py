@@ -185,8 +185,8 @@ def test_values_out_of_range_within_a_surface_raise():
 
 def test_checks_do_not_keep_a_program_from_the_cache():
     """JAX keeps no compiled program on disk that may call back to Python, which is how checks raise."""
-    traced = Traced(lambda e: rk.Block(0.1, 1.0, e).restitution, {"e": jax.ShapeDtypeStruct((), np.dtype(float))})
-    assert "Argument `restitution` must be in [0, 1]" in traced.messages
+    traced = Traced.of(lambda e: rk.Block(0.1, 1.0, e).restitution, {"e": jax.ShapeDtypeStruct((), np.dtype(float))})
+    assert "Argument `restitution` must be in [0, 1]" in traced.program.messages
     assert "callback" not in str(jax.make_jaxpr(traced)(0.5, ()))
 
 
@@ -204,21 +204,21 @@ def point():
 def test_programs_are_told_apart():
     """Constants are arguments, but part of the fingerprint; arrays within a program are part of it."""
     one, two = jnp.arange(3.0), jnp.arange(3.0) + 1
-    same = Traced(lambda x: x * one, point()), Traced(lambda x: x * two, point())
+    same = Traced.of(lambda x: x * one, point()), Traced.of(lambda x: x * two, point())
     assert same[0] == same[1] and hash(same[0]) == hash(same[1])
-    assert same[0].fingerprint != same[1].fingerprint == Traced(lambda x: x * two, point()).fingerprint
-    assert same[0] != Traced(lambda x: x + one, point())
-    assert same[0] != Traced(lambda x: {"a": x * one}, point())
-    inner = [Traced(lambda x, c=c: jax.jit(lambda y: y * c)(x), point()) for c in (one, two)]
+    assert same[0].fingerprint != same[1].fingerprint == Traced.of(lambda x: x * two, point()).fingerprint
+    assert same[0] != Traced.of(lambda x: x + one, point())
+    assert same[0] != Traced.of(lambda x: {"a": x * one}, point())
+    inner = [Traced.of(lambda x, c=c: jax.jit(lambda y: y * c)(x), point()) for c in (one, two)]
     assert inner[0] != inner[1] and inner[0].fingerprint != inner[1].fingerprint
-    close = [Traced(lambda x, c=c: x * c, point()) for c in (0.1, np.nextafter(0.1, 1))]
+    close = [Traced.of(lambda x, c=c: x * c, point()) for c in (0.1, np.nextafter(0.1, 1))]
     assert close[0] != close[1] and close[0].fingerprint != close[1].fingerprint
     called = [
-        Traced(lambda x, f=f: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"), point())
+        Traced.of(lambda x, f=f: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"), point())
         for f in (lambda x: x, lambda x: -x)
     ]
     assert called[0] != called[1]
-    checks = [Traced(lambda x: rk.Block(x, 1.0).restitution, point()) for _ in range(2)]
+    checks = [Traced.of(lambda x: rk.Block(x, 1.0).restitution, point()) for _ in range(2)]
     assert checks[0] == checks[1]
 
 
@@ -239,7 +239,7 @@ def test_programs_of_scenes_are_told_apart():
     """By what they compute, by arrays in them, and by what they call back to; not by how often they were traced."""
 
     def traced(function):
-        return Traced(lambda x: differentiable(function)(x), point())
+        return Traced.of(lambda x: differentiable(function)(x), point())
 
     def calling(f):
         return traced(lambda x: jax.pure_callback(f, point()["x"], x, vmap_method="sequential"))
@@ -266,7 +266,7 @@ def test_fingerprints_are_the_same_in_every_process():
 import jax, numpy as np, jaxrock as rk
 from jaxrock.transforms.fingerprint import Traced
 record = rk.Record(np.arange(5.0), 0.01)
-print(Traced(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtypeStruct((), "float32")}).fingerprint)
+print(Traced.of(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeDtypeStruct((), "float32")}).fingerprint)
 """
     assert fresh(code, seed="1") == fresh(code, seed="2")
 

@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from jaxrock._checks import put_down
 from jaxrock._guard import guarded
@@ -50,9 +51,14 @@ def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block |
     if not isinstance(model, Equation):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
-        for name, moment in zip(("restoring moment", "overturning arm"), model.at_rest(side)):
-            block = guarded(block, jnp.any(moment <= 0), f"The {name} must be positive at rotation 0.")
+        for name, falls in zip(("restoring moment", "overturning arm"), _falls(model, side)):
+            block = guarded(block, falls, f"The {name} must be positive at rotation 0.")
     return block
+
+
+@jax.jit  # one call where there would be fifty
+def _falls(model: Equation, block: Block | Side) -> list[Bool[Array, ""]]:
+    return [jnp.any(moment <= 0) for moment in model.at_rest(block)]
 
 
 def _is_functions(node) -> bool:

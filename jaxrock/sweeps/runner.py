@@ -6,15 +6,13 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxrock._checks import put_down
 from jaxrock.sweeps.devices import compiler_options, local_devices
 from jaxrock.sweeps.plan import deal, dealt_to, layout
-from jaxrock.transforms.fingerprint import Program
+from jaxrock.transforms.fingerprint import Checked, Program, with_checks
 
 _EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
 
@@ -103,14 +101,6 @@ def _mesh_of(devices: tuple) -> Mesh:
     return Mesh(np.array(devices), ("devices",))
 
 
-class _Checked(eqx.Module):
-    """Results, and for each of the messages whether it applies."""
-
-    results: Any
-    failed: tuple
-    messages: tuple[str, ...] = eqx.field(static=True)
-
-
 class _Compiled(NamedTuple):
     """A function of points and a scene, its messages, and the structure, shapes and types of its results at a point."""
 
@@ -141,10 +131,8 @@ def _call_of(function: Callable, mesh: Mesh) -> Callable:
     def on_one(points, scene):
         def one(*point):
             if isinstance(function, Program):
-                return _Checked(*function(*point, scene), function.messages)
-            with put_down() as checks:
-                results = function(*point, scene)
-            return _Checked(results, tuple(failed for _, failed in checks), tuple(message for message, _ in checks))
+                return Checked(*function(*point, scene), function.messages)
+            return with_checks(function)(*point, scene)
 
         return jax.vmap(one)(*points)
 

@@ -115,10 +115,11 @@ def sweep(
         sizes = ", ".join(f"{name} has {values.size}" for name, values in lists.items())
         raise ValueError(f"Axes that go side by side must have one length, but {sizes}.")
 
-    def at_point(**point):
+    def of_suites(**point):
         return function(**{name: suites[name][x] if name in suites else x for name, x in point.items()})
 
-    traced = Traced(at_point, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
+    at_point = of_suites if suites else function
+    traced = Traced.of(at_point, {name: jax.ShapeDtypeStruct((), values.dtype) for name, values in lists.items()})
     names = own_names(list(axes), outer, traced.shapes, 0)
     plan = Plan.of(tuple(lists.values()), outer, block)
     with shared_out():

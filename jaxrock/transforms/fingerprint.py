@@ -3,14 +3,16 @@
 import functools
 import hashlib
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
 from jaxrock._checks import put_down
+from jaxrock.transforms.reads import reads
 
 
 class Program:
@@ -53,18 +55,54 @@ class Program:
         return isinstance(other, Program) and self._key == other._key
 
 
-def traced(function: Callable, leaves: Sequence) -> tuple[ClosedJaxpr, Any, tuple[str, ...]]:
-    """The program of `function(*leaves)` with its checks put down: (jaxpr, shapes of (results, failures), messages)."""
+class Checked(eqx.Module):
+    """What a function returns, and for each of the messages of its checks whether it applies."""
 
-    def checked(*leaves):
+    results: Any
+    failed: tuple
+    messages: tuple[str, ...] = eqx.field(static=True)
+
+
+def with_checks(function: Callable) -> Callable[..., Checked]:
+    """The same function, whose checks of arguments do not raise: they are `Checked`."""
+
+    def checked(*arguments):
         with put_down() as checks:
-            found = function(*leaves)
-        messages.extend(message for message, _ in checks)
-        return found, tuple(failed for _, failed in checks)
+            results = function(*arguments)
+        return Checked(results, tuple(failed for _, failed in checks), tuple(message for message, _ in checks))
 
-    messages = []
-    closed, shapes = jax.make_jaxpr(checked, return_shape=True)(*leaves)
-    return closed, shapes, tuple(messages)
+    return checked
+
+
+def traced(function: Callable, key: Hashable | None, leaves: Iterable) -> tuple[ClosedJaxpr, Checked]:
+    """The program of a function of leaves with its checks, and what it returns.
+
+    `key`: what tells the function from others; it is the same program then as when a like one was traced before. None:
+    nothing does, and it is traced.
+    """
+    if key is None:
+        return jax.make_jaxpr(with_checks(function), return_shape=True)(*leaves)
+    found = _under_jit(_Keyed(function, key)).trace(*leaves)
+    return found.jaxpr, found.out_info
+
+
+class _Keyed:
+    """A function that is like others with the same key."""
+
+    def __init__(self, function: Callable, key: Hashable):
+        self.function, self.key = function, key
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return isinstance(other, _Keyed) and self.key == other.key
+
+
+# JAX traces again where its settings, or types of numbers, are others: it knows of all of them.
+@functools.lru_cache(maxsize=64)
+def _under_jit(keyed: _Keyed) -> Any:
+    return jax.jit(with_checks(keyed.function))
 
 
 class Traced:
@@ -74,13 +112,22 @@ class Traced:
     the function returns, `fingerprint` tells program and constants in any process.
     """
 
-    def __init__(self, function: Callable, point: dict[str, jax.ShapeDtypeStruct]):
-        closed, (self.shapes, failures), messages = traced(
-            lambda *values: function(**dict(zip(point, values))), list(point.values())
-        )
-        self.program = Program(closed.jaxpr, jax.tree.structure((self.shapes, failures)), messages)
-        self.messages, self.constants = messages, tuple(closed.consts)
+    _known: weakref.WeakKeyDictionary[ClosedJaxpr, "Traced"] = weakref.WeakKeyDictionary()
+
+    def __init__(self, closed: ClosedJaxpr, told: Checked):
+        self.program = Program(closed.jaxpr, jax.tree.structure((told.results, told.failed)), told.messages)
+        self.shapes, self.constants = told.results, tuple(closed.consts)
         self.fingerprint = self.program.fingerprint(self.constants)
+
+    @classmethod
+    def of(cls, function: Callable, point: dict[str, jax.ShapeDtypeStruct]) -> "Traced":
+        """From the function as it is now."""
+        told, names = reads(function), tuple(point)
+        key = None if told is None else (told, names)
+        closed, results = traced(lambda *values: function(**dict(zip(names, values))), key, point.values())
+        if closed not in cls._known:
+            cls._known[closed] = cls(closed, results)
+        return cls._known[closed]
 
     def __call__(self, *arguments):
         """Evaluate at a point; the last argument are the constants."""

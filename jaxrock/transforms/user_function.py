@@ -2,15 +2,17 @@
 
 `jax.jit` takes a function for the same as long as it is the same object. What it computes may change all the same: it
 may read a global, an attribute, an array that is changed in place. So a function of a user's is traced whenever an
-entry point of the package is called, which takes about a millisecond, and goes on as the program that it traces to: a
-pytree with the arrays that it captures as leaves, and the text of the program as the static part. Nothing is compiled
-again while the text is the same, and arrays and traced values are arguments, with derivatives.
+entry point of the package is called, which takes about a millisecond, unless all that it reads is known to be the same
+(`reads`), and goes on as the program that it traces to: a pytree with the arrays that it captures as leaves, and the
+text of the program as the static part. Nothing is compiled again while the text is the same, and arrays and traced
+values are arguments, with derivatives.
 
 It has to be a function of its arguments and of what it reads. A function that was compiled by `jax.jit` before is what
 JAX has kept of it.
 """
 
 import hashlib
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +24,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxrock._checks import watched
 from jaxrock.transforms.fingerprint import Program, _text, traced
+from jaxrock.transforms.reads import reads
 
 
 class ByIdentity(eqx.Module):
@@ -54,12 +57,17 @@ class UserFunction(eqx.Module):
             arguments, named = structure.unflatten(values[len(arrays) :])
             return itself(*arguments, **named)
 
-        values = [*arrays, *leaves]
-        closed, shapes, messages = traced(call, values)
+        values, known = [*arrays, *leaves], reads(function)  # what is told so holds no arrays
+        closed, told = traced(call, None if known is None else (known, structure), values)
+        if closed in _known:
+            return _known[closed]
         jaxpr, rules = _with_own_arrays(closed.jaxpr), _rules(closed, call, values)
-        program = Program(jaxpr, jax.tree.structure(shapes), messages, rules)
+        program = Program(jaxpr, jax.tree.structure((told.results, told.failed)), told.messages, rules)
         dtypes = tuple(leaf.dtype for leaf in leaves)
-        return cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)))
+        made = cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)))
+        if known is not None:
+            _known[closed] = made
+        return made
 
     def __call__(self, *arguments, **named):
         """Evaluate it within a trace; checks that it makes are made, or put down, here."""
@@ -71,6 +79,9 @@ class UserFunction(eqx.Module):
         for message, failed in zip(self.program.messages, failures):
             found = watched(found, message, failed)
         return found
+
+
+_known: weakref.WeakKeyDictionary[ClosedJaxpr, UserFunction] = weakref.WeakKeyDictionary()
 
 
 def current_function(function: Callable, *arguments, **named) -> UserFunction | ByIdentity:
