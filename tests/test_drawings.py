@@ -228,7 +228,7 @@ def test_a_film_of_a_block_that_rolls():
     """It knows the edges of the response."""
     model, initial = EDGES["circle"][1], (0.1, 0.0)
     response = rk.simulate(BLOCK, rk.SinePulse(0.5, 0.6), model, initial=initial, duration=0.4)
-    film = rk.plot.animate(response, BLOCK, fps=5)
+    film = started(rk.plot.animate(response, BLOCK, fps=5))
     for number, time in enumerate((0.0, 0.2, 0.4)):
         outline = film._func(number)[0].get_xy()[:-1]
         rotation = float(response(np.array([time]))[0][0])
