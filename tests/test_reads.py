@@ -20,6 +20,7 @@ SIZE, ARRAY, PAIR = 2.0, jnp.ones(2), (1, (2.0, "b"))
 CHANGING, LIST = np.ones(2), [1.0]
 SCALED, BENT = 2.0 * RECORD, rk.models.Equation(lambda x, block: jnp.sin(block.alpha - x))
 LISTED = rk.models.Equation(lambda x, block: reading_lists(block.alpha - x))
+UFUNC = np.frompyfunc(lambda x: LIST[0] * x, 1, 1)
 POINT = {"x": jax.ShapeDtypeStruct((), np.dtype(float))}
 
 
@@ -93,6 +94,7 @@ NOT_TOLD = {
     "a model whose functions read lists": lambda x: rk.outcome(BLOCK, rk.SinePulse(x, 1.0), LISTED).margin,
     "a list in what encloses it": closing([1.0]),
     "a part": functools.partial(with_default, factor=3.0),
+    "a ufunc of its own": lambda x: UFUNC(SIZE) * x,
     "the environment": lambda x: len(os.environ) * x,
     "a file": lambda x: rk.example_record().dt * x,
     "another file": lambda x: jnp.load("x.npy") * x,

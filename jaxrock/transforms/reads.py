@@ -105,11 +105,13 @@ def _of_value(value: Any, seen: set[int]) -> Iterator[Hashable]:
 
 def _is_pure(value: Any) -> bool:
     """Whether it is a function or class that computes from its arguments alone."""
-    if isinstance(value, np.ufunc) or (isinstance(value, type) and issubclass(value, np.generic)):
-        return True
     name = getattr(value, "__name__", None)
     if name is None or isinstance(value, types.ModuleType):
         return False
+    if isinstance(value, np.ufunc):
+        return value is getattr(np, name, None)  # others may call a user's function
+    if isinstance(value, type) and issubclass(value, np.generic):
+        return value.__module__ == "numpy"
     if _is_within(value, _PURE) and not isinstance(value, types.MethodType):
         return True
     at = getattr(jnp, name, None), getattr(jax.lax, name, None), getattr(jax.nn, name, None), getattr(math, name, None)
