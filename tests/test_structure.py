@@ -358,6 +358,7 @@ SHARED = {
     "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
     "sweeps.grid._examples": "changed at import only",
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",
+    "transforms.user_function._known": "the same value, whoever puts it there, by one call of C",
     "transforms.recipe._alike": "under a lock",
     "transforms.recipe._latest": "under a lock",
 }

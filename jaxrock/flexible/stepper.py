@@ -151,17 +151,15 @@ class FlexibleScene(eqx.Module):
         left = jax.lax.stop_gradient(jnp.maximum(remaining, 0.0))
         scales = self.ground.scales
         scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, jnp.inf if scales is None else scales[inner]))
-        usual = jnp.where(jnp.isfinite(lasts) & (lasts > 0), jax.lax.stop_gradient(lasts), 1.0)
-        unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(left > 0, left, usual))
+        room = jnp.where(left > 0, left, jax.lax.stop_gradient(lasts))
+        unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(jnp.isfinite(room) & (room > 0), room, 1.0))
         load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
-        # Where nothing of a piece is left, an arc as long as any: of one far longer the load would be a sum of large
-        # terms that cancel, already at its start.
+        # Where nothing of a piece is left, an arc as long as any: of a longer one large terms cancel even at its start.
         cap = jnp.minimum(jnp.where(left > 0, left, unit), self.longest(state)) / unit
         if len(load) > 4:
             size = jnp.finfo(left.dtype).eps / 4 * jnp.max(self.ground.bounds)
             cap = step_length(jax.lax.stop_gradient(load), jax.lax.stop_gradient(size), cap)
-        length = cap * unit
-        whole = length >= left
+        length, whole = cap * unit, cap * unit >= left
         share = jnp.where(whole, remaining / length, 1.0)
         return jnp.stack(load) * powers(length / unit, len(load)), length, share, whole
 

@@ -92,7 +92,7 @@ def _of_value(value: Any, seen: set[int]) -> Iterator[Hashable]:
     if kind in _NUMBERS:
         yield kind, repr(value)  # -0.0 equals 0.0, and True equals 1
     elif kind is Label:
-        yield kind
+        yield (kind,)
     elif parts is not None:
         yield kind, len(parts)
         for part in parts:
