@@ -74,6 +74,9 @@ TOLD = {
     "a scaled record": lambda x: rk.simulate(BLOCK, SCALED, samples=3).rotation * x,
     "numbers and mathematics": lambda x: jnp.sin(x) * math.pi + np.pi * SIZE + math.cos(SIZE) + np.float64(1.0),
     "an array of JAX": lambda x: ARRAY * x,
+    "a status, an engine": lambda x: (
+        rk.outcome(BLOCK, rk.SinePulse(x, 1.0), engine=rk.Diffrax(rtol=1e-6)).status == rk.Status.successful
+    ),
     "a pair": lambda x: PAIR[0] * x,
     "a function that it calls": lambda x: helper(x),
     "a model of functions": lambda x: rk.outcome(BLOCK, rk.SinePulse(x, 1.0), BENT).margin,

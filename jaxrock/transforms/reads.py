@@ -24,8 +24,8 @@ from jaxrock._label import Label
 
 # Modules of this package whose functions and classes compute from their arguments alone: they read no files, say.
 _PURE = (
-    "blocks.asymmetric", "blocks.flexible", "blocks.restitution", "blocks.rigid", "closed_form", "engines.taylor",
-    "models", "motions.pulses", "responses",
+    "blocks.asymmetric", "blocks.flexible", "blocks.restitution", "blocks.rigid", "closed_form", "engines.diffrax",
+    "engines.taylor", "models", "motions.pulses", "responses", "status",
 )  # fmt: skip
 _IMMUTABLE = (*_PURE, "blocks.edge", "blocks.rock", "motions.motion", "motions.record")
 _NUMBERS = (bool, int, float, complex, str, bytes, type(None))
