@@ -185,6 +185,11 @@ def marked(unless: bool = False) -> Iterator[None]:
         _marks.reset(before)
 
 
+def is_marking() -> bool:
+    """Whether numbers outside of their ranges are marked now."""
+    return _marks.get()
+
+
 def with_throw(function: Making) -> Making:
     """Decorate what makes a block, a law or a motion, and takes `throw`: that is seen to here.
 

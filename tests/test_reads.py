@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock._checks import marked
 from jaxrock.transforms.fingerprint import Traced
 from jaxrock.transforms.reads import reads
 from jaxrock.transforms.user_function import current_function
@@ -167,6 +168,19 @@ def test_traced_again_under_other_settings():
         assert Traced.of(function, single).shapes.dtype == np.float32
     assert Traced.of(function, POINT) is double and double.shapes.dtype == np.float64
     assert Traced.of(function, single).shapes.dtype == np.float64  # of the array
+
+
+def test_traced_again_where_nothing_is_raised():
+    """Checks are put down in one program, and mark what fails in the other."""
+
+    def function(x):
+        return rk.Block(x, 1.0).alpha
+
+    raising = Traced.of(function, POINT)
+    with marked():
+        marking = Traced.of(function, POINT)
+    assert raising is Traced.of(function, POINT) and raising.program.messages and not marking.program.messages
+    assert np.isnan(jax.tree.leaves(marking(-1.0, marking.constants))[0])
 
 
 @pytest.mark.parametrize(

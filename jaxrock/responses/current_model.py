@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxrock._checks import put_down
+from jaxrock._checks import is_traced, put_down
 from jaxrock._guard import guarded
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
@@ -51,14 +51,18 @@ def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block |
     if not isinstance(model, Equation):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
-        for name, falls in zip(("restoring moment", "overturning arm"), _falls(model, side)):
+        # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
+        found = _falls(model, side) if is_traced((model, side)) else _compiled_falls(model, side)
+        for name, falls in zip(("restoring moment", "overturning arm"), found):
             block = guarded(block, falls, f"The {name} must be positive at rotation 0.")
     return block
 
 
-@jax.jit  # one call where there would be fifty
 def _falls(model: Equation, block: Block | Side) -> list[Bool[Array, ""]]:
     return [jnp.any(moment <= 0) for moment in model.at_rest(block)]
+
+
+_compiled_falls = jax.jit(_falls)
 
 
 def _is_functions(node) -> bool:
