@@ -8,6 +8,7 @@ import functools
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from common import least_time, seconds, table  # first: the search path and double precision
 from peers_solvers.report import surroundings
@@ -82,6 +83,19 @@ def of_one():
         yield [name, seconds(single), seconds(of_batch), f"{single / of_batch:.2f}", seconds(plain)]
 
 
+def restoring(x, block):
+    """Of a rigid block, as a user writes it."""
+    return jnp.sin(block.alpha - x)
+
+
+def by_an_equation():
+    """Least time of a call with a model of a user's function, less that of the same by a model of the package [s]."""
+    block, pulse, engine = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 1.2), rk.Diffrax(rtol=1e-4)
+    models = rk.models.Equation(restoring), rk.Linear()
+    own, known = (warm(lambda model: rk.outcome(block, pulse, model, engine=engine).margin, model) for model in models)
+    return seconds(own - known)
+
+
 PAGE = """# What a call costs before its first scene
 
 Written by `python benchmarks/fixed_costs.py`, {machine}.
@@ -97,6 +111,9 @@ One scene in a compiled function, and as a batch of one; as a plain call of a ne
 looked at and placed one by one.
 
 {scenes}
+
+A call by an `Equation` with a function of a user's takes {equation} more than one by a model of the package, of the
+same objects again and again.
 """
 
 
@@ -107,6 +124,7 @@ def main():
     page = PAGE.format(
         machine=surroundings(), calls=CALLS,
         surfaces=table(header, list(of_surfaces())), scenes=table(of_scenes, list(of_one())),
+        equation=by_an_equation(),
     )  # fmt: skip
     (HERE / "fixed_costs.md").write_text(page)
 
