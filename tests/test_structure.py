@@ -355,6 +355,7 @@ SHARED = {
     "_garbage._pauses": "under its lock",
     "native.machine._registered": "under a lock",
     "numerics.compound._OPERATIONS": "changed at import only",
+    "responses.arguments._usual": "the same value, whoever puts it there, by one call of C",
     "sweeps.devices._meetings": "counted by one call of C, and under a lock where there are many processes",
     "sweeps.grid._examples": "changed at import only",
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",

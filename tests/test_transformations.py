@@ -19,6 +19,7 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
+from jaxrock.responses.arguments import _usual, start_of
 
 BLOCK = rk.Block(0.2, 2.0, 0.9)
 COLUMN = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
@@ -310,3 +311,10 @@ def test_settings_are_made_anywhere():
         return x * rk.Series(tolerance=1e-9).tolerance / rk.Diffrax(rtol=1e-9).rtol
 
     np.testing.assert_allclose(jax.grad(lambda x: dealt(scaled)(x).sum())(AT), np.ones(4), rtol=1e-15)
+
+
+def test_what_is_kept_belongs_to_no_trace():
+    """The first scene of a session may be asked for where JAX traces what is known."""
+    _usual.clear()
+    jax.grad(lambda x: dealt(jax.vmap(outcome))(x).sum())(AT)
+    assert not any(isinstance(x, jax.core.Tracer) for x in start_of((0.0, 0.0)))

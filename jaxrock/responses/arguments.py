@@ -1,13 +1,10 @@
 """What `outcome` and `simulate` take alike: the block's kind, the initial state, the engine."""
 
-import functools
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import as_real, checked, marked, scalar, shown, strength
+from jaxrock._checks import as_real, checked, is_traced, marked, scalar, shown, strength
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -50,10 +47,17 @@ def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[
         return _start_of(initial)
 
 
-@functools.lru_cache(maxsize=4)
+_usual: dict[np.dtype, tuple[Scalar, Scalar]] = {}
+
+
 def _at_rest(precision: np.dtype) -> tuple[Scalar, Scalar]:
     """The usual start, in the precision of the session: to make it takes a tenth of an outcome's time."""
-    return as_real("initial[0]", 0.0), as_real("initial[1]", 0.0)
+    if precision in _usual:
+        return _usual[precision]
+    made = as_real("initial[0]", 0.0), as_real("initial[1]", 0.0)
+    if not is_traced(made):  # JAX traces what is known within some transformations
+        _usual[precision] = made
+    return made
 
 
 def _start_of(initial: tuple[ArrayLike, ArrayLike]) -> tuple[Scalar, Scalar]:
