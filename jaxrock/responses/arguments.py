@@ -1,5 +1,6 @@
 """What `outcome` and `simulate` take alike: the block's kind, the initial state, the engine."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
