@@ -64,9 +64,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
     series = expand(start, order)
     terms, speeds = series.opening, series.speed
     size = jnp.minimum(stepper.scene.alpha, jnp.abs(terms[0]) + jnp.abs(terms[1]))
-    last = jnp.abs(terms[-1]) + jnp.abs(terms[-2]) + 0.02 * (jnp.abs(terms[-3]) + jnp.abs(terms[-4]))
-
-    missed, most = last * whole**order, stepper.tolerance * size
+    missed, most = stepper.remainder(start, terms).at(whole), stepper.tolerance * size
     full, half = missed <= most, missed <= 2**order * most
     room = keep_by(where(full, whole, where(half, 0.5, 0.25) * whole), start.one)
     missed = missed * where(full, 1.0, where(half, 0.5**order, 0.25**order))
