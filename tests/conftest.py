@@ -39,21 +39,26 @@ def checked_modules():
 install_import_hook(list(checked_modules()), "beartype.beartype")
 
 # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
-gc.set_threshold(200_000, 10, 10)
+gc.set_threshold(1_000_000, 10, 10)
 
 if "XLA_FLAGS" not in os.environ:
     importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1".strip()
+    fewer = ("simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking")
+    flags = (
+        "--xla_backend_optimization_level=1",
+        "--xla_cpu_parallel_codegen_split_count=1",  # parts that are compiled side by side take longer in all
+        f"--xla_disable_hlo_passes={','.join(fewer)}",
+    )
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
 
-# What a process has compiled it finds again after it has forgotten it; each has its own place, for what one writes
-# another might read half of. The first one makes and clears away the place of all.
+# What one process has compiled all find again, after it was forgotten, too. What one has half written another may read:
+# JAX says so, which is no error here (see `filterwarnings`), and compiles it. The first one clears the place away.
 _PLACE = "JAXROCK_TESTS_COMPILED"
 if _PLACE not in os.environ:
     os.environ[_PLACE] = tempfile.mkdtemp(prefix="jaxrock-tests-")
     atexit.register(shutil.rmtree, os.environ[_PLACE], ignore_errors=True)
-_own = Path(os.environ[_PLACE]) / os.environ.get("PYTEST_XDIST_WORKER", "alone")
-jax.config.update("jax_compilation_cache_dir", str(_own))
+jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_enable_x64", True)
@@ -85,28 +90,20 @@ def _has_many_maps() -> bool:
     return maps.read_bytes().count(b"\n") > _MOST_MAPS
 
 
-def _collect() -> None:
-    """Give back what is garbage: the collector is told to look seldom, and much waits for it."""
-    gc.collect()
-    if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
-        _OF_C.malloc_trim(0)
-
-
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
     """Forget compiled programs before they are too many: each takes memory, and maps pages, and past 65,530 maps XLA
     crashes on Linux."""
     goes_on = nextitem is not None and nextitem.path == item.path
     most = max(_WITHIN if goes_on else _AFTER_A_FILE, _held[0] + _LEAST_GROWTH)
-    many = _has_many_maps()
-    if not many and _memory() <= most:
+    if not _has_many_maps() and _memory() <= most:
         return
-    _collect()
-    if many or _memory() > most - _LEAST_GROWTH / 2:  # else it was garbage, and there is room for a while
-        importlib.import_module("jaxrock.transforms.recipe")._latest.clear()
-        jax.clear_caches()
-        _collect()
-        _held[0] = _memory()
+    importlib.import_module("jaxrock.transforms.recipe")._latest.clear()
+    jax.clear_caches()
+    gc.collect()  # it is told to look seldom, and much waits for it
+    if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
+        _OF_C.malloc_trim(0)
+    _held[0] = _memory()
 
 
 def pytest_collection_finish():
