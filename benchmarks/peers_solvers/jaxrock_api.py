@@ -70,6 +70,7 @@ def under_pulses(problem, engine):
 
 SETTINGS = {
     "pulse": (
+        (1e-4, "tolerance 1e-6", {"tolerance": 1e-6}),
         (1e-6, "tolerance 1e-8", {"tolerance": 1e-8}),
         (1e-10, "tolerance 1e-12", {"tolerance": 1e-12}),
         (1e-12, "default", {}),
