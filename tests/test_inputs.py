@@ -725,6 +725,18 @@ def test_single_precision_among_double():
     np.testing.assert_array_equal(response(ratio), response(ratio.astype(float)))
 
 
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["Housner", "Linear"])
+def test_a_record_in_single_precision_among_double(model):
+    """Every number is of single precision, and what comes of it, too."""
+    samples = (0.3 * np.random.default_rng(0).normal(size=200)).astype(np.float32)
+    short, exact = (
+        rk.outcome(rk.Block(*map(kind, (0.2, 2.0, 0.9))), rk.Record(samples.astype(kind), kind(0.02)), model)
+        for kind in (np.float32, np.float64)
+    )
+    assert short.max_rotation.dtype == jnp.float32 and not exact.overturned
+    np.testing.assert_allclose(short.max_rotation, exact.max_rotation, rtol=1e-4)
+
+
 def test_a_length_of_time_is_no_number():
     with pytest.raises(ValueError, match="Argument `count` must be a whole number"):
         rk.studies.use_cpu_devices(np.timedelta64(1, "s"))

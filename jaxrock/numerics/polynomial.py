@@ -187,14 +187,10 @@ def last_size(coefficients: list[Scalar]) -> Scalar:
 
 def step_length(coefficients: list[Scalar], size: Scalar | float, cap: Scalar) -> Scalar:
     """Step at which the last coefficients drop below `size`, at most `cap`."""
-    return length_within(last_size(coefficients), len(coefficients) - 1, size, cap)
-
-
-def length_within(coefficient: Scalar, degree: int, size: Scalar | float, cap: Scalar) -> Scalar:
-    """Length up to which a term of this degree (6 or more) stays below `size`, at most `cap`."""
-    tiny = jnp.finfo(coefficient.dtype).tiny
-    ratio = size / jnp.maximum(coefficient, tiny)
-    return jnp.minimum(where(coefficient > tiny, root_of(ratio, degree), jnp.inf), cap)
+    order, last = len(coefficients) - 1, last_size(coefficients)
+    tiny = jnp.finfo(last.dtype).tiny
+    ratio = size / jnp.maximum(last, tiny)
+    return jnp.minimum(where(last > tiny, root_of(ratio, order), jnp.inf), cap)
 
 
 def longest(order: int, dtype: Any) -> float:

@@ -31,7 +31,6 @@ from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
 from jaxrock.engines.taylor.policy import POLICY, exact
-from jaxrock.engines.taylor.remainder import Remainder
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
@@ -43,8 +42,10 @@ from jaxrock.numerics.polynomial import (
     first_event,
     jet,
     keeps_sign,
+    last_size,
     longest,
     rescaled,
+    step_length,
 )
 from jaxrock.numerics.xla_cpu import keep, unseen_one
 from jaxrock.status import Status
@@ -60,7 +61,7 @@ class Series(AbstractEngine):
 
     **Arguments:**
 
-    - `order`: order of the Taylor steps, at least 4; None takes 8 for motions of many pieces (records), else 20 for
+    - `order`: order of the Taylor steps, at least 4; None takes 9 for motions of many pieces (records), else 20 for
       linear equations and 16 for others, and fewer where a `tolerance`, or single precision, leaves room for it.
     - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
       ones take less time where there are many scenes, and leave more of them undecided.
@@ -131,10 +132,6 @@ class TaylorStepper(AbstractStepper):
     def longest(self) -> float:
         """How long a step may be, in the unit of its series."""
         return min(16.0, longest(self.order, self.scene.p.dtype))
-
-    def remainder(self, start: Start, terms: list[Scalar]) -> Remainder:
-        """What the series of a step leaves out."""
-        return Remainder.of(start, terms, POLICY.is_record(self.scene.most_pieces))
 
     def advance(self, state: State) -> State:
         """One step of a lane."""
@@ -354,8 +351,7 @@ class _Step(NamedTuple):
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)
-        remainder = stepper.remainder(start, coefficients)
-        length = remainder.reach(stepper.tolerance * size, jnp.minimum(room, stepper.longest))
+        length = step_length(coefficients, stepper.tolerance * size, jnp.minimum(room, stepper.longest))
         full = length >= room * (1 - 1e-9)
         length = keep(where(full, room, length), state.local)
         opening, speed = (keep(value, state.local) for value in jet(coefficients, length, 1))
@@ -374,7 +370,7 @@ class _Step(NamedTuple):
             length=length,
             full=full,
             rounded=stepper.rounding * size,
-            missed=remainder.at(length),
+            missed=last_size(coefficients) * length**order,
             signs=signs,
             monotone=monotone,
             faster=faster,

@@ -22,10 +22,9 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
-from jaxrock.engines.taylor.remainder import Remainder
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.newton import root_between
-from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign
+from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
 
@@ -82,13 +81,13 @@ class _Part(NamedTuple):
     certain: Flag
 
 
-def _part(start: Start, terms: list[Scalar], remainder: Remainder, room: Scalar, least: Scalar, most: float) -> _Part:
-    """As much of a step as is certain, `most` at most; `least`: what the series may leave out."""
+def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: float) -> _Part:
+    """As much of a step as is certain, `most` at most; `least`: what the last coefficients may contribute."""
     one, before, first = start.one, terms[1], 2 * terms[2]
     cap = jnp.minimum(room, most)
     # Under records nearly all steps go as far as there is room: no root is taken for them.
-    short = ~(remainder.at(cap) <= least)
-    longest = _if(short, lambda: remainder.reach(least, cap), cap)
+    short = ~(last_size(terms) * cap ** (len(terms) - 1) <= least)
+    longest = _if(short, lambda: step_length(terms, least, cap), cap)
     reaches = longest >= room * (1 - 1e-9)
     longest = keep_by(where(reaches, room, longest), one)
     rises = where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
@@ -213,11 +212,12 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
 
-def _missed(stepper: TaylorStepper, remainder: Remainder, at: Scalar, least: Scalar) -> Scalar:
-    """What the series of a step leaves out; `least`: what it may. A step that ends early misses less."""
+def _missed(stepper: TaylorStepper, terms: list[Scalar], at: Scalar, least: Scalar) -> Scalar:
+    """What the last terms contribute to a step; `least`: what they may. A step that ends early misses less."""
     if stepper.rounding == stepper.tolerance:
         return least
-    return jnp.minimum(least, jnp.maximum(remainder.at(at), stepper.rounding / stepper.tolerance * least))
+    contributed = last_size(terms) * at**stepper.order
+    return jnp.minimum(least, jnp.maximum(contributed, stepper.rounding / stepper.tolerance * least))
 
 
 def _stands(stepper: TaylorStepper, meeting: _Meeting) -> Flag | bool:
@@ -241,8 +241,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     terms = expand(start, order).opening
     size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in terms[: max(order // 2, 4)]])
     least = stepper.tolerance * keep_by(jnp.minimum(scene.alpha, size), one)
-    remainder = stepper.remainder(start, terms)
-    part = _part(start, terms, remainder, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least, stepper.longest)
+    part = _part(start, terms, jnp.minimum(stepper.room(state) * (1 / unit), 32.0), least, stepper.longest)
     meeting = _meeting(start, terms, part, state)
     at, hits = meeting.at, meeting.hits
     fast, sure = _fastest(start, terms, part, at, state.fastest * stretch)
@@ -254,7 +253,7 @@ def advance(stepper: TaylorStepper, state: State) -> State:
     full = part.full & ~(hits.saddle | hits.impact | hits.turning)
     piece, local, over = stepper.move_on(state, elapsed, full)
     time = where(at > 0, at * stretch, jnp.inf)  # there are pieces of no length
-    missed = _missed(stepper, remainder, at, least)
+    missed = _missed(stepper, terms, at, least)
     errors = 2 * missed, 2 * missed * jnp.maximum(order / time, 1.0)
     spread = errors_after(stepper, state, start.angle, shaking.now, elapsed, errors)
     passed = replace(

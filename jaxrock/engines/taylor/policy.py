@@ -21,7 +21,7 @@ class Policy(NamedTuple):
 
     pulse_order: int = 16
     linear_order: int = 20
-    record_order: int = 8
+    record_order: int = 9
     many_pieces: int = 32
     outcome_steps: int = 100_000
     history_steps: int = 4096

@@ -14,7 +14,7 @@ from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.polynomial import horner
+from jaxrock.numerics.polynomial import horner, last_size
 from jaxrock.numerics.xla_cpu import keep_by
 
 Scalar = Inexact[Array, ""]
@@ -64,7 +64,7 @@ def _by_series(stepper: TaylorStepper, start: Start, unit: Scalar, whole: Scalar
     series = expand(start, order)
     terms, speeds = series.opening, series.speed
     size = jnp.minimum(stepper.scene.alpha, jnp.abs(terms[0]) + jnp.abs(terms[1]))
-    missed, most = stepper.remainder(start, terms).at(whole), stepper.tolerance * size
+    missed, most = last_size(terms) * whole**order, stepper.tolerance * size
     full, half = missed <= most, missed <= 2**order * most
     room = keep_by(where(full, whole, where(half, 0.5, 0.25) * whole), start.one)
     missed = missed * where(full, 1.0, where(half, 0.5**order, 0.25**order))
