@@ -603,6 +603,7 @@ CALLS: dict[str, Call] = {
         },
         True,
         ".*",
+        raises=(ImportError,),  # says what to install
     ),
     "Posterior.interval": Call(posterior().interval, {"share": 0.9}),
     "feasible_region": Call(
