@@ -188,3 +188,33 @@ def test_an_end_without_balance_has_no_derivatives():
     factor = float(value) / float(rk.intensity.peak_acceleration(scene[1]))
     verdicts = [bool(rk.outcome(scene[0], x * factor * scene[1]).overturned) for x in (1 - 1e-12, 1 + 1e-12)]
     assert verdicts == [False, True]
+
+
+def test_the_amplitude_of_a_sum_is_its_own_peak():
+    """Which is far below what its parts add up to, where they take from each other."""
+    block, shape = rk.Block(0.2, 2.0, 0.9), np.sin(6 * np.arange(0, 1.2, 0.01))
+    first, second = rk.Record(0.3 * shape, 0.01), rk.Record(0.25 * shape, 0.01)
+    asked = {"intensity": (1.0, 2.0), "derivatives": False, "progress": False}
+    found = rk.critical_amplitudes(block, first - second, **asked)
+    alone = rk.critical_amplitudes(block, rk.Record(0.05 * shape, 0.01), **asked)
+    assert alone.count == found.count == 1
+    np.testing.assert_allclose(found.value, alone.value, rtol=1e-12)
+    np.testing.assert_allclose(found.intensity, alone.intensity, rtol=1e-12)
+    with pytest.raises(ValueError, match="Argument `motion` must move the ground"):
+        rk.critical_amplitudes(block, first - first, **asked)
+
+
+def test_ends_of_a_sum_of_pulses_are_ends():
+    """The verdict changes there, and derivatives are those of differences."""
+    block, asked = rk.Block(0.2, 2.0, 0.9), {"intensity": (4.0, 5.0), "progress": False}
+
+    def motion(amplitude):
+        return rk.SinePulse(amplitude, 0.6) + rk.SinePulse(0.2, 0.3)
+
+    found = rk.critical_amplitudes(block, motion(0.3), **asked)
+    peak = rk.intensity.peak_acceleration(motion(0.3))
+    verdicts = [bool(rk.outcome(block, found.lowest * (1 + x) / peak * motion(0.3)).overturned) for x in (-1e-6, 1e-6)]
+    assert verdicts == [False, True]
+    ends = [rk.critical_amplitudes(block, motion(0.3 + x), **asked).lowest for x in (-1e-5, 1e-5)]
+    slope = found.derivative[int(np.argmin(found.value)), found.names.index("first.amplitude")]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-6)

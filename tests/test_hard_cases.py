@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -225,6 +226,24 @@ def test_elastic_impacts_never_end():
     assert history(FREE["tiny, no loss"])["status"] == rk.Status.step_budget_exhausted._value
     again = rk.outcome(rk.Block(*ELASTIC), rk.SinePulse(0.6, 1.0), rk.Linear(), engine=rk.Series(order=6, max_steps=3))
     assert again.status == rk.Status.step_budget_exhausted
+
+
+def test_a_history_ends_where_its_steps_are_used_up():
+    """What was followed is there, and beyond it are no numbers."""
+    scene = rk.Block(0.2, 2.0, 1.0), rk.RectangularPulse(0.0, 1.0)
+    whole = rk.simulate(*scene, initial=(0.1, 0.0), duration=100.0)
+    cut = rk.simulate(*scene, initial=(0.1, 0.0), duration=100.0, engine=rk.Series(max_steps=40))
+    assert cut.status == rk.Status.step_budget_exhausted and whole.status == rk.Status.successful
+    last = float(np.max(cut.impact_times))
+    assert 3 < last < 30
+    for time in (1.0, last - 1e-6):
+        np.testing.assert_allclose(cut(time), whole(time), rtol=1e-9, atol=1e-12)
+    assert np.all(np.isnan(cut(99.0)))
+    followed = np.isfinite(cut.rotation)
+    assert np.all(followed[cut.time < last]) and not np.any(followed[cut.time > last + 2])
+    assert np.abs(cut.rotation[followed]).max() < 0.1 * (1 + 1e-9)
+    rk.plot.history(cut)
+    plt.close("all")
 
 
 def test_accumulation_and_new_uplift():

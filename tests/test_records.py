@@ -310,6 +310,8 @@ def test_two_columns(file, content):
     "title, per_g",
     [
         ("time,acceleration [g]", 1.0),
+        ("time,acceleration [m/s²]", 9.80665),
+        ("time,acceleration [m s-2]", 9.80665),
         ("t (s),a (m/s^2)", 9.80665),
         ("# time [s], acceleration [cm/s2]", 980.665),
         ("Station A (upper)\nt [s], a [Gal]\n", 980.665),
@@ -322,12 +324,45 @@ def test_unit_of_a_column_is_in_its_title(file, title, per_g):
         read_record(path, unit="m/s2" if per_g != 9.80665 else "g")
 
 
-@pytest.mark.parametrize("title", ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a", "[g],a"])
+@pytest.mark.parametrize("title", ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a"])
 def test_other_titles_state_no_unit(file, title):
     path = file(f"{title}\n{PAIRS}")
     with pytest.raises(ValueError, match="which states none"):
         read_record(path)
     np.testing.assert_allclose(read_record(path, unit="g").samples, SAMPLES)
+
+
+@pytest.mark.parametrize("unit", ["mg", "%g", "mGal", "ft/s2", "mm/s2", "cm/s", "m", "counts"])
+@pytest.mark.parametrize("given", [None, "g"])
+def test_a_column_in_another_unit_is_refused_whatever_is_asked_for(file, unit, given):
+    with pytest.raises(ValueError, match=f"line 1 states the unit '{unit}', but accelerations must be in g"):
+        read_record(file(f"time [s],motion [{unit}]\n{PAIRS}"), unit=given)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("s", 1.0), ("sec.", 1.0), ("ms", 1e-3), ("us", 1e-6), ("min", 60.0)])
+def test_unit_of_times_is_in_their_title(file, unit, seconds):
+    usual = read_record(file(PAIRS), unit="g")
+    record = read_record(file(f"t ({unit}),a [g]\n{PAIRS}"))
+    np.testing.assert_allclose(record.dt, seconds * usual.dt, rtol=1e-12)
+    with pytest.raises(ValueError, match="Argument `dt` must agree with file"):
+        read_record(file(f"t ({unit}),a [g]\n{PAIRS}"), dt=3 * seconds * usual.dt)
+
+
+@pytest.mark.parametrize("title", ["frequency [Hz]", "period [s]", "Period", "NS [g]", "t [Hz]"])
+def test_what_is_said_to_be_no_time_is_none(file, title):
+    with pytest.raises(ValueError, match="before accelerations there must be times"):
+        read_record(file(f"{title},Sa [g]\n{PAIRS}"))
+
+
+@pytest.mark.parametrize("title", ["", "step", "Sample", "#,n"])
+def test_a_count_of_samples_is_no_time(file, title):
+    rows = "".join(f"{k},{a!r}\n" for k, a in enumerate(SAMPLES.tolist()))
+    path = file(f"{title.removeprefix('#,')},a [g]\n{rows}")
+    with pytest.raises(ValueError, match="Argument `dt` must be given for text file"):
+        read_record(path)
+    record = read_record(path, dt=0.02)
+    np.testing.assert_array_equal(record.samples, SAMPLES)
+    assert record.dt == 0.02
 
 
 @pytest.mark.parametrize("unit, per_g", [("g", 1.0), ("m/s2", 9.80665), ("cm/s2", 980.665)])

@@ -51,10 +51,12 @@ class Trajectory(eqx.Module):
         return jax.tree.map(lambda x: x.reshape(*time.shape, *x.shape[1:]), jax.vmap(at)(time.ravel()))
 
     def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
-        """The node before a time, and how long after it that is [s]."""
+        """The node before a time, and how long after it that is [s]; not a number where no step was left for that."""
         index = jnp.clip(count_up_to(self.times, time) - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
-        return node, jnp.minimum(time, self.duration) - self.times[index]
+        elapsed = jnp.minimum(time, self.duration) - self.times[index]
+        is_followed = node.done | (index < self.times.size - 1) | (elapsed <= 0)
+        return node, where(is_followed, elapsed, jnp.nan)
 
     def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
         """The values where something happened, in this order; under jit filled up: infinite times, zeros beside them.

@@ -21,7 +21,7 @@ from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
-from jaxrock.engines.scene import peak_bound, uplift_threshold
+from jaxrock.engines.scene import uplift_threshold
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -29,7 +29,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.responses.current_model import current_model
 from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.lowest_ends import lowest_ends
-from jaxrock.studies.parameters import named
+from jaxrock.studies.parameters import named, peak_of
 from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, on_border
 from jaxrock.sweeps.sweep import known_surface, surface
 
@@ -165,7 +165,7 @@ class _Scenes(eqx.Module):
 
     both: PyTree  # block and motion
     threshold: Float[Array, " scenes"]  # [g]
-    peak: Float[Array, " scenes"]  # bound of the acceleration [g]
+    peak: Float[Array, " scenes"]  # of the acceleration [g]
     amplitude: Float[Array, " scenes"]  # as the motion names it [g]
     single: bool = eqx.field(static=True)
 
@@ -196,7 +196,7 @@ def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Arr
 
     def one(index):
         block, motion = one_of_many(both, index)
-        return uplift_threshold(block, model), peak_bound(motion), jnp.abs(named(block, motion)["amplitude"])
+        return uplift_threshold(block, model), peak_of(motion), jnp.abs(named(block, motion)["amplitude"])
 
     return jax.vmap(one)(jnp.arange(size))
 

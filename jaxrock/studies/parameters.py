@@ -13,7 +13,8 @@ from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
-from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.motions.intensity import peaks_of_motion
+from jaxrock.motions.motion import AbstractMotion, Scaled, Summed
 
 Real = Inexact[Array, "..."]
 AnyBlock = Block | AsymmetricBlock | FlexibleBlock
@@ -31,7 +32,13 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     """
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
     found |= {leaf.name: leaf.value for leaf in _numbers(motion)}
-    return found if "amplitude" in found else found | {"amplitude": peak_bound(motion)}
+    return found if "amplitude" in found else found | {"amplitude": peak_of(motion)}
+
+
+def peak_of(motion: AbstractMotion) -> Real:
+    """Peak acceleration [g]; of a sum its own, which may be far below what its parts add up to."""
+    parts = jax.tree.leaves(motion, is_leaf=lambda x: isinstance(x, Summed))
+    return peaks_of_motion(motion)[0] if any(isinstance(x, Summed) for x in parts) else peak_bound(motion)
 
 
 def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter]:
@@ -88,7 +95,7 @@ def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real]) -> Abstract
     new = [values[leaf.name] for leaf in numbers]
     changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
     if "amplitude" not in [leaf.name for leaf in numbers]:
-        changed = Scaled(changed, values["amplitude"] / jax.lax.stop_gradient(peak_bound(motion)))
+        changed = Scaled(changed, values["amplitude"] / jax.lax.stop_gradient(peak_of(motion)))
     return changed
 
 

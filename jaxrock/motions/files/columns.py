@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
-from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, is_unit, to_float
+from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, to_float
+from jaxrock.motions.files.titles import Titles
 
 _FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 
@@ -38,9 +39,10 @@ class Columns(AbstractFormat):
             allowed = f"be 0 to {width - 1}, the column of accelerations in text file `{name}`"
             raise ValueError(f"Argument `column` must {allowed}, but is {column}.")
         chosen = width - 1 if column is None else column
-        line, written = _title(lines, numbers[0] - 1, chosen, width)
+        titles = _titles(lines, numbers[0] - 1, width)
+        written = titles.unit_of(chosen)
         if written:
-            unit = agreed_unit(name, line, unit, written)
+            unit = agreed_unit(name, titles.line, unit, written)
         if unit is None:
             allowed = "be 'g', 'm/s2' or 'cm/s2'"
             raise ValueError(f"Argument `unit` must {allowed} for text file `{name}`, which states none, but is None.")
@@ -48,24 +50,19 @@ class Columns(AbstractFormat):
         # Beside `column` and `dt`, column 0 may hold accelerations too; only times never fall.
         rising = times[-1] > times[0] and (np.diff(times) >= 0).all()
         if chosen > 0 and (column is None or dt is None or rising):
-            dt = agreed_step(name, dt, _step(name, times, numbers, printed))
+            seconds = titles.seconds(name, times)
+            if seconds is not None:
+                dt = agreed_step(name, dt, float(f"{seconds * _step(name, times, numbers, printed):.12g}"))
         if dt is None:
             raise ValueError(f"Argument `dt` must be given for text file `{name}`, which has no times, but is None.")
         return Accelerogram(table[:, chosen], dt, unit, "")
 
 
-_BRACKETS = re.compile(r"[\[(]\s*([^()\[\]]+?)\s*[\])]$")
-
-
-def _title(lines: list[str], first: int, column: int, width: int) -> tuple[int, str]:
-    """The line that titles the columns, above the `first` of numbers, and the unit in brackets that it gives to one.
-
-    The unit is empty where there is none, or another word in brackets.
-    """
+def _titles(lines: list[str], first: int, width: int) -> Titles:
+    """What is written above the `first` line of numbers, if it has a title for each column."""
     number = next((k for k in range(first, 0, -1) if lines[k - 1].strip()), 0)
     fields = _fields(lines[number - 1].lstrip("# ")) if number else []
-    written = _BRACKETS.search(fields[column]) if len(fields) == width else None
-    return number, written[1] if written and is_unit(written[1]) else ""
+    return Titles(number, fields if len(fields) == width else [])
 
 
 def _fields(line: str) -> list[str]:

@@ -13,7 +13,11 @@ from jaxrock._text import file_error
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `rigid.GRAVITY`, the g of the papers)
 PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY}
-_SPELLINGS = {"g": "g", "m/s2": "m/s2", "m/s/s": "m/s2"} | dict.fromkeys(["cm/s2", "cm/s/s", "gal", "gals"], "cm/s2")
+_SPELLINGS = (
+    {"g": "g"}
+    | dict.fromkeys(["m/s2", "m/s/s", "m s-2"], "m/s2")
+    | dict.fromkeys(["cm/s2", "cm/s/s", "cm s-2", "gal", "gals"], "cm/s2")
+)
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 
 # A broken first line of data must not pass for a line of the header.
@@ -37,7 +41,7 @@ def agreed_step(name: str, given: float | None, stated: float) -> float:
 
 
 def _spelling(written: str) -> str:
-    return re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s")
+    return re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s").replace("²", "2")
 
 
 def is_unit(written: str) -> bool:
