@@ -14,7 +14,8 @@ from jaxrock.motions.files.parsing import is_unit
 _BRACKETS = re.compile(r"[\[(]\s*([^()\[\]]+?)\s*[\])]$")
 # Units that accelerations are not read in, or that are of something else: any speed or length, parts of g, volts.
 _OTHER_UNIT = re.compile(
-    r"(%|milli|micro|[mµμu])[-\s]*(g|gals?)|.*(/|\bper\b)\s*s(ec(onds?)?)?(/s(ec)?|[\^*]*[2²])?|.*\bs(ec)?\^?[-−][12]"
+    r"(%|milli|micro|[mµμu])[-\s]*(g|gals?)"
+    r"|.*(/|\bper\b)\s*s(ec(onds?)?)?(/s(ec)?|[\^*]*[2²])?|.*\bs(ec)?\^?[-−][12]"
     r"|[kcmµμ]?m|in(ch(es)?)?|ft|feet|[mµμ]?v(olts?)?|counts?",
     re.IGNORECASE,
 )
