@@ -54,7 +54,7 @@ class Response(AbstractTable):
     - `impact_count`, `max_rotation` [rad], `time_of_max` [s], `max_velocity` [rad/s]: within the duration.
     - `overturned`, `margin`, `status`: as in `Outcome`; the verdict looks beyond a duration that covers the motion.
 
-    After the last of the engine's steps, where these were too few (see `status`), rotation and velocity are not numbers.
+    Beyond the engine's last step, where it had too few (see `status`), rotation and velocity are not numbers.
     Under jit or vmap the arrays of impacts and peaks have fixed length: times are filled up with inf, values
     with 0. Outside they hold the events alone.
     """
