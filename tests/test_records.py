@@ -457,7 +457,11 @@ def test_many_columns_without_times(file):
             PAIRS.replace("0.3", "0.3,1"), {}, "line 3 has 3 columns, but line 1 has 2", id="additional field"
         ),
         pytest.param(PAIRS.replace("0.3", ""), {}, "line 3 has 1 column, but line 1 has 2", id="empty field"),
-        pytest.param("0,00;0,1\n0,01;0,2\n", {}, "line 1 holds more than numbers", id="decimal commas"),
+        pytest.param(
+            "0,00;0,1\n0,01;0,2\n", {}, "line 1 holds decimal commas, which must be points", id="decimal commas"
+        ),
+        pytest.param("t [s];a [g]\n0;0,1e-3\n", {}, "line 2 holds decimal commas", id="decimal commas below titles"),
+        pytest.param("0\t0,1\n", {}, "line 1 holds decimal commas", id="decimal commas and tabs"),
         pytest.param("0.00 1_0\n0.01 1_1\n", {}, "line 1 holds more than numbers", id="underscores"),
         pytest.param("time,acceleration\n", {}, "no line holds columns of numbers", id="header only"),
         pytest.param("0.0,0.1\n", {}, "has one row only, so its times give no time step", id="one row"),

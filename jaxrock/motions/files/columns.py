@@ -10,6 +10,8 @@ from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, to_float
 from jaxrock.motions.files.titles import Titles
 
+_COMMA = r"[-+]?\d+(?:,\d+)?(?:[EeDd][-+]?\d+)?"
+_DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d){_COMMA}(?:[;\s]+{_COMMA})+[;\s]*")
 _FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 
 
@@ -87,6 +89,8 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
         if not all(_FIELD.fullmatch(field) for field in fields):
             if rows:
                 raise file_error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
+            if _DECIMAL_COMMAS.fullmatch(line):
+                raise file_error(name, f"line {number} holds decimal commas, which must be points: {line[:60]!r}.")
             if LIKE_DATA.match(line):
                 hint = "if it belongs to a header, let it start with #"
                 raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
