@@ -89,11 +89,7 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
         if not all(_FIELD.fullmatch(field) for field in fields):
             if rows:
                 raise file_error(name, f"line {number} should hold numbers only, but is {line[:60]!r}.")
-            if _DECIMAL_COMMAS.fullmatch(line):
-                raise file_error(name, f"line {number} holds decimal commas, which must be points: {line[:60]!r}.")
-            if LIKE_DATA.match(line):
-                hint = "if it belongs to a header, let it start with #"
-                raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
+            _check_header(name, number, line)
             continue
         row = [to_float(field) if field[-1].isdigit() or field[-1] == "." else np.nan for field in fields]
         if not np.isfinite(row).all():
@@ -108,6 +104,15 @@ def _table(name: str, lines: list[str]) -> tuple[np.ndarray, Sequence[int], list
     if rows:
         check_end(name, lines, last)
     return np.array(rows), numbers, first
+
+
+def _check_header(name: str, number: int, line: str) -> None:
+    """Refuse a line of a header that looks like numbers."""
+    if _DECIMAL_COMMAS.fullmatch(line):
+        raise file_error(name, f"line {number} holds decimal commas, which must be points: {line[:60]!r}.")
+    if LIKE_DATA.match(line):
+        hint = "if it belongs to a header, let it start with #"
+        raise file_error(name, f"line {number} holds more than numbers ({hint}): {line[:60]!r}.")
 
 
 _MARKS = re.compile(r"[^-+.0-9EeDd \t\n,]")
