@@ -242,6 +242,10 @@ def test_a_history_ends_where_its_steps_are_used_up():
     followed = np.isfinite(cut.rotation)
     assert np.all(followed[cut.time < last]) and not np.any(followed[cut.time > last + 2])
     assert np.abs(cut.rotation[followed]).max() < 0.1 * (1 + 1e-9)
+    forces = rk.responses.contact_forces(cut, scene[0])
+    for force in (forces.normal, forces.friction):
+        np.testing.assert_array_equal(np.isfinite(force), followed)
+    assert 0 < forces.least_normal < 1 and 0 < forces.largest_friction < 1
     rk.plot.history(cut)
     plt.close("all")
 

@@ -122,8 +122,8 @@ def _at_impacts(response: Response, side: float, here: tuple[Scalar, Scalar], th
 
 
 def _friction(horizontal, normal):
-    held = normal > 0
-    return jnp.where(held, jnp.abs(horizontal) / jnp.where(held, normal, 1.0), jnp.inf)
+    lost = normal <= 0  # not where nothing is known
+    return jnp.where(lost, jnp.inf, jnp.abs(horizontal) / jnp.where(lost, 1.0, normal))
 
 
 def _forces(scene: Scene, sides: list, time: Scalar, rotation: Scalar, velocity: Scalar, side: Scalar | None = None):
