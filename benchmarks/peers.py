@@ -3,8 +3,8 @@
     python benchmarks/peers.py [--problems P1 P4 ...] [--peers taylor scipy ...] [--quick] [--repeat 3]
 
 Seven problems (`references/peer_problems.py`), every peer with settings for errors of about 1e-6, 1e-10 and 1e-12 where
-it can, all on all cores, timed after compilation. Errors are against references of 30 digits (`references/peers.json`).
-And one block at a time under a record, on one core (`--problems one`).
+it can (of pulses the fastest two also 1e-4), all on all cores, timed after compilation. Errors are against references
+of 30 digits (`references/peers.json`). And one block at a time under a record, on one core (`--problems one`).
 Writes `peers.md`, `peers.png` and `peers.json` beside this file. `--quick`: fewer scenes, once each; `--draw`: table
 and picture again from the numbers; `--keep`: measures some again and keeps the others. A peer that is not installed
 is listed as skipped.

@@ -46,19 +46,30 @@ def as_real(name: str, value: Values) -> Inexact[Array, "..."]:
         return _as_real(name, value)
 
 
+def native(numbers: np.ndarray) -> np.ndarray:
+    """The same as JAX takes them: in this machine's order of bytes, of double precision at most."""
+    kind = numbers.dtype.newbyteorder("=") if numbers.dtype.itemsize <= 8 else np.dtype(float)
+    return numbers.astype(kind, copy=False)
+
+
+def check_unmasked(name: str, value: Any) -> None:
+    """Raise ValueError for an array of NumPy with values that are masked: what lies under a mask is no number."""
+    if np.ma.is_masked(value):
+        raise ValueError(f"Argument `{name}` must have a value everywhere, but some are masked.")
+
+
 def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
     if _holds_no_number(value):
         raise _no_number(name, value)
-    if np.ma.is_masked(value):
-        raise ValueError(f"Argument `{name}` must have a value everywhere, but some are masked.")
+    check_unmasked(name, value)
     usual = jnp.result_type(float)
     try:
         # A number of Python leaves a weak type behind, which would recompile every function it meets; NumPy's do not.
         known = value if isinstance(value, jax.Array) or is_traced(value) else np.array(value)
         if isinstance(known, np.ndarray) and known.dtype.kind in "fiu":
-            is_real = known.dtype.kind == "f" and usual.itemsize // 2 <= known.dtype.itemsize <= 8
-            kind = known.dtype.newbyteorder("=") if is_real else usual  # of integers, of half and extended precision
-            return placed(known.astype(kind, copy=False))
+            known = native(known)
+            is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
+            return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
         array = jnp.asarray(known)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error

@@ -748,12 +748,15 @@ def test_a_record_in_single_precision_among_double(model):
 def test_numbers_in_any_order_of_bytes_and_of_any_precision(kind):
     samples = np.array([0, 1, 3, 2], kind)
     np.testing.assert_array_equal(rk.Record(samples, 0.1).samples, [0, 1, 3, 2])
+    np.testing.assert_array_equal(rk.sweep(lambda x: 2.0 * x, x=samples, progress=False).values, [0, 2, 6, 4])
 
 
 def test_masked_values_are_no_numbers():
     samples = np.ma.masked_values([0.1, 0.3, 999.0, 0.2], 999.0)
     with pytest.raises(ValueError, match="Argument `acceleration` must have a value everywhere, but some are masked"):
         rk.Record(samples, 0.1)
+    with pytest.raises(ValueError, match="Argument `p` must have a value everywhere, but some are masked"):
+        rk.sweep(lambda p: p, p=samples, progress=False)
     np.testing.assert_array_equal(rk.Record(np.ma.array([0.1, 0.3]), 0.1).samples, [0.1, 0.3])  # none is
 
 

@@ -41,7 +41,8 @@ class Critical(AbstractTable):
     """Ends of overturning intervals, in rising order; (ends,) for one scene, (scenes, ends) for many, then filled up.
 
     - `count`: number of ends.
-    - `value`: amplitude [g], or duration (or period) of the motion [s]; infinite where filled up.
+    - `value`: amplitude [g], or duration (or period) of the motion [s]; infinite where filled up. Of a motion that
+      names no amplitude (a record, a sum) it is the peak: over `intensity.peak_acceleration(motion)` a factor on it.
     - `intensity`: the amplitude over the uplift threshold [-].
     - `rising`: the block overturns above this end, and not below.
     - `impacts`: before it overturns, just beside this end.

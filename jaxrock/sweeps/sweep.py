@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
-from jaxrock._checks import is_traced, placed
+from jaxrock._checks import check_unmasked, is_traced, native, placed
 from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
 from jaxrock._tables import needed
@@ -188,12 +188,14 @@ def _there(store: Store) -> np.ndarray:
 
 
 def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
+    check_unmasked(name, values)
     array = np.asarray(values)
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
             f"{array.dtype}."
         )
+    array = native(array)
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
 
 

@@ -1,6 +1,6 @@
 """What the titles of columns of text say: the unit of accelerations, and what the numbers beside them are.
 
-Nothing is guessed: a unit that is none of these is refused, and so is a first column that is said to be no time.
+Nothing is guessed: what looks like another unit is refused, and so is a first column that is said to be no time.
 """
 
 import re
