@@ -88,6 +88,28 @@ QUESTIONS = {
         "answer = jax.vmap(jax.hessian(peak))(x)",
         30.0, 1.5,
     ),
+    "history_slopes": (
+        "gradient of a history by 5",
+        "def misfit(x):\n"
+        "    history = rk.simulate(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4]))\n"
+        "    return jnp.sum(history(jnp.linspace(0.0, 2.0, 200))[0] ** 2)\n"
+        "answer = jax.grad(misfit)(jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]))",
+        6.0, 1.0,
+    ),
+    "history_hessian": (
+        "its Hessian",
+        "def misfit(x):\n"
+        "    history = rk.simulate(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4]))\n"
+        "    return jnp.sum(history(jnp.linspace(0.0, 2.0, 200))[0] ** 2)\n"
+        "answer = jax.hessian(misfit)(jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]))",
+        30.0, 1.5,
+    ),
+    "samples": (
+        "gradient by all samples of a record",
+        "samples, dt = 1.5 * rk.example_record().samples, rk.example_record().dt\n"
+        "answer = jax.grad(lambda s: rk.outcome(block, rk.Record(s, dt)).max_rotation)(samples)",
+        6.0, 1.0,
+    ),
     "asymmetric": (
         "asymmetric rock, vertical shaking, `vmap`",
         "rock = rk.blocks.AsymmetricBlock(0.15, 0.25, 2.0)\n"

@@ -1,6 +1,7 @@
 """The history of a block under a motion."""
 
 import functools
+from dataclasses import replace
 from typing import Annotated, overload
 
 import equinox as eqx
@@ -254,7 +255,7 @@ def _equally_spaced(path: Trajectory, samples: int):
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
     scene = Scene.of(block, motion, model)
     stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration)
-    run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like, plain=_plainly)
+    run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like)
     state, nodes, final = run((block, motion, model, initial, stop, engine))
     stepper = engine.stepper(scene, stop, history=True)
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
@@ -290,19 +291,12 @@ def _followed(given) -> tuple[State, State, Outcome]:
     return _steps(*given)
 
 
-def _plainly(given) -> tuple[State, State, Outcome]:
-    return _steps(*given, plain=True)
-
-
 def _on_tape(given) -> tuple[State, State, Outcome]:
     return _steps(*given, taped=True)
 
 
-def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False, plain: bool = False):
-    """The state at the end of a history, the states before all steps (and after the last), and what came of it.
-
-    `plain`: a step is not a thing of its own, which would have derivatives by all that it starts from.
-    """
+def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
+    """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
     scene = Scene.of(block, motion, model)
     stop = stop.astype(scene.p.dtype)
     stepper, budget = engine.stepper(scene, stop, history=True, taped=taped), engine.budget(scene, history=True)
@@ -310,12 +304,12 @@ def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False, 
     if taped:
         state, nodes = stepper.on_tape(state, budget)
         nodes = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]])[: budget + 1], nodes, state)
-    elif plain or not engine.in_lanes:
+    elif not engine.in_lanes:
         state, nodes = followed(lambda s: stepper.advance(s), state, budget, engine.loop)
     else:
-        step = differentiable(_step, name="step", results=lambda given: given[1], in_lanes=True)
+        step = differentiable(_step, name="step", results=lambda given: given[1], in_lanes=True, derivatives="in a direction")
         state, nodes = followed(lambda s: step((stepper, s)), state, budget, engine.loop)
-    return state, nodes, _concluded(stepper, state, plain or taped)
+    return state, nodes, _concluded(stepper, state, taped)
 
 
 def _step(given) -> State:
@@ -323,10 +317,10 @@ def _step(given) -> State:
     return stepper.advance(state)
 
 
-def _concluded(stepper: AbstractStepper, state: State, plain: bool) -> Outcome:
-    if plain or not stepper.engine.in_lanes:
+def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:
+    if taped or not stepper.engine.in_lanes:
         return conclude(stepper, state)
-    return differentiable(_end, name="end", in_lanes=True)((stepper, state))
+    return differentiable(_end, name="end", in_lanes=True, derivatives="in a direction")((stepper, state))
 
 
 def _end(given) -> Outcome:
@@ -336,18 +330,33 @@ def _end(given) -> Outcome:
 @jax.jit
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    engine = path.stepper.engine
-    at = _at
+    stepper, engine, at = path.stepper, path.stepper.engine, _at
     if not engine.reverse:
-        at = differentiable(_at, _at, None, "evaluation", lambda given: (given[1], given[1]), engine.in_lanes)
-    found = jax.vmap(lambda t: at((path, t)))(time.ravel())
-    return jax.tree.map(lambda x: x.reshape(time.shape), found)
+        stepper = _moving_in_evaluation(stepper)
+        at = differentiable(
+            _at, _at, None, "evaluation", lambda given: (given[2], given[2]), engine.in_lanes, derivatives="by directions"
+        )
+
+    def found(time):
+        node, elapsed = path.before(time)
+        if not engine.reverse:
+            moving = {name: getattr(node, name) for name in ("local", "opening", "velocity")}
+            node = replace(jax.lax.stop_gradient(node), **moving)
+        return at((stepper, node, elapsed))
+
+    return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(found)(time.ravel()))
+
+
+def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
+    """The same, of which nothing moves but what an evaluation depends on."""
+    scene, still = stepper.scene, jax.lax.stop_gradient(stepper)
+    moving = {name: getattr(scene, name) for name in ("moments", "far", "p", "motion", "knots", "scales")}
+    return replace(still, scene=replace(still.scene, **moving))
 
 
 def _at(given) -> tuple[Scalar, Scalar]:
-    """The same at one time."""
-    path, time = given
-    (node, elapsed), stepper = path.before(time), path.stepper
+    """The same, so long after a node."""
+    stepper, node, elapsed = given
     opening, speed = stepper.evaluate(node, elapsed)
     # The last node is the end of the history: the block lies, rests, or is caught in motion there.
     lies = node.done & (node.opening >= jnp.pi / 2)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.extend.core import jaxpr_as_fun
 
 from jaxrock.keeping.facts import facts as facts_of
-from jaxrock.transforms.recipe import Passes, Recipe
+from jaxrock.transforms.recipe import Derivatives, Passes, Recipe
 from jaxrock.transforms.scenes import computed
 
 
@@ -30,8 +30,8 @@ def differentiable(
     name: str | None = None,
     results: Callable | None = None,
     in_lanes: bool = False,
-    plain: Callable | None = None,
     refilled: bool = False,
+    derivatives: Derivatives = "at once",
 ) -> Callable:
     """`function(tree)` with derivatives of every order, forward and reverse, from forward mode alone.
 
@@ -44,7 +44,7 @@ def differentiable(
     `passes`: the function in parts; `function` is then their `whole`.
     `name`: of a function that depends on nothing but its argument: then it need not be traced if it has been before.
     `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
-    `plain`: the same function as forward mode goes through it best.
+    `derivatives`: how forward mode makes them (see `Recipe`).
     `results`: of the tree what the function returns (of `jax.ShapeDtypeStruct`), where that is known without tracing.
     """
 
@@ -56,7 +56,8 @@ def differentiable(
         known = results(structure.unflatten(like)) if told is not None and results is not None else None
         recipe = Recipe.of(
             function, structure, like, told,
-            passes=passes, on_tape=on_tape, results=known, in_lanes=in_lanes, refilled=refilled, plain=plain,
+            passes=passes, on_tape=on_tape, results=known, in_lanes=in_lanes, refilled=refilled,
+            derivatives=derivatives,
         )  # fmt: skip
         recipe, leaves = _without_outside(recipe, leaves)
         return computed(recipe, leaves)

@@ -52,10 +52,10 @@ def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
         changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
 
-    return _made(recipe, moves, both, like, "change", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
+    return _made(recipe, moves, both, like, "change", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype), sum(moves))
 
 
-def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequence, word: str, shapes: Callable):
+def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequence, word: str, shapes: Callable, directions: int = 0):
     value = recipe.results
     return Recipe(
         both,
@@ -66,6 +66,8 @@ def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequenc
         in_lanes=recipe.in_lanes,
         refilled=recipe.refilled,
         order=recipe.order + 1,
+        derivatives=recipe.derivatives,
+        directions=directions,
     )
 
 
@@ -82,7 +84,7 @@ def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *directio
 
     def function(moving):
         rest = iter(moving)
-        return recipe.forward([next(rest) if move else x for x, move in zip(leaves, moves)])
+        return recipe([next(rest) if move else x for x, move in zip(leaves, moves)])
 
     return jax.jvp(function, (_moving(leaves, moves),), (list(direction),))
 

@@ -5,7 +5,7 @@ import functools
 import threading
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,8 @@ from jaxrock.keeping.facts import settings
 from jaxrock.keeping.folder import name_of
 from jaxrock.numerics.xla_cpu import are_marked
 from jaxrock.transforms.fingerprint import Program
+
+Derivatives = Literal["at once", "by directions", "in a direction"]
 
 
 class Passes(NamedTuple):
@@ -57,8 +59,11 @@ class Recipe:
     - `facts`: what tells it, with its leaves' shapes, from all others in any process; None: only its program does.
     - `results`: what it returns, a tree of `jax.ShapeDtypeStruct`; None: tracing tells.
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
-    - `plain`: the same function as forward mode goes through it best; None: as it is.
     - `order`: of the derivatives that it computes.
+    - `derivatives`: how forward mode makes more of them: value and Jacobian at once; the Jacobian by directions, which
+      are scenes of their own, as of all that computes derivatives already; or value and change in one direction alone,
+      which does not transpose.
+    - `directions`: how many of the last leaves are the direction of a change that it computes.
     """
 
     def __init__(
@@ -72,13 +77,14 @@ class Recipe:
         results: Any = None,
         in_lanes: bool = False,
         refilled: bool = False,
-        plain: Callable | None = None,
         order: int = 0,
+        derivatives: Derivatives = "at once",
+        directions: int = 0,
     ):
         self.function, self.structure, self.like, self.order = function, structure, tuple(like), order
         self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
         self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
-        self.plain = plain
+        self.derivatives, self.directions = derivatives, directions
         self.plans, self._derivatives, self._programs = {}, {}, {}  # what has been made of it
 
     @classmethod
@@ -128,12 +134,6 @@ class Recipe:
     def __call__(self, leaves: Sequence) -> list:
         """Compute it for one scene."""
         return jaxpr_as_fun(self.program)(*leaves)
-
-    def forward(self, leaves: Sequence) -> list:
-        """The same, for derivatives."""
-        if self.plain is None:
-            return self(leaves)
-        return jax.tree.leaves(self.plain(self.structure.unflatten(leaves)))
 
     def taped(self, leaves: Sequence) -> list:
         """The same on a tape."""

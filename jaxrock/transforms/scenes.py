@@ -54,11 +54,18 @@ def _batched(leaves, axes, *, recipe, own, size):
     new = [axis is not None for axis in axes]  # what is not mapped has none
     leaves = [jnp.moveaxis(x, axis, 0) if moved else x for x, axis, moved in zip(leaves, axes, new)]
     more = next(x.shape[0] for x, moved in zip(leaves, new) if moved)
+    of_directions = not any(new[: len(new) - recipe.directions])
+    if of_directions and size is None:
+        # One scene's numbers are given to all directions, so that it is computed where they are.
+        spread = [not (moved or x.shape) for x, moved in zip(leaves, new)]
+        leaves = [jnp.broadcast_to(x, (more,)) if every else x for x, every in zip(leaves, spread)]
+        new = [moved or every for moved, every in zip(new, spread)]
     if size is None:
         found = scenes_p.bind(*leaves, recipe=recipe, own=tuple(new), size=more)
     else:
         found = _one_more_axis(leaves, new, more, recipe, own, size)
-    return found, [0] * len(found)
+    shared = len(jax.tree.leaves(recipe.results[0])) if of_directions else 0  # the value is the same in all
+    return [*(x[0] for x in found[:shared]), *found[shared:]], [*[None] * shared, *[0] * (len(found) - shared)]
 
 
 batching.primitive_batchers[scenes_p] = _batched
@@ -103,7 +110,10 @@ def _pushed(leaves, changes, *, recipe, own, size):
     numbers = sum(x.size for x, move in zip(recipe.like, moves) if move)
     if recipe.on_tape is not None and numbers > _MANY:
         return _pushed_on_tape(leaves, moves, moving, recipe, own, size)
-    derive = _jacobian_by_directions if recipe.order and recipe.in_lanes else _jacobian_at_once
+    if recipe.derivatives == "in a direction":
+        return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
+    by_directions = recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes)
+    derive = _jacobian_by_directions if by_directions else _jacobian_at_once
     value, jacobian = derive(leaves, moves, recipe, own, size)
 
     def contracted(columns, *moving):
@@ -117,6 +127,17 @@ def _pushed(leaves, changes, *, recipe, own, size):
         return jax.vmap(contracted, in_axes=(0, *axes))(columns, *moving)
 
     return value, [moved(*each) for each in zip(value, jacobian)]
+
+
+def _pushed_in_a_direction(leaves, moves, moving, recipe, own, size):
+    """Value and change by one program of both, which does not transpose: of a part of something that forward mode goes
+    through as a whole, and that moves by far fewer numbers than the part is given."""
+    both = value_and_change(recipe, moves)
+    flags = *own, *(mine for mine, move in zip(own, moves) if move)
+    found = scenes_p.bind(*leaves, *moving, recipe=both, own=flags, size=size)
+    value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
+    value = jax.tree.leaves(value)
+    return value, [_unmoved(x) if d is None else d for x, d in zip(value, changes, strict=True)]
 
 
 def _jacobian_at_once(leaves, moves, recipe, own, size):
@@ -134,19 +155,13 @@ def _jacobian_by_directions(leaves, moves, recipe, own, size):
     take ten times as long to compile as this, of twelve, which computes the first derivatives for every direction."""
     both = value_and_change(recipe, moves)
     moving = [x for x, move in zip(recipe.like, moves) if move]
-    # Of one scene its numbers are given to all directions, so that it is computed where they are.
-    spread = [size is None and not x.shape for x in recipe.like]
-    directions = directions_of(moving)
-    count = len(directions[0])
-    given = [jnp.broadcast_to(x, (count,)) if every else x for x, every in zip(leaves, spread)]
 
-    def one(*given):
-        return scenes_p.bind(*given, recipe=both, own=(*own, *[False] * len(moving)), size=size)
+    def one(*direction):
+        found = scenes_p.bind(*leaves, *direction, recipe=both, own=(*own, *[False] * len(moving)), size=size)
+        value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
+        return jax.tree.leaves(value), changes
 
-    axes = [*(0 if every else None for every in spread), *[0] * len(moving)]
-    found = jax.vmap(one, in_axes=axes)(*given, *directions)
-    value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
-    value = [x[0] for x in jax.tree.leaves(value)]
+    value, changes = jax.vmap(one, out_axes=(None, 0))(*directions_of(moving))
     return value, [None if d is None else columns_of(x, d, moving) for x, d in zip(value, changes, strict=True)]
 
 
