@@ -190,3 +190,18 @@ def test_programs_are_small(motion, most):
     with marking(False):
         assert 500 < operations_of(recipe.program.jaxpr) <= most
     assert "keep" in str(recipe.program) and operations_of(recipe.program.jaxpr) <= 1.3 * most  # for XLA
+
+
+@pytest.mark.parametrize("motion", [rk.SinePulse(0.5, 1.0), rk.example_record()], ids=["pulse", "record"])
+def test_programs_of_derivatives_of_histories_are_small(motion):
+    """XLA gets no step to differentiate, nor the evaluation of one: those are machine code, asked for by name."""
+
+    def misfit(x):
+        history = rk.simulate(rk.Block(x[0], x[1], x[2]), x[3] * motion)
+        return jnp.sum(history(jnp.linspace(0.0, 1.0, 8))[0] ** 2)
+
+    asked = jax.make_jaxpr(jax.grad(misfit))(jnp.array([0.2, 2.0, 0.9, 1.1]))
+    with marking(False):
+        history = recipe_in(asked.jaxpr).program
+    assert str(history).count("scenes[") >= 2  # a step, the end
+    assert operations_of(asked.jaxpr) + operations_of(history.jaxpr) <= 2500

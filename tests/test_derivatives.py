@@ -211,6 +211,25 @@ def test_a_history_in_both_modes():
     np.testing.assert_allclose(forward, differences.T, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_second_derivatives_of_a_history():
+    """Of rotations before and after impacts, and of the margin: differences of first derivatives, and symmetric."""
+    x = jnp.array([0.2, 2.0, 0.9, 0.26, 1.4, 1.7])
+
+    def results(q):
+        response = rk.simulate(rk.Block(*q[:3]), rk.SinePulse(q[3], q[4]), samples=2)
+        rotation, velocity = response(jnp.stack([0.3 * q[4], q[5]]))
+        return jnp.concatenate([rotation, velocity, response.margin[None]])
+
+    found = jax.jit(jax.hessian(results))(x)
+    np.testing.assert_allclose(found, jnp.swapaxes(found, 1, 2), rtol=1e-11, atol=1e-10)
+    steps = 1e-4 * jnp.diag(x)
+    nearby = jnp.concatenate([x + k * steps for k in (-2, -1, 1, 2)])
+    slopes = jax.jit(jax.vmap(jax.jacfwd(results)))(nearby).reshape(4, 6, 5, 6)
+    differences = (slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12e-4 * x[:, None, None])
+    np.testing.assert_allclose(found, jnp.moveaxis(differences, 0, 1), rtol=1e-7, atol=1e-7)
+
+
 # ---- One step and one impact: independent formulas ----
 
 
