@@ -14,6 +14,7 @@ from jaxrock.engines import free_stage
 from jaxrock.numerics import compound, elementary, polynomial as polynomials
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.given import given
 from jaxrock.numerics.xla_cpu import marking
 
 RNG = np.random.default_rng(7)
@@ -40,7 +41,7 @@ OPERATIONS = {
 each = pytest.mark.parametrize("operation, settings, count", OPERATIONS.values(), ids=OPERATIONS)
 
 
-def given(count):
+def numbers_for(count):
     """Numbers, some of them negative."""
     return list(NUMBERS[:count] * np.where(np.arange(count) % 3 == 2, -1, 1) ** (count > 3))
 
@@ -55,7 +56,7 @@ def written_of(operation, settings, numbers):
 @each
 def test_it_is_what_it_consists_of(operation, settings, count):
     """Alone, compiled, and at many places of which some numbers are shared; one operation in a program."""
-    numbers = given(count)
+    numbers = numbers_for(count)
     expected = jax.jit(jaxpr_as_fun(written_of(operation, settings, numbers)))(*numbers)
 
     def of(*numbers):
@@ -79,7 +80,7 @@ def test_it_is_what_it_consists_of(operation, settings, count):
 @each
 def test_it_changes_as_what_it_consists_of(operation, settings, count):
     """Forward, reverse, by some of the numbers, and again."""
-    numbers = given(count)
+    numbers = numbers_for(count)
     program = written_of(operation, settings, numbers)
 
     def of(*numbers):
@@ -108,7 +109,7 @@ def test_it_changes_as_what_it_consists_of(operation, settings, count):
 @each
 def test_machine_code_is_the_same(operation, settings, count):
     call = pytest.importorskip("jaxrock.native.call")
-    numbers = given(count)
+    numbers = numbers_for(count)
     lanes = [np.linspace(0.8, 1.2, 21) * x for x in numbers]
 
     def of(*numbers):
@@ -155,6 +156,33 @@ def test_what_is_fixed_has_no_derivatives():
     assert jax.grad(of, (0, 1))(3.0, 5.0) == (3.0, 0.0)
     np.testing.assert_array_equal(jax.vmap(jax.grad(of), (0, None))(jnp.arange(3.0), 2.0), [0, 1, 2])
     assert str(jax.make_jaxpr(of)(3.0, 5.0)).count("fixed") == 1
+
+
+def squared_slope(value, by, change):
+    return 2 * by * change
+
+
+@pytest.mark.parametrize("checkpoint", [lambda f: f, jax.checkpoint], ids=["kept", "checkpoint"])
+def test_given_values_in_a_scan(checkpoint):
+    """x^2 three times over, whose square is given: derivatives of three orders, in every nesting and in lanes."""
+
+    @checkpoint
+    def step(x, _):
+        return given(squared_slope, jax.lax.stop_gradient(x**2), x), None
+
+    def of(x):
+        return jax.lax.scan(step, x, None, length=3)[0]
+
+    assert of(1.1) == pytest.approx(1.1**8) and jax.grad(of)(1.1) == pytest.approx(8 * 1.1**7)
+    second, third = 56 * 1.1**6, 336 * 1.1**5
+    for nested in (jax.hessian(of), jax.grad(jax.grad(of)), jax.jacfwd(jax.jacfwd(of))):
+        assert nested(1.1) == pytest.approx(second, rel=1e-14)
+    assert jax.jacfwd(jax.grad(jax.grad(of)))(1.1) == pytest.approx(third, rel=1e-14)
+    x = jnp.linspace(0.5, 1.5, 4)
+    np.testing.assert_allclose(jax.vmap(jax.hessian(of))(x), 56 * x**6, rtol=1e-14)
+    np.testing.assert_allclose(jax.hessian(lambda x: jax.vmap(of)(x).sum())(x), np.diag(56 * x**6), rtol=1e-14)
+    scaled = jax.vmap(lambda a: given(squared_slope, jax.lax.stop_gradient(x[0] ** 2), a))  # the value is shared
+    np.testing.assert_array_equal(scaled(x), jnp.full(4, x[0] ** 2))
 
 
 def operations_of(jaxpr):

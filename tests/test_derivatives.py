@@ -230,6 +230,31 @@ def test_second_derivatives_of_a_history():
     np.testing.assert_allclose(found, jnp.moveaxis(differences, 0, 1), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.slow  # fast: `test_given_values_in_a_scan` of what was wrong
+@pytest.mark.parametrize("of", ["margin", "history"])
+def test_second_derivatives_by_all_samples(of):
+    """The Hessian times a direction, forward over reverse and reverse over reverse: differences of gradients."""
+    count = 100
+    samples = 0.35 * jnp.sin(0.12 * jnp.arange(count)) * jnp.exp(-0.005 * jnp.arange(count))
+    direction = jnp.cos(0.3 * jnp.arange(count))
+    block = rk.Block(0.2, 2.0)
+
+    def result(samples):
+        record = rk.Record(samples, 0.01)
+        if of == "margin":
+            return rk.outcome(block, record).margin
+        return jnp.sum(rk.simulate(block, record, samples=2)(jnp.linspace(0.0, 1.5, 30))[0] ** 2)
+
+    slopes, step = jax.jit(jax.grad(result)), 1e-4
+    at = [slopes(samples + k * step * direction) for k in (-2, -1, 1, 2)]
+    differences = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+    over_reverse = jax.jit(lambda x: jax.jvp(slopes, (x,), (direction,))[1])(samples)
+    np.testing.assert_allclose(over_reverse, differences, rtol=1e-7, atol=1e-9)
+    if of == "margin":
+        twice = jax.jit(jax.grad(lambda x: slopes(x) @ direction))(samples)
+        np.testing.assert_allclose(twice, differences, rtol=1e-7, atol=1e-9)
+
+
 # ---- One step and one impact: independent formulas ----
 
 

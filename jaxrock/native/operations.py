@@ -274,7 +274,7 @@ OPERATIONS: dict[str, Callable] = {
 }
 
 # What changes no value.
-NOTHING = ("stop_gradient", "fixed", "copy", "apart", "reshard", "pvary", "pcast")
+NOTHING = ("stop_gradient", "fixed", "given", "copy", "apart", "reshard", "pvary", "pcast")
 
 
 OPERATIONS |= dict.fromkeys(NOTHING, lambda e, _, x: x)

@@ -8,7 +8,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal
 
-_MARKS = {"fixed", "stop_gradient", "keep"}
+_MARKS = {"fixed", "given", "stop_gradient", "keep"}
 
 
 def unmarked(program: ClosedJaxpr) -> ClosedJaxpr:

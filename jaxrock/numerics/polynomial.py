@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.compound import Compound, Zero
+from jaxrock.numerics.given import given, is_zero
 from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
@@ -286,17 +286,14 @@ def first_event(coefficients: list[Scalar], watches: list[Watch], start: Scalar,
     return Landing(x, jet(coefficients, x, highest), hits)
 
 
-@jax.custom_jvp
 def meet(x: Scalar, forcing: list[Scalar], level: Scalar) -> Scalar:
     """x, where the series `forcing` meets `level`, as it is given; its derivatives are those of the root."""
-    return x
+    return given(_meeting, x, (forcing, level))
 
 
-@functools.partial(meet.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    (_, forcing, _), (_, d_forcing, d_level) = primals, tangents
-    x = meet(*primals)
-    moved = [jnp.zeros_like(x) if isinstance(d, SymbolicZero) else d for d in d_forcing]
+def _meeting(x: Scalar, by: tuple, changes: tuple) -> Scalar:
+    (forcing, _), (d_forcing, d_level) = by, changes
+    moved = [jnp.zeros_like(x) if is_zero(d) else d for d in d_forcing]
     slope = horner(derivative(forcing), x) if len(forcing) > 1 else jnp.zeros_like(x)
-    lack = (0.0 if isinstance(d_level, SymbolicZero) else d_level) - horner(moved, x)
-    return x, where(slope == 0, 0.0, lack / where(slope == 0, 1.0, slope))
+    lack = (0.0 if is_zero(d_level) else d_level) - horner(moved, x)
+    return where(slope == 0, 0.0, lack / where(slope == 0, 1.0, slope))

@@ -307,7 +307,9 @@ def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
     elif not engine.in_lanes:
         state, nodes = followed(lambda s: stepper.advance(s), state, budget, engine.loop)
     else:
-        step = differentiable(_step, name="step", results=lambda given: given[1], in_lanes=True, derivatives="in a direction")
+        step = differentiable(
+            _step, name="step", results=lambda given: given[1], in_lanes=True, derivatives="in a direction"
+        )
         state, nodes = followed(lambda s: step((stepper, s)), state, budget, engine.loop)
     return state, nodes, _concluded(stepper, state, taped)
 
@@ -334,7 +336,13 @@ def _evaluate(path: Trajectory, time):
     if not engine.reverse:
         stepper = _moving_in_evaluation(stepper)
         at = differentiable(
-            _at, _at, None, "evaluation", lambda given: (given[2], given[2]), engine.in_lanes, derivatives="by directions"
+            _at,
+            _at,
+            None,
+            "evaluation",
+            lambda given: (given[2], given[2]),
+            engine.in_lanes,
+            derivatives="by directions",
         )
 
     def found(time):

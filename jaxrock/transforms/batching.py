@@ -7,6 +7,7 @@ Which way `Lanes.__call__` takes:
     one                         careful, its numbers in one lane    careful, without lanes
     up to _FEW; or any number   careful, in lanes                   careful, in chunks of _LANES
       without a quick pass
+    many, on a tape             -                                   one after the other
     more, with a quick pass     quick, in lanes; careful what it    quick, in chunks of _QUICK_LANES, which after
                                   postpones, collected; in            every round (if there are any) are made up
                                   chunks of _NATIVE_LANES where       anew; careful what it postpones
@@ -155,6 +156,8 @@ class Lanes:
 
     def _many_by_xla(self, leaves) -> list:
         """In chunks of lanes."""
+        if self.recipe.derivatives == "on a tape":
+            return self._one_after_the_other(leaves)
         passes, scenes = self._passes, _Scenes(leaves, self.own, self.recipe.structure)
 
         def function(own, _=None):
@@ -174,6 +177,16 @@ class Lanes:
         # Outside the chunks, so that what nobody asks for is not computed.
         found, which = ready.each(passes.conclude, ready.own, followed)
         return self._again(function, scenes.own, jax.tree.leaves(found), which)
+
+    def _one_after_the_other(self, leaves) -> list:
+        """Lanes would all go on to the end of the longest tape there may be, and the way back is cut where JAX makes
+        "both" of a branch."""
+
+        def one(own):
+            rest = iter(own)
+            return self.recipe([next(rest) if mine else x for x, mine in zip(leaves, self.own)])
+
+        return jax.lax.map(one, [x for x, mine in zip(leaves, self.own) if mine])
 
     def _in_rounds(self, quickly: Callable, ready: "_Scenes", states):
         """Follow all states to their end; after every so many steps the unfinished ones make up new chunks."""

@@ -1,4 +1,5 @@
-"""Forward mode in every number of a scene that moves: value and Jacobian, in one recipe."""
+"""Derivatives of a recipe, as recipes: value and Jacobian by all that moves, value and change in one direction, and the
+transpose of that change."""
 
 import functools
 import math
@@ -23,6 +24,12 @@ def value_and_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     return recipe.derivative(moves, _with_change)
 
 
+def pulled_back(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
+    """The recipe of what changes of the leaves that move weigh, if those of the value (but integers), which follow the
+    recipe's leaves, weigh so much: the transpose of `value_and_change`, for functions that reverse mode goes through."""
+    return recipe.derivative(moves, _transposed)
+
+
 def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     moving = _moving(recipe.like, moves)
 
@@ -40,7 +47,7 @@ def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     def shapes(out):
         return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
 
-    return _made(recipe, moves, both, recipe.like, "jacobian", shapes)
+    return _made(recipe, moves, both, recipe.like, "jacobian", _with_each(recipe.results, shapes))
 
 
 def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
@@ -52,22 +59,40 @@ def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
         changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
 
-    return _made(recipe, moves, both, like, "change", lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype), sum(moves))
+    results = _with_each(recipe.results, lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
+    return _made(recipe, moves, both, like, "change", results, directions=sum(moves), origin=(recipe, moves))
 
 
-def _made(recipe: Recipe, moves: tuple[bool, ...], both: Callable, like: Sequence, word: str, shapes: Callable, directions: int = 0):
-    value = recipe.results
+def _transposed(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
+    real = [out for out in jax.tree.leaves(recipe.results) if _is_real(out)]
+    moving = _moving(recipe.like, moves)
+
+    def pulled(leaves):
+        own, rest = leaves[: len(moves)], iter(leaves[len(moves) :])
+        value, pull = jax.vjp(_of_moving(recipe, moves, own), _moving(own, moves))
+        return pull([next(rest) if _is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in value])[0]
+
+    return _made(recipe, moves, pulled, (*recipe.like, *real), "pulled back", moving)
+
+
+def _with_each(value: Any, shapes: Callable) -> tuple:
+    return value, [shapes(out) if _is_real(out) else None for out in jax.tree.leaves(value)]
+
+
+def _made(
+    recipe: Recipe, moves: tuple[bool, ...], function: Callable, like: Sequence, word: str, results: Any, **more: Any
+) -> Recipe:
     return Recipe(
-        both,
+        function,
         jax.tree.structure(list(like)),
         like,
         facts=None if recipe.facts is None else f"{recipe.facts} {word} {[int(move) for move in moves]}",
-        results=(value, [shapes(out) if _is_real(out) else None for out in jax.tree.leaves(value)]),
+        results=results,
         in_lanes=recipe.in_lanes,
         refilled=recipe.refilled,
         order=recipe.order + 1,
         derivatives=recipe.derivatives,
-        directions=directions,
+        **more,
     )
 
 
@@ -79,14 +104,19 @@ def _is_real(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
-def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *direction: Any) -> tuple[list, list]:
-    """The recipe's leaves, and their change in a direction."""
+def _of_moving(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence) -> Callable:
+    """The recipe's leaves as a function of those that move."""
 
     def function(moving):
         rest = iter(moving)
         return recipe([next(rest) if move else x for x, move in zip(leaves, moves)])
 
-    return jax.jvp(function, (_moving(leaves, moves),), (list(direction),))
+    return function
+
+
+def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *direction: Any) -> tuple[list, list]:
+    """The recipe's leaves, and their change in a direction."""
+    return jax.jvp(_of_moving(recipe, moves, leaves), (_moving(leaves, moves),), (list(direction),))
 
 
 def directions_of(moving: Sequence) -> list:

@@ -18,7 +18,7 @@ from jaxrock.keeping.folder import name_of
 from jaxrock.numerics.xla_cpu import are_marked
 from jaxrock.transforms.fingerprint import Program
 
-Derivatives = Literal["at once", "by directions", "in a direction"]
+Derivatives = Literal["at once", "by directions", "in a direction", "on a tape"]
 
 
 class Passes(NamedTuple):
@@ -61,9 +61,10 @@ class Recipe:
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
     - `order`: of the derivatives that it computes.
     - `derivatives`: how forward mode makes more of them: value and Jacobian at once; the Jacobian by directions, which
-      are scenes of their own, as of all that computes derivatives already; or value and change in one direction alone,
-      which does not transpose.
-    - `directions`: how many of the last leaves are the direction of a change that it computes.
+      are scenes of their own, as of all that computes derivatives already; value and change in one direction alone,
+      which does not transpose; or the change alone, which does, since reverse mode goes through the function's code.
+    - `directions`: how many of the last leaves are the direction of a change that it computes; that of what, by which
+      leaves, is told by `origin`.
     """
 
     def __init__(
@@ -80,11 +81,12 @@ class Recipe:
         order: int = 0,
         derivatives: Derivatives = "at once",
         directions: int = 0,
+        origin: "tuple[Recipe, tuple[bool, ...]] | None" = None,
     ):
         self.function, self.structure, self.like, self.order = function, structure, tuple(like), order
         self.passes, self.on_tape, self.facts, self._results = passes, on_tape, facts, results
         self.in_lanes, self.refilled = in_lanes or passes is not None, refilled or bool(passes and passes.round)
-        self.derivatives, self.directions = derivatives, directions
+        self.derivatives, self.directions, self.origin = derivatives, directions, origin
         self.plans, self._derivatives, self._programs = {}, {}, {}  # what has been made of it
 
     @classmethod
@@ -135,10 +137,14 @@ class Recipe:
         """Compute it for one scene."""
         return jaxpr_as_fun(self.program)(*leaves)
 
-    def taped(self, leaves: Sequence) -> list:
+    @functools.cached_property
+    def taped(self) -> "Recipe":
         """The same on a tape."""
         assert self.on_tape is not None
-        return jax.tree.leaves(self.on_tape(self.structure.unflatten(leaves)))
+        facts = None if self.facts is None else f"{self.facts} on tape"
+        return Recipe(
+            self.on_tape, self.structure, self.like, facts=facts, results=self.results, derivatives="on a tape"
+        )
 
     def derivative(self, moves: tuple[bool, ...], make: Callable) -> "Recipe":
         """The recipe of value and derivatives by some leaves, which `make(recipe, moves)` makes once."""

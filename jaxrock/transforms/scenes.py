@@ -14,7 +14,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like
-from jaxrock.transforms.forward_mode import columns_of, directions_of, value_and_change, value_and_jacobian
+from jaxrock.transforms.forward_mode import columns_of, directions_of, pulled_back, value_and_change, value_and_jacobian
 from jaxrock.transforms.lowering import lowered
 from jaxrock.transforms.recipe import Recipe
 
@@ -108,8 +108,10 @@ def _pushed(leaves, changes, *, recipe, own, size):
     moving = [d for d, move in zip(changes, moves) if move]
     axes = [0 if mine else None for mine, move in zip(own, moves) if move]
     numbers = sum(x.size for x, move in zip(recipe.like, moves) if move)
-    if recipe.on_tape is not None and numbers > _MANY:
-        return _pushed_on_tape(leaves, moves, moving, recipe, own, size)
+    if recipe.derivatives == "on a tape" or (recipe.on_tape is not None and numbers > _MANY):
+        value = scenes_p.bind(*leaves, recipe=recipe, own=own, size=size)
+        taped = recipe if recipe.derivatives == "on a tape" else recipe.taped
+        return value, _pushed_in_a_direction(leaves, moves, moving, taped, own, size)[1]
     if recipe.derivatives == "in a direction":
         return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
     by_directions = recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes)
@@ -130,8 +132,8 @@ def _pushed(leaves, changes, *, recipe, own, size):
 
 
 def _pushed_in_a_direction(leaves, moves, moving, recipe, own, size):
-    """Value and change by one program of both, which does not transpose: of a part of something that forward mode goes
-    through as a whole, and that moves by far fewer numbers than the part is given."""
+    """Value and change by one program of both: of a part of something that forward mode goes through as a whole, and
+    that moves by far fewer numbers than the part is given; or of a tape, where there are too many for a Jacobian."""
     both = value_and_change(recipe, moves)
     flags = *own, *(mine for mine, move in zip(own, moves) if move)
     found = scenes_p.bind(*leaves, *moving, recipe=both, own=flags, size=size)
@@ -165,35 +167,22 @@ def _jacobian_by_directions(leaves, moves, recipe, own, size):
     return value, [None if d is None else columns_of(x, d, moving) for x, d in zip(value, changes, strict=True)]
 
 
-def _pushed_on_tape(leaves, moves, moving, recipe, own, size):
-    """Value and change by the recipe's own code, through which reverse mode goes."""
-
-    def one(given):
-        leaves, moving = given[: len(moves)], given[len(moves) :]
-
-        def function(moving):
-            rest = iter(moving)
-            return recipe.taped([next(rest) if move else x for x, move in zip(leaves, moves)])
-
-        return jax.jvp(function, ([x for x, move in zip(leaves, moves) if move],), (moving,))
-
-    given = [*leaves, *moving]
-    if size is None:
-        value, changed = one(given)
-    else:
-        # One scene after the other: lanes would all go on to the end of the longest tape there may be, and the way
-        # back is cut where JAX makes "both" of a branch.
-        mine = [*own, *(mine for mine, move in zip(own, moves) if move)]
-        shared = [None if flag else x for x, flag in zip(given, mine)]
-        value, changed = jax.lax.map(
-            lambda own: one([a if b is None else b for a, b in zip(own, shared)]),
-            [x if flag else None for x, flag in zip(given, mine)],
-        )
-    changed = [_unmoved(x) if d.dtype == jax.dtypes.float0 else d for x, d in zip(value, changed)]
-    return value, changed
-
-
 ad.primitive_jvps[scenes_p] = _pushed
+
+
+def _transposed(weights, *leaves, recipe, own, size):
+    """Of a change on a tape, which is linear in its direction; its value weighs nothing."""
+    base, moves = recipe.origin
+    count = len(leaves) - recipe.directions
+    values = len(jax.tree.leaves(recipe.results[0]))
+    weights = [ad.instantiate_zeros(x) for x in weights[values:]]
+    flags = *own[:count], *[size is not None] * len(weights)
+    found = scenes_p.bind(*leaves[:count], *weights, recipe=pulled_back(base, moves), own=flags, size=size)
+    summed = [x if size is None or mine else x.sum(axis=0) for x, mine in zip(found, own[count:])]
+    return [*[None] * count, *summed]
+
+
+ad.primitive_transposes[scenes_p] = _transposed
 
 mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=False))
 mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=True), platform="cpu")

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
+from jaxrock.numerics.given import given, is_zero
 from jaxrock.numerics.polynomial import product_term
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
@@ -117,12 +117,8 @@ class _Weights(NamedTuple):
 
     def times(self, change: Start) -> Any:
         """The change of the end."""
-        pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=_is_zero), strict=True)
-        return sum((weight * moved for weight, moved in pairs if not _is_zero(moved)), start=0.0)
-
-
-def _is_zero(tangent) -> bool:
-    return isinstance(tangent, SymbolicZero)
+        pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=is_zero), strict=True)
+        return sum((weight * moved for weight, moved in pairs if not is_zero(moved)), start=0.0)
 
 
 def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like: Scalar) -> list | None:
@@ -223,27 +219,24 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     return of(powers), of([jnp.zeros_like(length)] + [k * power for k, power in enumerate(powers[:-1], 1)])
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def arrive(order: int, start: Start, end: End) -> tuple[Scalar, Scalar, Scalar]:
     """Length, opening angle and speed of a step's end, as they are given; their derivatives follow the flow.
 
     Only these derive from `start`, and from `end.level` and `end.room`: the values in `end` need no derivatives.
     """
-    return end.length, end.opening, end.speed
+    return given(_arriving, (end.length, end.opening, end.speed), (start, end), order)
 
 
-@functools.partial(arrive.defjvp, symbolic_zeros=True)
-def _(order, primals, tangents):
-    (start, end), (d_start, d_end) = primals, tangents
-    length, opening, speed = arrive(order, start, end)  # with derivatives of their own, for those of higher order
+def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) -> tuple:
+    (length, opening, speed), (start, end), (d_start, d_end) = values, by, changes
     d_opening, d_speed = (weights.times(d_start) for weights in _weights(order, start, length))
     push, weight = start.shaking.at(length)
     law = start.moments.acceleration(Angle.of(opening), speed, start.side * push, weight)
     acceleration = start.stretch**2 * law
-    d_level, d_room = (0.0 if _is_zero(d) else d for d in (d_end.level, d_end.room))
+    d_level, d_room = (0.0 if is_zero(d) else d for d in (d_end.level, d_end.room))
     # An end that is grazed has no derivative: infinite, for the status to tell.
     d_length = where(end.full, d_room, 0.0)
     d_length = where(end.turns, -d_speed / where(end.turns, acceleration, 1.0), d_length)
     d_length = where(end.meets, (d_level - d_opening) / where(end.meets, speed, 1.0), d_length)
     moved = d_length, d_opening + speed * d_length, d_speed + acceleration * d_length
-    return (length, opening, speed), tuple(jnp.broadcast_to(d, length.shape) for d in moved)
+    return tuple(jnp.broadcast_to(d, length.shape) for d in moved)
