@@ -25,8 +25,8 @@ def value_and_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
 
 def pulled_back(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
-    """The recipe of what changes of the leaves that move weigh, if those of the value (but integers), which follow the
-    recipe's leaves, weigh so much: the transpose of `value_and_change`, for functions that reverse mode goes through."""
+    """The recipe of what changes of the leaves that move weigh, if those of the value (but integers), which follow its
+    leaves, weigh so much: the transpose of `value_and_change`, of functions that reverse mode goes through."""
     return recipe.derivative(moves, _transposed)
 
 
