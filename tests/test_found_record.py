@@ -74,6 +74,18 @@ def test_what_scaling_takes():
     np.testing.assert_allclose(found(starts=3, baseline=False).scaling, (factor - 1) * size(START.samples), rtol=1e-6)
 
 
+def test_scaling_does_not_jump_over_a_narrow_range():
+    """Factors of 1.190 to 1.209 topple, and then none up to 1.49, by the ends that `critical_amplitudes` finds."""
+    time = np.arange(0, 4, 0.02)
+    record = rk.Record(0.28 * np.sin(2 * np.pi * time / 0.8) * np.sin(np.pi * time / 4), 0.02)
+    block = rk.Block(0.2, 2.5, 0.9)
+    ends = rk.critical_amplitudes(block, record, intensity=(1.0, 4.0), derivatives=False, progress=False).value
+    factor = ends[0] / np.abs(record.samples).max()
+    result = rk.inverse.find_record(block, record, "topple", starts=1, steps=2, baseline=False, progress=False)
+    np.testing.assert_allclose(result.scaling, (factor - 1) * size(record.samples), rtol=1e-6)
+    assert result.change <= result.scaling
+
+
 def test_the_baseline_is_kept():
     """Velocity and displacement at the end, of straight lines between samples, by a rule exact for cubic ones."""
     change = np.asarray(found(starts=3, baseline=True).record.samples - START.samples)

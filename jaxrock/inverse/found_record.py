@@ -63,8 +63,8 @@ class FoundRecord(AbstractTable):
 
     - `record`: the `Record`; `start`: the one that was changed.
     - `change`: root mean square of the change [g]; infinite if nothing was found, and the record is the start.
-    - `scaling`: root mean square of the change that it takes to scale the start until margins are as wanted [g];
-      infinite if no factor does it.
+    - `scaling`: root mean square of the change that it takes to scale the start until margins are as wanted [g], of
+      factors that are looked at in steps of half a per cent; infinite if none of them does it.
     - `margin`: (blocks,) margins under the record.
     - `slope`: by how much the margin that changes most does so for a change of root mean square 1 g [1/g], where the
       search turned last. (At the verge itself a block in balance may wait for what is left of the record, and slopes
@@ -165,7 +165,7 @@ def find_record(
     search = Search(site, size, allowed_changes(*space, None if kept is None else kept.rows))
     if search.reached(np.zeros((1, samples.size)))[0]:
         return _result(search, start, Found(np.zeros(samples.size), 0.0), [0.0], 0.0, kept)
-    scaling = min(_length(search.in_direction(direction)) for direction in (samples, -samples))
+    scaling = min(_length(search.in_direction(direction, fine=True)) for direction in (samples, -samples))
     best, lengths = None, []
     for _ in range(_ROUNDS):
         bar = Progress(starts * steps, "record", progress)
@@ -185,7 +185,7 @@ def _nearest(search: Search, directions: "_Directions", starts: int, steps: int,
     """The lengths to which all starts come, and what the shortest is of."""
     found = []
     for number in range(starts):
-        reached = search.in_direction(directions(number))
+        reached = search.in_direction(directions(number), fine=number == 0)
         found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
         bar.add((number + 1) * steps - bar.done)
     lengths = [_length(each) for each in found]
@@ -250,7 +250,9 @@ class _Directions(NamedTuple):
     def __call__(self, number: int) -> np.ndarray:
         """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby."""
         if number == 0:
-            louder, softer = (self.search.in_direction(self.search.allowed(x)) for x in (self.samples, -self.samples))
+            louder, softer = (
+                self.search.in_direction(self.search.allowed(x), fine=True) for x in (self.samples, -self.samples)
+            )
             best = min(louder, softer, key=_length)
             return self.samples * 0.0 if best is None else best.direction
         if number == 1:

@@ -26,6 +26,7 @@ from jaxrock.status import Status
 
 _LANES = 64  # records in one call of the compiled program
 _SHORTEST, _LONGEST = 1e-4, 1e2  # lengths of changes that are looked at first, in root mean squares of the record
+_FINE = 1024  # factors of a record that are looked at, each half a per cent more than the one before
 _NOTHING = 1e-10  # of a change: what is left of it by rounding
 _CLOSER = 5  # times that the place on a line is looked for, each 64 times as close
 _TURNS = 0.5 ** np.arange(8)  # shares of the way to the direction that straight margins would have
@@ -117,13 +118,20 @@ class Search(NamedTuple):
         slopes = side[:, None] * np.where(np.isfinite(slopes), slopes, 0.0)
         return side * (margin - np.asarray(self.site.target)), self.allowed(slopes)
 
-    def in_direction(self, direction: np.ndarray) -> Found | None:
-        """The first change in a direction that does what is wanted, about; None: there is none."""
+    def in_direction(self, direction: np.ndarray, fine: bool = False) -> Found | None:
+        """The first change in a direction that does what is wanted, of some that are looked at; None: there is none.
+
+        Each is a quarter longer than the one before; `fine`: of a change that scales, each makes the record half a per
+        cent larger than the one before.
+        """
         scale = rms(direction)
         if not scale > 0:
             return None
         direction = direction / scale
-        lengths = self.size * np.geomspace(_SHORTEST, _LONGEST, _LANES)
+        lengths = np.geomspace(_SHORTEST, _LONGEST, _LANES)
+        if fine:
+            lengths = np.union1d(lengths, np.geomspace(1.0, 1.0 + _LONGEST, _FINE)[1:] - 1.0)
+        lengths = self.size * lengths
         good = self.reached(lengths[:, None] * direction)
         if not good.any():
             return None
