@@ -230,6 +230,24 @@ def test_second_derivatives_of_a_history():
     np.testing.assert_allclose(found, jnp.moveaxis(differences, 0, 1), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("engine", [None, slow(rk.Diffrax(rtol=1e-11, atol=1e-13))], ids=["series", "diffrax"])
+def test_second_derivatives_of_a_speed_between_impacts(engine):
+    """The largest speed, where it is an extremum within a step, which moves: differences of first derivatives."""
+    record = rk.Record(0.35 * np.sin(0.3 * np.arange(40)), 0.025)
+    x = jnp.array([0.2, 2.0, 1.0])
+
+    def speed(q):
+        return rk.outcome(rk.Block(q[0], q[1]), q[2] * record, engine=engine).max_velocity
+
+    found = jax.jit(jax.hessian(speed))(x)
+    steps = 1e-4 * jnp.diag(x)
+    slopes = jax.jit(jax.vmap(jax.grad(speed)))(jnp.concatenate([x + k * steps for k in (-2, -1, 1, 2)]))
+    slopes = slopes.reshape(4, 3, 3)
+    differences = (slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12e-4 * x[:, None])
+    np.testing.assert_allclose(found, differences, rtol=1e-6, atol=1e-6)
+    assert np.abs(found).min() > 1e-3
+
+
 @pytest.mark.slow  # fast: `test_given_values_in_a_scan` of what was wrong
 @pytest.mark.parametrize("of", ["margin", "history"])
 def test_second_derivatives_by_all_samples(of):

@@ -28,7 +28,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.checkpointing import on_tape
-from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
+from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
 from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
 from jaxrock.engines.taylor.policy import POLICY, exact
 from jaxrock.models.coefficients import Coefficients
@@ -244,6 +244,8 @@ class TaylorStepper(AbstractStepper):
         time = where(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
         exact = landed(self.scene, hits, opening, where(moved, velocity, state.velocity))
+        jerk = where(hits.extremum, jet(derivative(step.coefficients), length, 2)[2], jnp.inf)
+        fastest = extreme_speed(start, length, opening, speed, jerk) / start.stretch
         passed = replace(
             state,
             spread=errors_after(self, state, start.angle, shaking.now, elapsed, missed),
@@ -254,7 +256,7 @@ class TaylorStepper(AbstractStepper):
             beyond=state.beyond ^ hits.saddle,
             uplifting=state.uplifting & ~moved,
             extremal=where(moved, hits.extremum, state.extremal),
-            fastest=where(moved, jnp.maximum(state.fastest, jnp.abs(velocity)), state.fastest),
+            fastest=where(moved, jnp.maximum(state.fastest, fastest), state.fastest),
             done=over,
         )
 

@@ -17,6 +17,7 @@ from jaxrock.models.coefficients import Basis, Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
 from jaxrock.numerics.polynomial import product_term
 from jaxrock.numerics.xla_cpu import keep, keep_by
@@ -240,3 +241,21 @@ def _arriving(order: int, values: tuple, by: tuple[Start, End], changes: tuple) 
     d_length = where(end.meets, (d_level - d_opening) / where(end.meets, speed, 1.0), d_length)
     moved = d_length, d_opening + speed * d_length, d_speed + acceleration * d_length
     return tuple(jnp.broadcast_to(d, length.shape) for d in moved)
+
+
+def extreme_speed(start: Start, length: Scalar, opening: Scalar, speed: Scalar, jerk: Scalar) -> Scalar:
+    """|speed| at the end of a step, with derivatives up to the second of that at the extremum near it.
+
+    The end stays where it was found, and that costs no first derivative: there the speed is as large nearby. But the
+    extremum moves, by -acceleration/jerk. `jerk`: there; infinite where the end is no extremum.
+    """
+    push, weight = start.shaking.at(length)
+    law = start.moments.acceleration(Angle.of(opening), speed / start.stretch, start.side * push, weight)
+    return given(_extreme, jnp.abs(speed), (speed, start.stretch**2 * law, fixed(jerk)))
+
+
+def _extreme(_, by: tuple, changes: tuple) -> Scalar:
+    """Of |v - a^2/(2 j)|, in which a is nothing, but not its derivatives."""
+    (speed, acceleration, jerk), (change, steeper, _) = by, changes
+    change, steeper = (jnp.zeros_like(speed) if is_zero(d) else d for d in (change, steeper))
+    return jnp.sign(speed) * (change - acceleration / jerk * steeper)
