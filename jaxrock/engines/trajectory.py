@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import count_up_to
 
 
 class Trajectory(eqx.Module):
@@ -52,7 +51,7 @@ class Trajectory(eqx.Module):
 
     def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
         """The node before a time, and how long after it that is [s]; not a number where no step was left for that."""
-        index = jnp.clip(count_up_to(self.times, time) - 1, 0, self.times.size - 1)
+        index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
         elapsed = jnp.minimum(time, self.duration) - self.times[index]
         is_followed = node.done | (index < self.times.size - 1) | (elapsed <= 0)
