@@ -363,6 +363,22 @@ def test_what_does_not_stand_by_its_equation_raises(call, parts, what):
             scenes(amplitude)
 
 
+def test_what_is_no_smooth_linear_equation_raises():
+    """Dry friction jumps at rest, where the engine would miss impacts; its smooth form and a damper do not."""
+
+    def equation(dissipation):
+        return rk.models.Equation(standing, dissipation=dissipation)
+
+    for size in (1e-6, 0.02):
+        with pytest.raises(ValueError, match="The dissipation must not jump"):
+            rk.outcome(BLOCK, rk.SinePulse(0.5, 1.0), equation(lambda x, v, block: size * jnp.sign(v)))
+    with pytest.raises(ValueError, match="must be linear in the push"):
+        model = rk.models.Equation(acceleration=lambda x, v, push, block: x - block.alpha - push**3)
+        rk.outcome(BLOCK, rk.SinePulse(0.5, 1.0), model)
+    for smooth in (lambda x, v, block: 0.02 * jnp.tanh(v / 1e-3), lambda x, v, block: 5.0 * v + jnp.abs(v) * v):
+        assert not any(equation(smooth).faults(BLOCK).values())
+
+
 @pytest.mark.slow  # compiles an arc of diffrax
 def test_programs_of_ones_own_equation_call_back_to_nothing():
     """Else JAX would not keep them."""

@@ -11,6 +11,8 @@ from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero
 
+_CREEP = 1e-30  # a velocity at which nothing but what jumps is felt
+
 
 class Equation(AbstractEquation):
     """A model of your own, written as functions; the diffrax engine solves it.
@@ -29,12 +31,14 @@ class Equation(AbstractEquation):
 
     A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
-    The functions must be smooth, work on JAX arrays, and be defined somewhat beyond 0 and pi/2. Functions that are
-    Equinox modules may carry parameters to differentiate. They may read what changes: every call of the package sees
-    them as they are then (within a function of yours under `jax.jit`, as when that was traced). A block that has
-    stopped below its unstable equilibrium after the motion counts as safe: what dissipates does not lift.
+    The functions must be smooth (dry friction is nearly k tanh(v/w), with a small w), work on JAX arrays, and be
+    defined somewhat beyond 0 and pi/2. Functions that are Equinox modules may carry parameters to differentiate. They
+    may read what changes: every call of the package sees them as they are then (within a function of yours under
+    `jax.jit`, as when that was traced). A block that has stopped below its unstable equilibrium after the motion
+    counts as safe: what dissipates does not lift.
 
-    **Raises:** ValueError where neither or both ways are used.
+    **Raises:** ValueError where neither or both ways are used; where it is used for a block that does not stand by it,
+    or if its dissipation jumps at rest or its acceleration is not linear in the push.
     """
 
     _acceleration: Callable
@@ -65,6 +69,25 @@ class Equation(AbstractEquation):
         zero = jnp.zeros_like(block.alpha)
         alone, pushed = (self._acceleration(zero, zero, push, as_functions_see(block)) for push in (zero, zero + 1))
         return -alone, alone - pushed
+
+    def faults(self, block: Block | Side) -> dict[str, Scalar]:
+        """What is wrong with the functions just after uplift, in words, and whether it is."""
+        zero = jnp.zeros_like(block.alpha)
+        alone, arm = self.at_rest(block)
+
+        def moment(velocity=0.0, push=0.0):
+            return -self._acceleration(zero, zero + velocity, zero + push, as_functions_see(block))
+
+        noise = 1e3 * jnp.finfo(zero.dtype).eps * (jnp.abs(alone) + jnp.abs(arm))
+        jump = jnp.abs(moment(velocity=_CREEP) - moment(velocity=-_CREEP))
+        bend = jnp.abs(moment(push=2.0) - alone - 2 * arm)
+        return {
+            "The restoring moment must be positive at rotation 0.": alone <= 0,
+            "The overturning arm must be positive at rotation 0.": arm <= 0,
+            "The dissipation must not jump where the velocity changes its sign: dry friction is nearly "
+            "k tanh(v/w) with a small w, not k sign(v).": jump > noise,
+            "The acceleration must be linear in the push of the ground.": bend > noise,
+        }
 
     @property
     def falls_flat(self) -> bool:

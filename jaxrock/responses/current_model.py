@@ -44,7 +44,7 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
 
 
 def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block | AsymmetricBlock:
-    """The block, with a check that it stands by an equation of the user's own (of `current_model`).
+    """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one.
 
     Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
     """
@@ -52,17 +52,17 @@ def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block |
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
         # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
-        found = _falls(model, side) if is_traced((model, side)) else _compiled_falls(model, side)
-        for name, falls in zip(("restoring moment", "overturning arm"), found):
-            block = guarded(block, falls, f"The {name} must be positive at rotation 0.")
+        found = _faults(model, side) if is_traced((model, side)) else _compiled_faults(model, side)
+        for message, applies in found.items():
+            block = guarded(block, applies, message)
     return block
 
 
-def _falls(model: Equation, block: Block | Side) -> list[Bool[Array, ""]]:
-    return [jnp.any(moment <= 0) for moment in model.at_rest(block)]
+def _faults(model: Equation, block: Block | Side) -> dict[str, Bool[Array, ""]]:
+    return {message: jnp.any(applies) for message, applies in model.faults(block).items()}
 
 
-_compiled_falls = jax.jit(_falls)
+_compiled_faults = jax.jit(_faults)
 
 
 def _is_functions(node) -> bool:
