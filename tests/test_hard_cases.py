@@ -540,3 +540,19 @@ def test_the_judge_sees_errors():
     for name, change in spoilt.items():
         assert hard_cases.judge(known, good | change, bound).startswith(name)
     assert hard_cases.judge(known, good | {"max_rotation": np.float64("nan")}, bound).startswith("peak")
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_the_error_of_a_small_peak(dtype):
+    """Blocks that hardly move when the motion ends: the peak comes by energy, the history's step by step."""
+    rate = jnp.asarray(np.geomspace(1e-3, 2.0, 4), dtype)
+    pulse = rk.SinePulse(jnp.asarray(0.3, dtype), jnp.asarray(0.25, dtype))
+
+    def both(p):
+        block = rk.Block(jnp.asarray(0.2, dtype), p, jnp.asarray(0.5, dtype))
+        found = rk.outcome(block, pulse)
+        return found.max_rotation, found.error, rk.simulate(block, pulse, duration=0.8, samples=2).max_rotation
+
+    peak, error, other = (np.asarray(x, float) for x in jax.jit(jax.vmap(both))(rate))
+    assert peak.min() < 1e-7 and np.all(np.abs(peak - other) <= error)
+    assert np.all(error < 5e-16 if dtype == jnp.float64 else error < 1e-6)

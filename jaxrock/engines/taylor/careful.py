@@ -178,6 +178,8 @@ class TaylorStepper(AbstractStepper):
         toss_up = toss_up & (state.status == Status.successful)
         flat = stage.peak_steepness <= 0
         error = where(flat, off, off * stage.peak_share / where(flat, 1.0, stage.peak_steepness))
+        # Peaks are what is missing to the saddle: small ones have lost their digits.
+        lost = where(moving, 4 * self.rounding * moments.saddle, 0.0)
         return replace(
             state,
             overturned=state.overturned | stage.overturned,
@@ -187,7 +189,7 @@ class TaylorStepper(AbstractStepper):
             second=jnp.maximum(state.second, jnp.minimum(state.peak, stage.peak)),
             peak_clearance=where(stage.peak > state.peak, state.clearance, state.peak_clearance),
             peak_time=where(higher, self.time(state) + stage.peak_time / scene.p, state.peak_time),
-            error=fixed(where(higher, error, state.error)),
+            error=fixed(where(higher, error, state.error) + lost),
             fastest=jnp.maximum(state.fastest, stage.fastest),
             impacts=state.impacts + stage.impacts,
             status=Status.where(toss_up, Status.undecided, state.status),
