@@ -124,6 +124,11 @@ class Diffrax(AbstractEngine):
         """Whether reverse mode goes through this engine's own loops: as the adjoint tells."""
         return not isinstance(self.adjoint, diffrax.ForwardMode)
 
+    @property
+    def in_lanes(self) -> bool:
+        """Machine code follows an arc's solve unless reverse mode goes through it."""
+        return not self.reverse
+
     def stepper(self, scene: Scene, stop: Scalar | None, history: bool, taped: bool = False) -> "ArcStepper":
         """This engine at work on a scene."""
         if taped:
