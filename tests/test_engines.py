@@ -2,13 +2,16 @@
 
 import functools
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 import jaxrock as rk
 from jaxrock.engines.taylor.policy import POLICY, exact
+from jaxrock.engines.trajectory import followed
 from references.hard_cases import LANES, SAMPLES, engines, outcomes
 
 RTOL = 1e-8
@@ -313,3 +316,32 @@ def test_less_is_computed_where_less_is_asked():
     assert all([POLICY.order(5000, t, linear) for t in asked] == [9, 9, 7, 6] for linear in (False, True))
     half = exact(np.float32)
     assert [POLICY.order(*kind) for kind in [(2, half, False), (2, half, True), (5000, half, False)]] == [10, 12, 6]
+
+
+class Count(eqx.Module):
+    """As much of a state as a loop over steps asks for."""
+
+    steps: jax.Array
+    last: jax.Array
+
+    @property
+    def done(self):
+        return self.steps >= self.last
+
+
+def test_lanes_of_histories_are_not_copied_at_every_step():
+    """What is kept of each lane is written in place, and nothing is chosen between whole arrays of it."""
+
+    def run(last):
+        start = Count(jnp.int32(0), last)
+        return followed(
+            lambda s: Count(s.steps + 1, s.last), start, 100, lambda c, s, x, _: jax.lax.while_loop(c, s, x)
+        )
+
+    lasts = jnp.array([3, 0, 100, 7], jnp.int32)
+    final, kept = jax.vmap(run)(lasts)
+    np.testing.assert_array_equal(final.steps, lasts)
+    for last, steps in zip(lasts, kept.steps):
+        np.testing.assert_array_equal(steps, np.where(np.arange(101) <= last, np.arange(101), 0))
+    chosen = [line for line in str(jax.make_jaxpr(jax.vmap(run))(lasts)).splitlines() if "select_n" in line]
+    assert chosen and not any("[4,101]" in line for line in chosen)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
@@ -88,14 +89,20 @@ def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> t
     def store(nodes, state):
         return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
 
+    def unfinished(state):
+        return ~state.done & (state.steps < budget)
+
     def step(carry):
-        state, nodes = carry
-        state = advance(state)
+        before, nodes = carry
+        going, after = unfinished(before), advance(before)
+        state = jax.tree.map(lambda new, old: where(going, new, old), after, before)
         return state, store(nodes, state)
 
     nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
     start = state, store(nodes, state)
-    return loop(lambda carry: ~carry[0].done & (carry[0].steps < budget), step, start, budget)
+    # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
+    # wait, and keep their last state once more.
+    return loop(lambda carry: unvmap_any(unfinished(carry[0])), step, start, budget)
 
 
 def times_of(time: Callable, nodes: PyTree, last: PyTree) -> Inexact[Array, " nodes"]:
