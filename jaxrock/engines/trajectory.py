@@ -54,7 +54,7 @@ class Trajectory(eqx.Module):
         """The node before a time, and how long after it that is [s]; not a number where no step was left for that."""
         index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
-        elapsed = jnp.minimum(time, self.duration) - self.times[index]
+        elapsed = where(time <= self.duration, time, self.duration) - self.times[index]
         is_followed = node.done | (index < self.times.size - 1) | (elapsed <= 0)
         return node, where(is_followed, elapsed, jnp.nan)
 
@@ -66,7 +66,8 @@ class Trajectory(eqx.Module):
         found, count = _in_order(happened, order, values)
         if isinstance(count, jax.core.Tracer):
             return found
-        return tuple(jnp.asarray(np.asarray(value)[: int(count)]) for value in found)
+        traced = any(isinstance(value, jax.core.Tracer) for value in found)  # known events, of which something moves
+        return tuple(value[: int(count)] if traced else jnp.asarray(np.asarray(value)[: int(count)]) for value in found)
 
 
 @jax.jit

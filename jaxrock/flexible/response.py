@@ -238,7 +238,8 @@ def _at_times(path: Trajectory, time, what: str):
 
     def follow(node, elapsed):
         curve, length, _, _ = scene.arc(node)
-        x = jnp.where(node.done, 0.0, elapsed / length)  # the last node is the end of the history
+        # The last node is the end of the history; but time goes through it.
+        x = jnp.where(node.done, elapsed - jax.lax.stop_gradient(elapsed), elapsed) / length
         if what == "outputs":
             return tuple(curve.outputs(x) * scales)
         state = curve.state(x)

@@ -171,7 +171,10 @@ def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
     shares = jnp.linspace(0.0, 1.0, _WITHIN + 1)
 
     def step(node, start, end):
-        lasts = jnp.where(jnp.isfinite(end), end - start, 0.0)
+        # What is infinite has derivatives that are not numbers, wherever it is left out later.
+        is_step, ends = jnp.isfinite(start), jnp.isfinite(end)
+        start, end = jnp.where(is_step, start, 0.0), jnp.where(ends, end, 0.0)
+        lasts = jnp.where(ends, end - start, 0.0)
 
         def at(share):
             opening, speed = stepper.evaluate(node, share * lasts)
@@ -182,7 +185,7 @@ def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
             time = start + jnp.clip(share, 1e-9, 1 - 1e-9) * lasts
             forces = _forces(stepper.scene, sides, time, node.side * opening, node.side * speed, node.side)
             below = opening < stepper.scene.on(node.side).moments.saddle
-            counts = jnp.isfinite(start) & ~node.done & below
+            counts = is_step & ~node.done & below
             return jnp.where(counts, _friction(*forces), 0.0), jnp.where(counts, forces[1], jnp.inf)
 
         friction, normal = jax.vmap(at)(shares)

@@ -27,7 +27,7 @@ from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, 
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result
-from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[Array, "..."]
 
@@ -368,6 +368,6 @@ def _at(given) -> tuple[Scalar, Scalar]:
     opening, speed = stepper.evaluate(node, elapsed)
     # The last node is the end of the history: the block lies, rests, or is caught in motion there.
     lies = node.done & (node.opening >= jnp.pi / 2)
-    velocity = jnp.where(node.done, node.velocity * stepper.scene.p, speed)
-    velocity = jnp.where(lies, 0.0, velocity)
-    return node.side * jnp.where(node.done, node.opening, opening), node.side * velocity
+    caught = with_derivatives_of((node.opening, node.velocity * stepper.scene.p), (opening, speed))
+    opening, speed = (jnp.where(node.done, end, x) for end, x in zip(caught, (opening, speed)))
+    return node.side * jnp.where(lies, node.opening, opening), node.side * jnp.where(lies, 0.0, speed)

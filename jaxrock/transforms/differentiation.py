@@ -8,18 +8,19 @@ import jax.numpy as jnp
 from jax.extend.core import jaxpr_as_fun
 
 from jaxrock.keeping.facts import facts as facts_of
-from jaxrock.numerics.given import given
+from jaxrock.numerics.given import given, is_zero
 from jaxrock.transforms.recipe import Derivatives, Passes, Recipe
 from jaxrock.transforms.scenes import computed
 
 
 def with_derivatives_of(value, other):
-    """`value`, with the derivatives of `other`, which is the same but for rounding; without derivatives it is free."""
+    """`value`, a number or several, with the derivatives of `other`, which is the same but for rounding; without
+    derivatives it is free."""
     return given(_following, value, other)
 
 
-def _following(value, other, change):
-    return change
+def _following(_, other, change):
+    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if is_zero(d) else d, other, change)
 
 
 def differentiable(

@@ -281,7 +281,12 @@ class ArcStepper(AbstractStepper):
             return engine.solve(*arc, event=None).ys[-1]
 
         run = run if self.engine.reverse else differentiable(run)
-        opening, velocity = run((self.engine, arc, self.engine.limits(self.scene, node.piece), self.scene.p * elapsed))
+        time = self.scene.p * elapsed
+        y = run((self.engine, arc, self.engine.limits(self.scene, node.piece), time))
+        # A solve of no length does not move with it.
+        shift = jnp.where(time == 0, time - jax.lax.stop_gradient(time), 0.0)
+        flow, bent = jax.jvp(arc.flow, (time, y), (jnp.ones_like(time), arc.flow(time, y)))
+        opening, velocity = y + shift * flow + shift**2 / 2 * bent
         return opening, velocity * self.scene.p
 
     def _is_hop(self, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:
