@@ -12,6 +12,7 @@ from scipy.special import ndtr
 
 import jaxrock as rk
 from jaxrock.hazard.intervals import intervals_of_motions
+from jaxrock.motions.suite import repeated
 
 G = 9.81
 RICKER_TOP = np.sqrt((3 - np.sqrt(6)) * 6) * np.exp(-(3 - np.sqrt(6)) / 2)  # of |y^3 - 3y| e^(-y^2/2)
@@ -225,6 +226,30 @@ def test_intervals_that_cannot_be_told():
         found = table(verdict).intervals()
         assert found.status == getattr(rk.hazard.FitStatus, status)
         assert np.isnan(found.median).all() and np.isnan(found.dispersion).all()
+
+
+def test_no_intervals_where_all_motions_did_the_same():
+    """Their variance is none, of which nothing follows: the fit stands, errors and intervals are not numbers."""
+    found = table([[[k < n for k in range(12)] for n in range(12)]] * 3)
+    assert found.fit().status == rk.hazard.FitStatus.successful
+    assert np.isfinite(found.fit().fragility.median) and np.isnan(found.fit().covariance).all()
+    assert found.intervals().status == rk.hazard.FitStatus.alike
+    assert np.isnan(found.intervals().median).all() and np.isnan(found.intervals().dispersion).all()
+
+
+def test_motions_that_are_the_same():
+    """Whatever they are called, whichever function made them; not those of other samples, steps, or kinds."""
+    same = [rk.Record([0.0, 0.3, 0.0], 0.4, name) for name in ("a", "b")]
+    others = [rk.Record([0.0, 0.3, 1e-9], 0.4), rk.Record([0.0, 0.3, 0.0], 0.41), 2 * same[0], -1 * same[0]]
+    others += [rk.SinePulse(0.3, 0.4), rk.CosinePulse(0.3, 0.4), 2 * rk.SinePulse(0.3, 0.4)]
+    assert repeated(rk.motions.Suite([same[0], *others])) is None
+    assert repeated(rk.motions.Suite([*same, *others[:2]])) == ("a", "b")
+    many = rk.motions.Suite([rk.SinePulse(np.array([0.3, 0.5]), 0.4), rk.SinePulse(0.5, 0.4)])
+    assert repeated(many) == ("SinePulse 2", "SinePulse")
+    with pytest.raises(ValueError, match="`motions` must hold each motion once, but 'a' and 'b' are the same"):
+        rk.hazard.simulated_fragility(BLOCKS, same, [0.1, 0.2])
+    with pytest.warns(UserWarning, match="Motions 'a' and 'b' are the same: what they do counts twice"):
+        rk.hazard.suite_outcomes(rk.Block(0.2, 2.0), same, 0.1, rk.Linear(), progress=False)
 
 
 def test_intervals_hold_for_few_motions():

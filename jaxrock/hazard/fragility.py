@@ -184,6 +184,10 @@ class FitStatus(Enumeration):
         "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
     )
     not_converged = item("The maximum of the likelihood was not found.")
+    alike = item(
+        "All motions did the same at every level: nothing is known of how they differ, and there are no intervals. "
+        "Take more motions, more levels, or more draws."
+    )
 
 
 class FragilityFit(AbstractTable):

@@ -1,9 +1,10 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
 import contextlib
+import dataclasses
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Annotated
+from collections.abc import Hashable, Iterator, Sequence
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -191,6 +192,30 @@ def _names(motion: AbstractMotion, size: int) -> list[str]:
         inner = inner.motion  # of one that is scaled, say
     name = getattr(inner, "name", "") or type(motion).__name__
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
+
+
+def repeated(suite: Suite) -> tuple[str, str] | None:
+    """Names of two motions that are the same to the last sample; None where there are none, or some are traced."""
+    if is_traced(suite):
+        return None
+    seen: dict[Any, str] = {}
+    for name, motion in zip(suite.names, suite.motions()):
+        before = seen.setdefault(_content(motion), name)
+        if before is not name:
+            return before, name
+    return None
+
+
+def _content(value: Any) -> Hashable:
+    """What a motion is made of, but for its name and where it comes from (all labels are equal)."""
+    if isinstance(value, (np.ndarray, jax.Array)):
+        array = np.asarray(value)
+        return array.shape, array.dtype.str, array.tobytes()
+    if isinstance(value, eqx.Module):
+        return type(value), *(_content(getattr(value, field.name)) for field in dataclasses.fields(value))
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_content, value))
+    return value if isinstance(value, Hashable) else id(value)
 
 
 def _numbered(names: list[str]) -> list[str]:
