@@ -445,6 +445,13 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
         ("a,ten,0.5,1,0,,toppled,,", "line 2: `alpha_deg` must be a number"),
         ("a,10,0.5,1,0,,toppled,", "line 2: has 8 fields, but there are 9 columns"),
         ("a,,0.5,1,0,,toppled,,", "line 2: `alpha` is empty"),
+        (
+            "a,0.17,0.01,1,0,,toppled,,",
+            "line 2: `alpha_deg` must be 0.5 or more, .* is 0.17; .* the column is `alpha_rad`",
+        ),
+        ("a,10,0.5,1,0,,stood,3,0.5", "line 2: `observed` is 'stood', but a rotation is given: call it rocked"),
+        ("a,10,0.5,1,0,,fell,3,", "line 2: `observed` is 'fell', but a rotation is given"),
+        ("a,10,0.5,1,0,,rocked,40,0.5", "line 2: Argument `rotation` must be below twice `alpha`"),
         ("#1,10,0.5,1,0,,toppled,,", "line 2: looks like a rock, but a line that begins with # is a comment"),
     ],
 )
@@ -489,6 +496,19 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
         (lambda: rk.inverse.Observations([0.1], [2.0], ["topled"]), "`seen` must hold only .* Did you mean 'toppled'"),
         (lambda: rk.inverse.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
         (lambda: rk.inverse.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
+        (
+            lambda: rocks(["toppled"] * 12, alpha_sd=0.12),
+            "`alpha_sd` must be below `alpha`, and in radians, but is 0.12",
+        ),
+        (lambda: rocks(["toppled"] * 12, p_sd=5.1), "`p_sd` must be below `p`, and in rad/s, but is 5.1"),
+        (
+            lambda: rocks(["rotation"] * 12, rotation=1.0, rotation_sd=0.01),
+            "`rotation` must be below twice `alpha`, .* 1.$",
+        ),
+        (
+            lambda: rocks(["rotation"] * 12, rotation=0.1, rotation_sd=0.8),
+            "`rotation_sd` must be below `alpha`, and in",
+        ),
         (lambda: rk.inverse.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),
     ],
 )

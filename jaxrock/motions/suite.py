@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, finite, is_traced, shown, watched
+from jaxrock._checks import Values, direction, is_traced, shown, watched
 from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
@@ -46,8 +46,8 @@ class Suite(AbstractNamed):
     - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Or a list of
       `Components`, each of which is one motion for every azimuth.
     - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
-    - `azimuth`: (azimuths,) of components [rad], from the first one towards the second: in which vertical planes a
-      block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
+    - `azimuth`: (azimuths,) of components [rad], within 2 pi, from the first one towards the second: in which vertical
+      planes a block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
 
     `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
     all scenes share the samples of all records.
@@ -156,7 +156,7 @@ def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | No
     """Components at all azimuths: motions, their names, the names of their records, and the azimuth of each."""
     if azimuth is None or not all(isinstance(each, Components) for each in motions):
         raise ValueError("Arguments `motions` and `azimuth` must be given for components alone, all of them.")
-    angles = np.asarray(finite("azimuth", azimuth), float)
+    angles = np.asarray(direction("azimuth", azimuth), float)
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
     own = [each.first.name or f"record {number + 1}" for number, each in enumerate(motions)]
