@@ -385,6 +385,10 @@ def test_motions_of_one_name_are_numbered():
             lambda: rk.motions.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
             "`motions` must move the ground, but 'quiet' does not",
         ),
+        (
+            lambda: rk.motions.Suite([rk.Record([0.3], 0.01, "one")]),
+            "`motions` must move the ground, but 'one' does not",
+        ),
         (lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
         (
             lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2, 0.1]),
@@ -411,6 +415,12 @@ def test_motions_of_one_name_are_numbered():
 def test_bad_input_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_traced_record_of_one_sample_is_refused():
+    speed = jax.jit(lambda x: rk.motions.Suite([rk.Record(x[None], 0.01)]).peak_velocity)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="`motions` must move the ground"):
+        jax.block_until_ready(speed(0.3))
 
 
 # --------------------------------------------------------------------------------------- slow

@@ -97,13 +97,15 @@ class Suite(AbstractNamed):
         self.sources = self.names if sources is None else sources
         self.peak_acceleration, self.peak_velocity = map(jnp.concatenate, zip(*map(_peaks, self.groups)))
         if is_traced(self.peak_acceleration):
-            peaks, failed = (self.peak_acceleration, self.peak_velocity), ~jnp.all(self.peak_acceleration > _LEAST)
+            peaks = self.peak_acceleration, self.peak_velocity
+            failed = ~jnp.all((peaks[0] > _LEAST) & (peaks[1] > 0))
             self.peak_acceleration, self.peak_velocity = watched(
                 peaks, "Argument `motions` must move the ground", failed
             )
             return
-        for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
-            if not peak > _LEAST:
+        # What lasts for no time, as a record of one sample, has an acceleration, and no velocity.
+        for name, peak, speed in zip(self.names, np.asarray(self.peak_acceleration), np.asarray(self.peak_velocity)):
+            if not (peak > _LEAST and speed > 0):
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
 
     def __len__(self) -> int:
