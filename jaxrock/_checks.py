@@ -105,7 +105,8 @@ def shown(value: Any) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__} (without parentheses)"
     if hasattr(type(value), "__dataclass_fields__"):
-        return f"a {type(value).__name__}"
+        name = type(value).__name__
+        return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
     if callable(value):
         return f"the function {getattr(value, '__name__', type(value).__name__)}"
     text = " ".join(repr(value).split())

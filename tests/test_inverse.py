@@ -496,9 +496,52 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
     refused(tmp_path, header, ",".join("1" * (header.count(",") + 1)), message)
 
 
+LIKELIHOOD = rk.inverse.Likelihood(rk.inverse.Observations(ALPHA, P, ["survived"] * 12), rk.SinePulse)
+
+
+def test_unexceeded_records():
+    """Of one shape and several durations: as each alone; they share samples."""
+    seen, shape = rk.inverse.Observations([0.12], [3.0], ["survived"]), np.sin(np.linspace(0, 2 * np.pi, 20))
+    found = rk.inverse.unexceeded_motion(seen, lambda a, d: a * rk.Record(shape, d / 19), [0.5, 0.6], progress=False)
+    peak = np.abs(shape).max()
+    for duration, amplitude in zip((0.5, 0.6), found.amplitude):
+        stands, falls = (
+            rk.outcome(rk.Block(0.12, 3.0), float(x * amplitude / peak) * rk.Record(shape, duration / 19)).overturned
+            for x in (0.999, 1.001)
+        )
+        assert falls and not stands
+
+
 @pytest.mark.parametrize(
     "wrong, message",
     [
+        (lambda: LIKELIHOOD.log_terms({"amp": 0.3}), r"`motion` must make a motion of \['amp'\], but: .*'amplitude'"),
+        (lambda: LIKELIHOOD.survival({"amplitude": 0.3}), "`motion` must make a motion of .*: missing .* 'period'"),
+        (lambda: LIKELIHOOD.survival({}), "`values` must name the parameters of the motion, but is empty"),
+        (
+            lambda: LIKELIHOOD.log_terms({"amplitude": np.ones(2), "period": np.ones(3)}),
+            "`amplitude` and `period` must have shapes that go together",
+        ),
+        (
+            lambda: rk.inverse.estimate_motion(
+                LIKELIHOOD.observations, rk.SinePulse, {"amplitud": rk.inverse.Unknown(0.1, 1.0)}
+            ),
+            "`motion` must make a motion of",
+        ),
+        (
+            lambda: rk.inverse.Likelihood(LIKELIHOOD.observations, lambda x: x).survival({"x": 0.3}),
+            "`motion` must make a motion of its parameters, but makes an array",
+        ),
+        (
+            lambda: rk.inverse.unexceeded_motion(
+                LIKELIHOOD.observations, lambda a, d: rk.Record(a * jnp.ones(9), d), [0.5, 0.6]
+            ),
+            "`motion` must make a motion whose samples do not depend on amplitude",
+        ),
+        (
+            lambda: rk.inverse.unexceeded_motion(LIKELIHOOD.observations, lambda a, d: a, [0.5]),
+            "`motion` must make a motion of amplitude and duration, but makes",
+        ),
         (lambda: rk.inverse.Unknown(2.0, 1.0), "`high` must be above `low`"),
         (lambda: rk.inverse.Unknown(0.0, 1.0), "`low` must be positive"),
         (lambda: rk.inverse.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),

@@ -379,6 +379,19 @@ def test_motions_of_one_name_are_numbered():
 @pytest.mark.parametrize(
     "call, message",
     [
+        (lambda: rk.motions.Suite([RECORD])[:2], "A motion of a suite has a whole number, but this is slice"),
+        (
+            lambda: rk.blocks.draw_blocks(rk.Block(0.4, 3.0), 1000, alpha=0.3),
+            "deviation `alpha` must let all 1000 draws be blocks, but one is none .* Lower it",
+        ),
+        (
+            lambda: rk.hazard.simulated_surface(BLOCKS, [rk.ExponentialPulse], [0.1, 0.2], [0.1, 0.2]),
+            "`pulses` must make motions of amplitude and period, but .*ExponentialPulse.* does not: missing .*'shape'",
+        ),
+        (
+            lambda: rk.hazard.simulated_fragility(rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0), [RECORD], [0.1, 0.2]),
+            "but is an AsymmetricBlock",
+        ),
         (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
         (lambda: rk.motions.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
         (
@@ -415,6 +428,14 @@ def test_motions_of_one_name_are_numbered():
 def test_bad_input_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_motions_by_their_numbers():
+    suite = rk.motions.Suite([RECORD, 2 * RECORD])
+    assert suite[-1].factor == suite[jnp.asarray(1)].factor == 2.0
+    for number in (2, -3):
+        with pytest.raises(IndexError, match=f"A suite of 2 motions has none with the number {number}"):
+            suite[number]
 
 
 def test_a_traced_record_of_one_sample_is_refused():

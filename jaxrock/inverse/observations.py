@@ -283,7 +283,8 @@ def _is_facing(x):
 def _list(name: str, value: Values, count: int) -> Rocks:
     array = as_real(name, value)
     if array.shape not in ((), (count,)):
-        raise ValueError(f"Argument `{name}` must have a value for each of {count} rocks, but has shape {array.shape}.")
+        each = "one rock" if count == 1 else f"each of {count} rocks"
+        raise ValueError(f"Argument `{name}` must have a value for {each}, but has shape {array.shape}.")
     return array if array.ndim else placed(np.full(count, array))
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import operator
 from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Annotated, Any
@@ -114,11 +115,11 @@ class Suite(AbstractNamed):
     def __getitem__(self, number) -> AbstractMotion:
         """One of its motions. Where its number is traced, scenes of all records share their samples.
 
-        **Raises:** IndexError for a number without a motion, ValueError for one that is traced; ValueError for a traced
-        number where motions are of several kinds, or made of records.
+        **Raises:** IndexError for a number without a motion, ValueError for one that is traced, or is no whole number;
+        ValueError for a traced number where motions are of several kinds, or made of records.
         """
         if not is_traced(number):
-            place = range(len(self))[number]
+            place = _place(number, len(self))
             ends = np.cumsum([size_of(group) for group in self.groups])
             group = int(np.searchsorted(ends, place, side="right"))
             return one_of_many(self.groups[group], place - int(ends[group]) + size_of(self.groups[group]))
@@ -152,6 +153,17 @@ class Suite(AbstractNamed):
         for group in self.groups:
             for index in range(size_of(group)):
                 yield one_of_many(group, index)
+
+
+def _place(number: Any, count: int) -> int:
+    """The place of a motion, from 0, by its number, which may be counted from the end."""
+    try:
+        place = operator.index(number)  # of arrays of one whole number, too
+    except TypeError:
+        raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.") from None
+    if not -count <= place < count:
+        raise IndexError(f"A suite of {count} motions has none with the number {place}.")
+    return place % count
 
 
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None):
