@@ -2,6 +2,7 @@
 
 import re
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
+from jaxrock.inverse.observation_files import _COLUMNS
 from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.scatter import rocks_at
@@ -439,6 +441,18 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
     seen = rk.inverse.read_observations(path)
     assert [SEEN[k] for k in np.asarray(seen.seen)] == ["toppled", "rotation", "survived", "survived"]
     np.testing.assert_allclose(seen.rotation[1], np.deg2rad(5.1))
+
+
+def test_all_columns_of_a_file_are_told(capsys):
+    """To who asks for help, reads the docstring, or the page about rocks."""
+    with pytest.raises(SystemExit):
+        main(["invert", "--help"])
+    page = (Path(__file__).parents[1] / "docs" / "how_to" / "rock.md").read_text()
+    for told in (capsys.readouterr().out, page):
+        assert {name for name in _COLUMNS if not name.endswith("_sd")} <= set(re.findall(r"\w+", told))
+    assert {name for name in _COLUMNS if not name.endswith(("_sd", "_deg"))} <= set(
+        re.findall(r"\w+", rk.inverse.read_observations.__doc__)
+    )
 
 
 @pytest.mark.parametrize(

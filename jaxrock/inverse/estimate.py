@@ -146,7 +146,7 @@ def estimate_motion(
 
     - `observations`: an `Observations`.
     - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
-      own.
+      own. Of a record scale the whole: see `Likelihood`.
     - `unknowns`: an `Unknown` for each of these parameters.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
       observation says nothing; see `Likelihood`. They are not estimated.

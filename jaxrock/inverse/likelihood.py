@@ -58,7 +58,9 @@ class Likelihood(eqx.Module):
 
     - `observations`: an `Observations`.
     - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
-      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced).
+      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced). Of a
+      record scale the whole, `amplitude * rk.Record(samples, dt * stretch)`: the likelihood of one with other samples,
+      `rk.Record(amplitude * samples, dt)`, is differentiated by each of them, which takes many times as long.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.

@@ -74,7 +74,19 @@ def read_observations(path: str | Path) -> Observations:
 
     **Arguments:**
 
-    - `path`: of the file; `jaxrock/observation_files.py` and `jaxrock invert --help` tell its columns.
+    - `path`: of the file.
+
+    The first line that is not a comment (#) names the columns, with their units; the others hold a rock each:
+
+    - `name`: optional.
+    - `alpha_rad` or `alpha_deg`, with `p_rad_per_s` or `half_diagonal_m` (of a rectangle); or `width_m` and `height_m`.
+    - Of rocks whose sides differ instead: `alpha1_rad` and `alpha2_rad` (or `_deg`), with `p1_rad_per_s` and
+      `p2_rad_per_s`, or `radius1_m` and `radius2_m`; optional `inertia_ratio` (m R1^2/I1; empty is 3/4) and `facing`
+      (1, -1; empty is not known).
+    - `restitution`: optional; empty is by angular momentum.
+    - `observed`: survived (stood), toppled (fell), or rotation (rocked); of the last `rotation_rad` or `rotation_deg`.
+    - `..._sd` of what was measured, such as `alpha_deg_sd`: standard deviation in the same unit; empty is 0. A rotation
+      needs one; `alpha2`, `p2_rad_per_s`, `radius2_m`, `inertia_ratio` and `facing` have none.
 
     **Returns:** an `Observations`.
 
