@@ -308,7 +308,7 @@ def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
     """The most probable places, their errors, and what fits to other motions say."""
     place, converged = climbed(problem, _starts(problem))
     ends = np.asarray(problem.ends)
-    covariance, good = _errors(_curvature(problem, place), np.ptp(ends, axis=1))
+    covariance, good = _errors(np.asarray(_hessian(problem, jnp.asarray(place))), np.ptp(ends, axis=1))
     at_end = np.any(
         (place - ends[:, 0] < 1e-4 * np.ptp(ends, axis=1)) | (ends[:, 1] - place < 1e-4 * np.ptp(ends, axis=1))
     )
@@ -392,10 +392,6 @@ def _value(problem, place, weights):
 @jax.jit
 def _probabilities(problem, place, shares):
     return problem.probabilities(place, shares)
-
-
-def _curvature(problem, place) -> np.ndarray:
-    return np.asarray(_hessian(problem, jnp.asarray(place)))
 
 
 @jax.jit
