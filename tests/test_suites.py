@@ -434,7 +434,7 @@ def test_motions_by_their_numbers():
     suite = rk.motions.Suite([RECORD, 2 * RECORD])
     assert suite[-1].factor == suite[jnp.asarray(1)].factor == 2.0
     for number in (2, -3):
-        with pytest.raises(IndexError, match=f"A suite of 2 motions has none with the number {number}"):
+        with pytest.raises(IndexError, match=f"is out of range: {number} of 2 motions"):
             suite[number]
 
 

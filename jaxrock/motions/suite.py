@@ -162,7 +162,7 @@ def _place(number: Any, count: int) -> int:
     except TypeError:
         raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.") from None
     if not -count <= place < count:
-        raise IndexError(f"A suite of {count} motions has none with the number {place}.")
+        raise IndexError(f"The number of a motion is out of range: {place} of {count} motions.")
     return place % count
 
 
