@@ -105,7 +105,8 @@ def shown(value: Any) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__} (without parentheses)"
     if hasattr(type(value), "__dataclass_fields__"):
-        return f"a {type(value).__name__}"
+        name = type(value).__name__
+        return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
     if callable(value):
         return f"the function {getattr(value, '__name__', type(value).__name__)}"
     text = " ".join(repr(value).split())
@@ -240,6 +241,8 @@ not_negative = Range("be 0 or more and finite", 0.0, np.inf, lambda x: (x >= 0) 
 finite = Range("be finite", -np.inf, np.inf, lambda x: (x > -np.inf) & (x < np.inf))
 level = Range("be 0 or more", 0.0, np.inf, lambda x: x >= 0)  # of a shaking; infinite: any
 not_nan = Range("be a number", -np.inf, np.inf, lambda x: x == x)  # some may be infinite
+# Directions, with room for the rounding of a full turn; more of it is a number of degrees.
+direction = Range("be finite, and in radians, from -2 pi to 2 pi", -2 * np.pi, 2 * np.pi, lambda x: abs(x) <= 6.2832)
 share = Range("be in [0, 1]", 0.0, 1.0, lambda x: (x >= 0) & (x <= 1))
 inner_share = Range("be in (0, 1)", 0.0, 1.0, lambda x: (x > 0) & (x < 1))
 below_one = Range("be in [0, 1)", 0.0, 1.0, lambda x: (x >= 0) & (x < 1))

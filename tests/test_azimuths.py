@@ -129,6 +129,10 @@ def test_a_suite_of_motions_has_none():
         (lambda: rk.motions.Suite([PAIR]), "`motions` and `azimuth` must be given for components alone"),
         (lambda: rk.motions.Suite([EAST], azimuth=[0.0]), "`motions` and `azimuth` must be given for components alone"),
         (lambda: rk.motions.Suite([PAIR, EAST], azimuth=[0.0]), "must be given for components alone"),
+        (
+            lambda: rk.motions.Suite([PAIR], azimuth=[0, 45, 90]),
+            "`azimuth` must be finite, and in radians, from -2 pi to 2 pi, .* 45",
+        ),
         (lambda: rk.motions.Suite([PAIR], azimuth=0.3), "`azimuth` must be a list of angles"),
         (lambda: rk.motions.Suite([PAIR], ["a", "b"], azimuth=[0.3]), "`names` must name 1 motions, but has 2"),
     ],

@@ -127,6 +127,18 @@ def test_rotations_say_more_than_verdicts(found):
         assert abs(np.log(float(more.values[name]) / truth)) < 3 * float(more.standard_errors[name])
 
 
+def test_a_parameter_that_tests_do_not_tell():
+    """Pulses far too weak, and far too strong, say that the rock lies between, and no more."""
+    pulses = [rk.SinePulse(0.02 if k % 2 else 6.0, 0.6) for k in range(20)]
+    fell = np.arange(20) % 2 == 0
+    for scatter in (SPREAD, 0.3):
+        flat = rk.inverse.calibrate_block(
+            lambda alpha: rk.Block(alpha, P), pulses, fell, {"alpha": UNKNOWN}, {"alpha": scatter}, cells=512, **QUICK
+        )
+        assert flat.status == rk.inverse.CalibrationStatus.not_told
+        assert np.isinf(list(flat.standard_errors.values())).all()
+
+
 def test_names_in_any_order():
     """Two parameters and a scatter: where the likelihood is largest does not hang on the order of their names."""
     unknowns = {"alpha": UNKNOWN, "p": rk.inverse.Unknown(1.5, 6.0)}

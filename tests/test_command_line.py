@@ -161,14 +161,18 @@ def test_run_that_cannot_be_completed(command, at2):
     assert re.fullmatch(r"jaxrock: these are not results: The step budget was used up .*\n", errors)
 
 
-def test_fragility(command, at2, column, tmp_path):
-    """Of two records, one twice; the table is that of the library."""
+def test_fragility(command, column, tmp_path):
+    """Of two records; the table is that of the library."""
+    other = tmp_path / "other.csv"
+    other.write_text("acceleration\n" + "".join(f"{float(a) * 980.665!r}\n" for a in SAMPLES[::-1]))
     words = ["--unit", "cm/s2", "--dt", "0.02", "--levels", "0.2", "6", "--points", "12", "--model", "linear"]
     words += ["--scatter", "0.4", "--draws", "6", "--width", "0.4", "--height", "1.2"]
-    status, table, errors = command("fragility", column, column, *words)
+    status, table, errors = command("fragility", column, other, *words)
     levels = np.geomspace(0.2, 6.0, 12)
     blocks = rk.blocks.draw_blocks(rk.Block.from_dimensions(0.4, 1.2), 6, alpha=0.4)
-    found = rk.hazard.simulated_fragility(blocks, [rk.Record(SAMPLES, 0.02)] * 2, levels, rk.Linear())
+    found = rk.hazard.simulated_fragility(
+        blocks, [rk.Record(x, 0.02) for x in (SAMPLES, SAMPLES[::-1])], levels, rk.Linear()
+    )
     _, rows = table_of(tmp_path / "out" / "fragility.csv")
     np.testing.assert_allclose(rows[:, 1], found.lower)
     assert (tmp_path / "out" / "stripes.csv").read_text().count("\n") == 25
@@ -335,6 +339,10 @@ BAD = {
     "duration 0": (["run", "--duration", "0"], "Argument `--duration` must be positive and finite, .*, but is 0.0"),
     "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, .*, but is nan"),
     "fragility, missing file": (["fragility", "missing.AT2"], "No such file or directory"),
+    "fragility, one file twice": (
+        ["fragility", "motion.txt", "motion.txt", "--unit", "g", "--dt", "0.02"],
+        "Argument `motions` must hold each motion once, but 'motion 1' and 'motion 2' are the same",
+    ),
     "fragility, levels": (["fragility", "a", "--levels", "2", "1"], "`--levels` must be positive, finite and in order"),
     "fragility, points 2": (["fragility", "a", "--points", "2"], "Argument `--points` must be at least 3, but is 2"),
     "spectrum, missing file": (["spectrum", "missing.AT2"], "No such file or directory"),

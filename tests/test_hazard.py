@@ -163,6 +163,19 @@ def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
     np.testing.assert_allclose(rk.hazard.toppling_rate(rock, two), exact, rtol=1e-11)
 
 
+@pytest.mark.parametrize("double, rtol", [(True, 1e-13), (False, 3e-6)])
+def test_small_dispersions_keep_the_digits_of_the_rate(double, rtol):
+    """Far within one power law the rate is that of the median times exp(k^2 b^2/2), down to a step."""
+    with jax.enable_x64(double):
+        levels, rates = [0.05, 0.1, 0.2, 0.4, 0.8, 1.6], [3e-2, 1e-2, 3e-3, 5e-4, 5e-5, 2e-6]
+        curve = rk.hazard.HazardCurve(levels, rates)
+        k = np.log(rates[2] / rates[3]) / np.log(2)
+        at_median = 3e-3 * (0.3 / 0.2) ** -k
+        for dispersion in (1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
+            found = rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(0.3, dispersion), curve)
+            np.testing.assert_allclose(found, at_median * np.exp((k * dispersion) ** 2 / 2), rtol=rtol)
+
+
 CURVES = {
     "site": CURVE,
     "few levels": rk.hazard.HazardCurve([0.1, 0.4, 0.5, 0.6], [2e-2, 1e-3, 5e-4, 2e-4]),

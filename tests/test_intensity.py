@@ -70,7 +70,8 @@ def test_of_a_record_by_quadrature():
     fine = np.linspace(0, time[-1], 100 * (NOISE.size - 1) + 1)
     place = cumulative_trapezoid(cumulative_trapezoid(lines(fine), fine, initial=0), fine, initial=0)
     found = np.abs(place).max()
-    assert rk.intensity.peak_displacement(RECORD) == pytest.approx(found, rel=1e-6)
+    with pytest.warns(UserWarning, match="its baseline drifts"):
+        assert rk.intensity.peak_displacement(RECORD) == pytest.approx(found, rel=1e-6)
 
 
 def test_peak_displacement_lies_between_samples():
@@ -160,6 +161,17 @@ def test_a_drifting_baseline_warns():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rk.intensity.peak_velocity(rk.processing.baseline_corrected(drifting, 1))
+
+
+def test_a_displacement_that_is_drift_warns():
+    """The velocity of this record ends near zero, its displacement does not."""
+    steady = rk.example_record()
+    with pytest.warns(UserWarning, match="The ground of .* ends 1.41 m away, its peak is 1.41 m: its baseline drifts"):
+        rk.intensity.peak_displacement(steady)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert rk.intensity.peak_displacement(rk.processing.baseline_corrected(steady)) < 0.35
+        rk.intensity.peak_displacement(rk.HalfSinePulse(A, T))  # which is meant
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
+from jaxrock.inverse.observation_files import _COLUMNS
 from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.scatter import rocks_at
@@ -270,6 +272,16 @@ def test_contradictions_have_no_intervals():
     assert "rock" in " ".join(found.remarks)
 
 
+def test_a_rotation_that_no_motion_makes_is_named():
+    """Its rock is likely to stand, as it does; and no larger scatter would move it that far."""
+    unknowns = {"amplitude": rk.inverse.Unknown(0.05, 0.06), "period": rk.inverse.Unknown(0.2, 0.3)}
+    seen = rocks(["survived"] * 11 + ["rotation"], rotation=0.3, rotation_sd=0.001)
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns, 0.05, starts=1)
+    assert found.status == rk.inverse.EstimateStatus.contradictory and found.probability[11] > 0.9
+    assert "rock 12 (its rotation is off by 300.0 standard deviations)" in found.remarks[0]
+    assert np.isinf(found.consistent_scatter) and "no scatter up to ten times as large" in found.remarks[1]
+
+
 def test_climbers_find_summits_and_hold_what_is_held():
     def hills(x):
         value = -np.sum((x - 1) ** 2 * np.array([1.0, 40.0]), axis=1)
@@ -431,6 +443,18 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
     np.testing.assert_allclose(seen.rotation[1], np.deg2rad(5.1))
 
 
+def test_all_columns_of_a_file_are_told(capsys):
+    """To who asks for help, reads the docstring, or the page about rocks."""
+    with pytest.raises(SystemExit):
+        main(["invert", "--help"])
+    page = (Path(__file__).parents[1] / "docs" / "how_to" / "rock.md").read_text()
+    for told in (capsys.readouterr().out, page):
+        assert {name for name in _COLUMNS if not name.endswith("_sd")} <= set(re.findall(r"\w+", told))
+    assert {name for name in _COLUMNS if not name.endswith(("_sd", "_deg"))} <= set(
+        re.findall(r"\w+", rk.inverse.read_observations.__doc__)
+    )
+
+
 @pytest.mark.parametrize(
     "line, message",
     [
@@ -445,6 +469,13 @@ def test_the_example_is_read_and_says_what_people_say(tmp_path, capsys):
         ("a,ten,0.5,1,0,,toppled,,", "line 2: `alpha_deg` must be a number"),
         ("a,10,0.5,1,0,,toppled,", "line 2: has 8 fields, but there are 9 columns"),
         ("a,,0.5,1,0,,toppled,,", "line 2: `alpha` is empty"),
+        (
+            "a,0.17,0.01,1,0,,toppled,,",
+            "line 2: `alpha_deg` must be 0.5 or more, .* is 0.17; .* the column is `alpha_rad`",
+        ),
+        ("a,10,0.5,1,0,,stood,3,0.5", "line 2: `observed` is 'stood', but a rotation is given: call it rocked"),
+        ("a,10,0.5,1,0,,fell,3,", "line 2: `observed` is 'fell', but a rotation is given"),
+        ("a,10,0.5,1,0,,rocked,40,0.5", "line 2: Argument `rotation` must be below twice `alpha`"),
         ("#1,10,0.5,1,0,,toppled,,", "line 2: looks like a rock, but a line that begins with # is a comment"),
     ],
 )
@@ -479,9 +510,52 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
     refused(tmp_path, header, ",".join("1" * (header.count(",") + 1)), message)
 
 
+LIKELIHOOD = rk.inverse.Likelihood(rk.inverse.Observations(ALPHA, P, ["survived"] * 12), rk.SinePulse)
+
+
+def test_unexceeded_records():
+    """Of one shape and several durations: as each alone; they share samples."""
+    seen, shape = rk.inverse.Observations([0.12], [3.0], ["survived"]), np.sin(np.linspace(0, 2 * np.pi, 20))
+    found = rk.inverse.unexceeded_motion(seen, lambda a, d: a * rk.Record(shape, d / 19), [0.5, 0.6], progress=False)
+    peak = np.abs(shape).max()
+    for duration, amplitude in zip((0.5, 0.6), found.amplitude):
+        stands, falls = (
+            rk.outcome(rk.Block(0.12, 3.0), float(x * amplitude / peak) * rk.Record(shape, duration / 19)).overturned
+            for x in (0.999, 1.001)
+        )
+        assert falls and not stands
+
+
 @pytest.mark.parametrize(
     "wrong, message",
     [
+        (lambda: LIKELIHOOD.log_terms({"amp": 0.3}), r"`motion` must make a motion of \['amp'\], but: .*'amplitude'"),
+        (lambda: LIKELIHOOD.survival({"amplitude": 0.3}), "`motion` must make a motion of .*: missing .* 'period'"),
+        (lambda: LIKELIHOOD.survival({}), "`values` must name the parameters of the motion, but is empty"),
+        (
+            lambda: LIKELIHOOD.log_terms({"amplitude": np.ones(2), "period": np.ones(3)}),
+            "`amplitude` and `period` must have shapes that go together",
+        ),
+        (
+            lambda: rk.inverse.estimate_motion(
+                LIKELIHOOD.observations, rk.SinePulse, {"amplitud": rk.inverse.Unknown(0.1, 1.0)}
+            ),
+            "`motion` must make a motion of",
+        ),
+        (
+            lambda: rk.inverse.Likelihood(LIKELIHOOD.observations, lambda x: x).survival({"x": 0.3}),
+            "`motion` must make a motion of its parameters, but makes an array",
+        ),
+        (
+            lambda: rk.inverse.unexceeded_motion(
+                LIKELIHOOD.observations, lambda a, d: rk.Record(a * jnp.ones(9), d), [0.5, 0.6]
+            ),
+            "`motion` must make a motion whose samples do not depend on amplitude",
+        ),
+        (
+            lambda: rk.inverse.unexceeded_motion(LIKELIHOOD.observations, lambda a, d: a, [0.5]),
+            "`motion` must make a motion of amplitude and duration, but makes",
+        ),
         (lambda: rk.inverse.Unknown(2.0, 1.0), "`high` must be above `low`"),
         (lambda: rk.inverse.Unknown(0.0, 1.0), "`low` must be positive"),
         (lambda: rk.inverse.Unknown(0.2, 3.0, prior=(100.0, 0.5)), "`prior` must be within five standard deviations"),
@@ -489,6 +563,19 @@ def test_columns_that_say_nothing_or_too_much_are_named(tmp_path, header, messag
         (lambda: rk.inverse.Observations([0.1], [2.0], ["topled"]), "`seen` must hold only .* Did you mean 'toppled'"),
         (lambda: rk.inverse.Observations([0.1, 0.2], [2.0], ["toppled"]), "`seen` must have a word for each of 2"),
         (lambda: rk.inverse.Observations([0.1], [2.0], ["rotation"]), "`rotation` must be given"),
+        (
+            lambda: rocks(["toppled"] * 12, alpha_sd=0.12),
+            "`alpha_sd` must be below `alpha`, and in radians, but is 0.12",
+        ),
+        (lambda: rocks(["toppled"] * 12, p_sd=5.1), "`p_sd` must be below `p`, and in rad/s, but is 5.1"),
+        (
+            lambda: rocks(["rotation"] * 12, rotation=1.0, rotation_sd=0.01),
+            "`rotation` must be below twice `alpha`, .* 1.$",
+        ),
+        (
+            lambda: rocks(["rotation"] * 12, rotation=0.1, rotation_sd=0.8),
+            "`rotation_sd` must be below `alpha`, and in",
+        ),
         (lambda: rk.inverse.Likelihood(rocks(["toppled"] * 12), rk.SinePulse, 0.0), "`scatter` must be positive"),
     ],
 )

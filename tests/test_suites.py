@@ -12,6 +12,7 @@ from scipy.special import ndtr
 
 import jaxrock as rk
 from jaxrock.hazard.intervals import intervals_of_motions
+from jaxrock.motions.suite import repeated
 
 G = 9.81
 RICKER_TOP = np.sqrt((3 - np.sqrt(6)) * 6) * np.exp(-(3 - np.sqrt(6)) / 2)  # of |y^3 - 3y| e^(-y^2/2)
@@ -227,6 +228,30 @@ def test_intervals_that_cannot_be_told():
         assert np.isnan(found.median).all() and np.isnan(found.dispersion).all()
 
 
+def test_no_intervals_where_all_motions_did_the_same():
+    """Their variance is none, of which nothing follows: the fit stands, errors and intervals are not numbers."""
+    found = table([[[k < n for k in range(12)] for n in range(12)]] * 3)
+    assert found.fit().status == rk.hazard.FitStatus.successful
+    assert np.isfinite(found.fit().fragility.median) and np.isnan(found.fit().covariance).all()
+    assert found.intervals().status == rk.hazard.FitStatus.alike
+    assert np.isnan(found.intervals().median).all() and np.isnan(found.intervals().dispersion).all()
+
+
+def test_motions_that_are_the_same():
+    """Whatever they are called, whichever function made them; not those of other samples, steps, or kinds."""
+    same = [rk.Record([0.0, 0.3, 0.0], 0.4, name) for name in ("a", "b")]
+    others = [rk.Record([0.0, 0.3, 1e-9], 0.4), rk.Record([0.0, 0.3, 0.0], 0.41), 2 * same[0], -1 * same[0]]
+    others += [rk.SinePulse(0.3, 0.4), rk.CosinePulse(0.3, 0.4), 2 * rk.SinePulse(0.3, 0.4)]
+    assert repeated(rk.motions.Suite([same[0], *others])) is None
+    assert repeated(rk.motions.Suite([*same, *others[:2]])) == ("a", "b")
+    many = rk.motions.Suite([rk.SinePulse(np.array([0.3, 0.5]), 0.4), rk.SinePulse(0.5, 0.4)])
+    assert repeated(many) == ("SinePulse 2", "SinePulse")
+    with pytest.raises(ValueError, match="`motions` must hold each motion once, but 'a' and 'b' are the same"):
+        rk.hazard.simulated_fragility(BLOCKS, same, [0.1, 0.2])
+    with pytest.warns(UserWarning, match="Motions 'a' and 'b' are the same: what they do counts twice"):
+        rk.hazard.suite_outcomes(rk.Block(0.2, 2.0), same, 0.1, rk.Linear(), progress=False)
+
+
 def test_intervals_hold_for_few_motions():
     """Of 300 suites of 10: standard errors hold the dispersion's truth far less often."""
     fits = [known(stripes(seed, 10).fit()) for seed in range(300)]
@@ -354,11 +379,28 @@ def test_motions_of_one_name_are_numbered():
 @pytest.mark.parametrize(
     "call, message",
     [
+        (lambda: rk.motions.Suite([RECORD])[:2], "A motion of a suite has a whole number, but this is slice"),
+        (
+            lambda: rk.blocks.draw_blocks(rk.Block(0.4, 3.0), 1000, alpha=0.3),
+            "deviation `alpha` must let all 1000 draws be blocks, but one is none .* Lower it",
+        ),
+        (
+            lambda: rk.hazard.simulated_surface(BLOCKS, [rk.ExponentialPulse], [0.1, 0.2], [0.1, 0.2]),
+            "`pulses` must make motions of amplitude and period, but .*ExponentialPulse.* does not: missing .*'shape'",
+        ),
+        (
+            lambda: rk.hazard.simulated_fragility(rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0), [RECORD], [0.1, 0.2]),
+            "but is an AsymmetricBlock",
+        ),
         (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
         (lambda: rk.motions.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
         (
             lambda: rk.motions.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
             "`motions` must move the ground, but 'quiet' does not",
+        ),
+        (
+            lambda: rk.motions.Suite([rk.Record([0.3], 0.01, "one")]),
+            "`motions` must move the ground, but 'one' does not",
         ),
         (lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
         (
@@ -386,6 +428,20 @@ def test_motions_of_one_name_are_numbered():
 def test_bad_input_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_motions_by_their_numbers():
+    suite = rk.motions.Suite([RECORD, 2 * RECORD])
+    assert suite[-1].factor == suite[jnp.asarray(1)].factor == 2.0
+    for number in (2, -3):
+        with pytest.raises(IndexError, match=f"is out of range: {number} of 2 motions"):
+            suite[number]
+
+
+def test_a_traced_record_of_one_sample_is_refused():
+    speed = jax.jit(lambda x: rk.motions.Suite([rk.Record(x[None], 0.01)]).peak_velocity)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="`motions` must move the ground"):
+        jax.block_until_ready(speed(0.3))
 
 
 # --------------------------------------------------------------------------------------- slow

@@ -51,9 +51,16 @@ def draw_blocks(
     normal = [jax.random.normal(key, (draws,)) for key in keys[:2]]
     alphas, ps = block.alpha * jnp.exp(alpha * normal[0]), block.p * jnp.exp(p * normal[1])
     if restitution == 0:
-        return Block(alphas, ps, jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), block.law))
-    ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
-    return Block(alphas, ps, block.restitution + restitution * jax.random.truncated_normal(keys[2], *ends, (draws,)))
+        law = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), block.law)
+    else:
+        ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
+        law = block.restitution + restitution * jax.random.truncated_normal(keys[2], *ends, (draws,))
+    try:
+        return Block(alphas, ps, law)
+    except ValueError as error:
+        names = " and ".join(f"`{name}`" for name, deviation in (("alpha", alpha), ("p", p)) if deviation > 0)
+        said = f"let all {draws} draws be blocks, but one is none ({str(error).rstrip('.')})"
+        raise ValueError(f"The standard deviation {names} must {said}. Lower it, or draw less stocky blocks.") from None
 
 
 def _tolerances(name: str, value) -> tuple[float, float]:

@@ -40,8 +40,10 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--example", action=_Example, help="print an example of such a file, and leave")
     parser.add_argument(
         "rocks",
-        help="CSV file of rocks (--example prints one); columns such as alpha_deg, alpha_deg_sd, half_diagonal_m, "
-        "observed; of two unlike sides alpha1_deg, alpha2_deg, radius1_m, radius2_m, facing, observed",
+        help="CSV file of rocks (--example prints one). Columns: name; alpha_deg or alpha_rad, with half_diagonal_m or "
+        "p_rad_per_s, or else width_m and height_m; restitution; observed (survived, toppled, rotation); rotation_deg "
+        "or rotation_rad. Of two unlike sides: alpha1_deg and alpha2_deg or alpha1_rad and alpha2_rad, with radius1_m "
+        "and radius2_m or p1_rad_per_s and p2_rad_per_s; inertia_ratio; facing. Standard deviations: alpha_deg_sd etc.",
     )
     parser.add_argument("--pulse", choices=tuple(PULSES), default="sine", help="kind of motion (default sine)")
     ends: dict[str, Any] = {"type": number, "nargs": 2, "metavar": ("FROM", "TO")}

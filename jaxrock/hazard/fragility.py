@@ -184,6 +184,10 @@ class FitStatus(Enumeration):
         "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
     )
     not_converged = item("The maximum of the likelihood was not found.")
+    alike = item(
+        "All motions did the same at every level: nothing is known of how they differ, and there are no intervals. "
+        "Take more motions, more levels, or more draws."
+    )
 
 
 class FragilityFit(AbstractTable):
@@ -196,8 +200,9 @@ class FragilityFit(AbstractTable):
     - `highest_survived`, `lowest_toppled`: in the unit of the levels, 0 and infinite if there are none. Where the
       outcomes are separable in the usual order, the median lies between them.
     - `status`: a `FitStatus`.
-    - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test):
-      above 0.05 this measure of intensity is useless here. It holds of separable outcomes, too.
+    - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test
+      with the observed information): above 0.05 this measure of intensity is useless here. It holds of separable
+      outcomes, too.
     """
 
     fragility: LogNormalFragility
@@ -334,9 +339,9 @@ def probit_line(abscissas, toppled, survived):
 def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
     """How probably outcomes that have nothing to do with an abscissa, given the others, give such a slope: (slopes,).
 
-    Rao's score test: at the line without it, whose slope is zero. (A test of the slope in its standard errors finds
-    less the better outcomes are parted.) Of clusters by their labels, of which there are `count`, by the scatter of
-    their scores.
+    Rao's score test, with the observed information: at the line without it, whose slope is zero. (A test of the slope
+    in its standard errors finds less the better outcomes are parted.) Of clusters by their labels, of which there are
+    `count`, by the scatter of their scores.
     """
 
     def test(tested, others):

@@ -103,6 +103,9 @@ def intervals_of_motions(fit, motions: int, confidence: ArrayLike) -> FragilityI
         nothing = jnp.full(2, jnp.nan)
         status = FitStatus.not_converged if fit.status == FitStatus.successful else fit.status
         return FragilityIntervals(confidence, nothing, nothing, status)
+    if not float(fit.covariance[0, 0]) > 0:
+        nothing = jnp.full(2, jnp.nan)
+        return FragilityIntervals(confidence, nothing, nothing, FitStatus.alike)
     freedom, tail = motions - 1, (1 - confidence) / 2
     variance = float(fit.covariance[0, 0])
     beyond = stdtrit(freedom, 1 - tail) * np.sqrt(variance)

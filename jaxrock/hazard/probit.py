@@ -26,7 +26,8 @@ class ProbitFit(AbstractTable):
     - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
     - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
-      a slope (Rao's score test, of clusters where there are any); they hold of separable outcomes, too.
+      a slope (Rao's score test with the observed information, of clusters where there are any); they hold of separable
+      outcomes, too.
     - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
     """
 

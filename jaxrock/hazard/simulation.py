@@ -32,7 +32,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.suite import Suite
+from jaxrock.motions.suite import Suite, repeated
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
 
 
@@ -119,8 +119,8 @@ class SimulatedFragility(AbstractTable):
 
         **Returns:** a `FragilityFit`. Its covariance takes motions as what is random: what one motion does at one level
         and to one block goes with what it does at others (a sandwich of clusters; two motions or more). Standard
-        errors from it are too small for few motions: `intervals` hold. Blocks are taken as drawn often enough. Look at
-        `monotone` and `falls` before a curve that only rises is used.
+        errors from it are too small for few motions: `intervals` hold. Of motions that all did the same it is NaN.
+        Blocks are taken as drawn often enough. Look at `monotone` and `falls` before a curve that only rises is used.
 
         **Raises:** ValueError if a bound is needed.
 
@@ -131,6 +131,8 @@ class SimulatedFragility(AbstractTable):
         fit = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
         if motions == 1 or fit.status != FitStatus.successful:
             return fit
+        if np.all(toppled == toppled[0]):
+            return eqx.tree_at(lambda f: f.covariance, fit, jnp.full_like(fit.covariance, jnp.nan))
         clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
         return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, clustered)
 
@@ -143,7 +145,8 @@ class SimulatedFragility(AbstractTable):
         - `bound`: as in `counts`.
         - `confidence`: in (0, 1).
 
-        **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, or of one motion only.
+        **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, of one motion only, and
+        (`FitStatus.alike`) of motions that all did the same.
         They take the capacities under motions as lognormal, as the fit does. How often intervals of 95 % held the truth
         of made suites of 5 to 40 motions stands in benchmarks/few_motions.md.
 
@@ -226,7 +229,7 @@ def simulated_fragility(
     **Arguments:**
 
     - `block`: a `Block`; with parameters of shape (draws,) uncertain, such as `draw_blocks` makes.
-    - `motions`: a `Suite`, or what makes one.
+    - `motions`: a `Suite`, or what makes one, of motions that differ.
     - `levels`: (levels,) of the measure, positive and rising; two or more.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
     - `measure`: what the levels are: "PGA" [g], "PGV" [m/s], "PGD" [m], "IA" (Arias) or "CAV" [m/s], "SA(0.5)" [g] or
@@ -236,12 +239,17 @@ def simulated_fragility(
     **Returns:** a `SimulatedFragility`: its `tabulated()` and `fit().fragility` go into `toppling_rate` and
     `survival_probability` with a hazard curve of the same measure.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, and for a motion that is there twice.
 
     **Source:** Vamvatsikos & Cornell (2002), scaled records; Jalayer & Cornell (2009), stripes.
     """
     levels = rising_list("levels", levels)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
+    twice = repeated(suite)
+    if twice:
+        raise ValueError(
+            f"Argument `motions` must hold each motion once, but {twice[0]!r} and {twice[1]!r} are the same."
+        )
     kind = measure_of("measure", measure)
     strength = strengths("measure", kind, suite)
     power = power_of("measure", kind, suite.motions())

@@ -4,6 +4,7 @@ Overturning does not grow with the scale: a block may topple at one and stand at
 are, and what is undecided bounds every share from both sides.
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
 
@@ -23,7 +24,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import Measure, measure_of, scaled_strengths
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.suite import Suite
+from jaxrock.motions.suite import Suite, repeated
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
 
 _FACINGS = {"one": (1,), "both": (1, -1)}
@@ -159,7 +160,8 @@ def suite_outcomes(
     - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block is a mirror image.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
-    **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`.
+    **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`. It warns of a motion that is there
+    twice.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -169,6 +171,9 @@ def suite_outcomes(
     if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
         raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
     suite = motions if isinstance(motions, Suite) else Suite(motions)
+    twice = repeated(suite)
+    if twice:
+        warnings.warn(f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.", stacklevel=3)
     strongest = float(np.max(suite.peak_acceleration))
     checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
     blocks, ways = stacked(block), _FACINGS[facing]

@@ -4,6 +4,7 @@ Peak acceleration alone says whether a block uplifts, the ratio of peak velocity
 pushed: together they say most of what a motion does to a rock.
 """
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Annotated
@@ -25,6 +26,7 @@ from jaxrock._checks import (
     not_negative,
     positive,
     scalar,
+    shown,
 )
 from jaxrock._described import described
 from jaxrock._parameters import one_of_many
@@ -290,7 +292,7 @@ def simulated_surface(
         raise ValueError("Argument `pulses` must hold at least one pulse, but is empty.")
     blocks, parts = stacked(block), []
     for pulse in pulses:
-        unit = pulse(jnp.ones(()), jnp.ones(()))
+        unit = _unit(pulse)
         peak, speed = float(peak_acceleration(unit)), float(peak_velocity(unit))
         # One motion of amplitude 1 g for every ratio, scaled to every acceleration.
         period = ratio * GRAVITY * peak / speed
@@ -298,6 +300,19 @@ def simulated_surface(
         factors = np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size))
         parts.append(_verdicts(blocks, group, factors, model, engine, progress).swapaxes(0, 1))
     return SimulatedSurface(acceleration, ratio, np.stack(parts))
+
+
+def _unit(pulse: Callable) -> AbstractMotion:
+    """What a function makes of amplitude 1 g and period 1 s."""
+    try:
+        inspect.signature(pulse).bind(1.0, 1.0)
+    except (TypeError, ValueError) as error:
+        said = f"make motions of amplitude and period, but {shown(pulse)} does not: {error}"
+        raise ValueError(f"Argument `pulses` must {said}. Give the others within a function.") from None
+    unit = pulse(jnp.ones(()), jnp.ones(()))
+    if not isinstance(unit, AbstractMotion):
+        raise ValueError(f"Argument `pulses` must make motions, but {shown(pulse)} makes {shown(unit)}.")
+    return unit
 
 
 def _verdicts(

@@ -177,14 +177,17 @@ def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number
     rate(start) exp(a^2/2 - z(start)^2/2) [Phi(b) - Phi(a)], where a and b are z + k dispersion at start and end.
     """
     known, exponents = power_laws(curve)
-    z = jnp.log(curve.levels / fragility.median) / fragility.dispersion
+    logarithms = jnp.log(curve.levels / fragility.median)
+    z = logarithms / fragility.dispersion
     start, end = z[:-1] + exponents * fragility.dispersion, z[1:] + exponents * fragility.dispersion
     # Both in the lower tail, where their difference keeps its digits.
     upper = start + end > 0
     low, high = jnp.where(upper, -end, start), jnp.where(upper, -start, end)
     logarithm = log_ndtr(high) + jnp.log(-jnp.expm1(log_ndtr(low) - log_ndtr(high)))
     rates = jnp.where(known, curve.rates[:-1], 0.0)
-    within = rates @ jnp.exp((start - z[:-1]) * (start + z[:-1]) / 2 + logarithm)
+    # (a^2 - z^2)/2 written out: a - z would lose the digits of a small dispersion.
+    grown = exponents * (logarithms[:-1] + exponents * fragility.dispersion**2 / 2)
+    within = rates @ jnp.exp(grown + logarithm)
     first = jnp.isfinite(curve.rates) & ~jnp.append(False, jnp.isfinite(curve.rates[:-1]))
     return within + jnp.where(first, curve.rates, 0.0) @ fragility(curve.levels)
 

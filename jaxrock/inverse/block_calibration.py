@@ -27,6 +27,7 @@ from jaxrock.motions.suite import Suite
 from jaxrock.status import Enumeration, item
 from jaxrock.studies.suite_scenes import scenes
 
+_LEAST_BEND = 1e-8  # of the likelihood over a range, squared: what is less is rounding
 _STARTS = 6  # points of a net from which the likelihood is climbed
 
 
@@ -37,9 +38,11 @@ class CalibrationStatus(Enumeration):
     at_an_end = item(
         "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."
     )
-    not_converged = item(
-        "The maximum of the likelihood was not found, or is flat: some parameter is not told by the tests."
+    not_told = item(
+        "The likelihood is flat: tests leave a parameter open, and its standard error is infinite. Tests that end "
+        "either way near where it decides, a prior, or its value would tell it."
     )
+    not_converged = item("The maximum of the likelihood was not found.")
 
 
 class BlockCalibration(AbstractTable):
@@ -47,7 +50,8 @@ class BlockCalibration(AbstractTable):
 
     - `values`: the most probable ones by name; of a parameter with scatter its median, and `name_sd`.
     - `covariance`: of the places of all in this order: logarithms where an `Unknown` is one, else themselves; the
-      inverse of the observed information. `standard_errors` by name, of the same.
+      inverse of the observed information. `standard_errors` by name, of the same: infinite where one would be larger
+      than the range, and NaN where there is no maximum.
     - `log_likelihood`: at the maximum; with priors, without their constants.
     - `probability`: (tests,) to topple, of every test. `bounds`: (2, tests) if all undecided scenes stood, or toppled.
     - `held_out`: (tests,) the same of fits to the tests of other motions; NaN where `folds` was 0.
@@ -303,14 +307,13 @@ def _dealt(groups, count: int, folds: int) -> np.ndarray | None:
 def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
     """The most probable places, their errors, and what fits to other motions say."""
     place, converged = climbed(problem, _starts(problem))
-    hessian = _curvature(problem, place)
     ends = np.asarray(problem.ends)
+    covariance, good = _errors(np.asarray(_hessian(problem, jnp.asarray(place))), np.ptp(ends, axis=1))
     at_end = np.any(
         (place - ends[:, 0] < 1e-4 * np.ptp(ends, axis=1)) | (ends[:, 1] - place < 1e-4 * np.ptp(ends, axis=1))
     )
-    good = bool(np.all(np.linalg.eigvalsh(hessian) < 0))
-    covariance = np.linalg.inv(-hessian) if good else np.full_like(hessian, np.nan)
     status = CalibrationStatus.successful if good and converged else CalibrationStatus.not_converged
+    status = CalibrationStatus.not_told if np.isinf(covariance).any() else status
     status = CalibrationStatus.at_an_end if at_end else status
     table = problem.table
     held_out = np.full(table.seen.shape, np.nan)
@@ -325,6 +328,22 @@ def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
         _probabilities(problem, place, table.toppled), jnp.stack(bounds), jnp.asarray(held_out), table.seen, status,
         problem,
     )  # fmt: skip
+
+
+def _errors(hessian: np.ndarray, extents: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Covariance of the places, and whether they are at a maximum.
+
+    Counted in ranges, a direction in which the likelihood bends by less than 1 either way is flat. A parameter whose
+    standard error is more than its range is not told: its variance is infinite, its covariances are not numbers.
+    """
+    bends, directions = np.linalg.eigh(-hessian * np.outer(extents, extents))
+    if not np.all(bends > -1):
+        return np.full_like(hessian, np.nan), False
+    covariance = directions / np.maximum(bends, _LEAST_BEND) @ directions.T
+    open_ones = np.diag(covariance) > 1
+    covariance[open_ones] = covariance[:, open_ones] = np.nan
+    covariance[open_ones, open_ones] = np.inf
+    return covariance * np.outer(extents, extents), True
 
 
 def _starts(problem: _Problem) -> list[np.ndarray]:
@@ -373,10 +392,6 @@ def _value(problem, place, weights):
 @jax.jit
 def _probabilities(problem, place, shares):
     return problem.probabilities(place, shares)
-
-
-def _curvature(problem, place) -> np.ndarray:
-    return np.asarray(_hessian(problem, jnp.asarray(place)))
 
 
 @jax.jit

@@ -19,7 +19,7 @@ from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
-from jaxrock.inverse.observations import TOPPLED, Observations
+from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
 from jaxrock.inverse.scatter import NODES
 from jaxrock.inverse.search import Trace, optimizer_or_none, summits_of
@@ -38,6 +38,7 @@ _GAIN = 1e-6  # of a round that calls for another
 _RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
+_ODD, _NAMED = 2.0, 3  # the same of one rock, from which it is named; at most so many
 _COMPUTED = 0.5  # of the possible scenes at the maximum
 _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
 
@@ -145,7 +146,7 @@ def estimate_motion(
 
     - `observations`: an `Observations`.
     - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
-      own.
+      own. Of a record scale the whole: see `Likelihood`.
     - `unknowns`: an `Unknown` for each of these parameters.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
       observation says nothing; see `Likelihood`. They are not estimated.
@@ -254,12 +255,11 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         status = EstimateStatus.contradictory
         interval, covariance = np.full_like(interval, np.nan), np.full_like(covariance, np.nan)
         consistent = _consistent(evaluate, summits.points[best])
-        names = problem.likelihood.observations.names
-        worst = np.argsort(probability)[:3]
-        worst = [f"{names[i]} ({float(probability[i]):.1g})" for i in worst if probability[i] < 0.05]
-        remarks = (f"Least probable under the best motion: {', '.join(worst)}.",) if worst else ()
+        remarks = (f"{_worst(problem.likelihood, probability, stands, facts)}.",)
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
+        else:
+            remarks += ("With no scatter up to ten times as large would the observations agree.",)
     per_point = problem.likelihood.observations.ways.size * NODES
     arrays = {
         "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
@@ -282,6 +282,23 @@ def _surprise(facts: Sequence[np.ndarray]) -> float:
     badness, mean, variance = (float(np.sum(x)) for x in facts)
     # A quarter keeps near certainties, whose variance is nothing, from being surprised by rounding.
     return (badness - mean) / np.sqrt(variance + 0.25)
+
+
+def _worst(likelihood: Likelihood, probability: np.ndarray, stands: np.ndarray, facts: Sequence[np.ndarray]) -> str:
+    """Rocks that surprise most, the worst first: how probable what they did is, or by how much a rotation is off."""
+    badness, mean, variance = facts
+    surprise = (badness - mean) / np.sqrt(variance + 0.25)
+    order = np.argsort(-surprise)[:_NAMED]
+    lapse, seen = float(likelihood.lapse), likelihood.observations
+    away = np.sqrt(np.maximum(2 * (badness + np.log((1 - lapse) * stands + lapse / 2)), 0.0))
+
+    def told(rock):
+        if seen.seen[rock] == ROTATION:
+            return f"{seen.names[rock]} (its rotation is off by {away[rock]:.1f} standard deviations)"
+        return f"{seen.names[rock]} ({probability[rock]:.1g})"
+
+    named = [told(rock) for rock in order if surprise[rock] > _ODD or rock == order[0]]
+    return f"Least probable under the best motion: {', '.join(named)}"
 
 
 def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxrock._arguments import arguments, pair
-from jaxrock._checks import Values, finite, placed, scalar, size
+from jaxrock._checks import Values, finite, placed, scalar, shown, size
+from jaxrock._parameters import shared
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
@@ -17,6 +18,7 @@ from jaxrock.inverse.likelihood import Likelihood, as_program
 from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.spectra import axis
@@ -136,7 +138,9 @@ def unexceeded_motion(
     **Arguments:**
 
     - `observations`: an `Observations`; rocks that toppled are left out.
-    - `motion`: `motion(amplitude, duration)` makes it, such as `SinePulse`.
+    - `motion`: `motion(amplitude, duration)` makes it, such as `SinePulse`, or
+      `lambda amplitude, duration: amplitude * rk.Record(samples, duration / 100)`: samples of a record must not depend
+      on either.
     - `durations`: (n,) durations or periods [s], positive.
     - `intensity`, `model`, `engine`, `progress`: as in `critical_amplitudes`.
 
@@ -153,7 +157,7 @@ def unexceeded_motion(
     blocks = placed(jax.tree.map(lambda x: np.tile(np.repeat(x, count), len(ways)), seen.blocks))
     critical = critical_amplitudes(
         blocks,
-        jax.vmap(motion)(*placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size)))),
+        _motions(motion, *placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size)))),
         model,
         intensity=intensity,
         derivatives=False,
@@ -165,3 +169,18 @@ def unexceeded_motion(
     weakest = np.where(np.isfinite(amplitude), standing[np.argmin(by_rock, axis=0)], -1)
     complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0)
     return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))
+
+
+def _motions(motion: Callable, amplitude: Array, duration: Array) -> AbstractMotion:
+    """Those of all amplitudes and durations in one, which share samples of a record."""
+    one = eqx.filter_eval_shape(motion, amplitude[0], duration[0])
+    if not isinstance(one, AbstractMotion):
+        raise ValueError(f"Argument `motion` must make a motion of amplitude and duration, but makes {shown(one)}.")
+    axes = jax.tree.map(lambda own: None if own else 0, shared(one))
+    try:
+        return jax.vmap(motion, out_axes=axes)(amplitude, duration)
+    except ValueError as error:
+        if "out_axes" not in str(error):
+            raise
+        said = "whose samples do not depend on amplitude and duration: scale it outside, `amplitude * rk.Record(...)`"
+        raise ValueError(f"Argument `motion` must make a motion {said}.") from None

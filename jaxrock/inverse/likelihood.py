@@ -20,7 +20,9 @@ Of an asymmetric rock of which it is not known which way round it stood in the s
 both ways.
 """
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +32,7 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, below_one, positive, put_down, scalar
+from jaxrock._checks import as_real, below_one, check_shapes, positive, put_down, scalar, shown
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import Possible, levels_around
@@ -41,7 +43,7 @@ from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
-from jaxrock.transforms.user_function import ByIdentity, current_function
+from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
 Real = Inexact[Array, "..."]
 _Found = tuple[Real, Bool[Array, "..."], Bool[Array, "..."]]  # margin and rotation, overturned, known
@@ -56,7 +58,9 @@ class Likelihood(eqx.Module):
 
     - `observations`: an `Observations`.
     - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
-      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced).
+      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced). Of a
+      record scale the whole, `amplitude * rk.Record(samples, dt * stretch)`: the likelihood of one with other samples,
+      `rk.Record(amplitude * samples, dt)`, is differentiated by each of them, which takes many times as long.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
       differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
@@ -92,7 +96,11 @@ class Likelihood(eqx.Module):
         self.lapse = scalar("lapse", below_one("lapse", lapse))
 
     def current(self, names: Sequence[str]) -> "Likelihood":
-        """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`."""
+        """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`.
+
+        **Raises:** ValueError where the motion is not made of these.
+        """
+        _check_names(self.motion, names)
         seen, number = self.observations, jax.ShapeDtypeStruct((), jnp.result_type(float))
         parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
         return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
@@ -114,6 +122,7 @@ class Likelihood(eqx.Module):
     def _compiled(self, what: Callable, values: Mapping[str, ArrayLike], *how):
         """One of its functions as one program: outside of a program every operation would be one of its own."""
         given = {name: as_real(name, x) for name, x in values.items()}
+        check_shapes(**given)
         return as_program(what, self.current(tuple(values)), given, *how)
 
     def _log_probabilities(self, possible: Possible) -> Real:
@@ -216,9 +225,34 @@ class Likelihood(eqx.Module):
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
         """Logarithm of the strength of a motion, and whether there is no such motion."""
         with put_down() as checks:
-            strength = _log_strength(self.motion(**dict(zip(names, parameters))))
+            strength = _log_strength(_made(self.motion(**dict(zip(names, parameters)))))
         failed = jnp.stack([~jnp.isfinite(strength), *(bad for _, bad in checks)]).any()
         return jnp.where(failed, 0.0, strength), failed
+
+
+def _check_names(motion: Callable, names: Sequence[str]) -> None:
+    """Raise ValueError where a motion is not made of parameters of such names."""
+    if not names:
+        raise ValueError("Argument `values` must name the parameters of the motion, but is empty.")
+    if isinstance(motion, UserFunction):
+        return  # it has been traced for its names
+    try:
+        signature = inspect.signature(motion.function if isinstance(motion, ByIdentity) else motion)
+    except ValueError:  # of some functions that are not Python's
+        return
+    try:
+        signature.bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise ValueError(f"Argument `motion` must make a motion of {list(names)}, but: {error}.") from None
+
+
+def _made(motion: Any) -> AbstractMotion:
+    """What the motion's function has made, if that is one."""
+    if not isinstance(motion, AbstractMotion):
+        is_array = isinstance(motion, (jax.Array, np.ndarray))
+        what = f"an array of shape {motion.shape}" if is_array else shown(motion)
+        raise ValueError(f"Argument `motion` must make a motion of its parameters, but makes {what}.")
+    return motion
 
 
 @eqx.filter_jit

@@ -11,8 +11,8 @@ The first line that is not a comment (#) names the columns, with their units; th
   ground acceleration drives the rock from side 1 to side 2, -1 where it stands the other way round; empty is not known.
 - `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the energy that two impacts keep;
   empty is by angular momentum.
-- `observed`: survived, toppled (stood, fell and the like are understood), or rotation; then `rotation_rad` or
-  `rotation_deg` holds the largest |rotation|.
+- `observed`: survived, toppled (stood, fell and the like are understood), or rotation (rocked); then `rotation_rad` or
+  `rotation_deg` holds the largest |rotation|, which is empty otherwise.
 - `..._sd` of the measured ones, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A measured
   rotation needs one. Those of side 1 are for both sides, which are off by the same factor.
 """
@@ -43,6 +43,7 @@ column,18.0,0.5,1.10,stood,,
 """
 
 _DEGREE = np.pi / 180
+_LEAST_DEGREES = 0.5  # of a slenderness: what is less is in radians
 
 _FACTORS = {
     "alpha_rad": 1.0, "alpha_deg": _DEGREE, "p_rad_per_s": 1.0, "half_diagonal_m": 1.0, "width_m": 1.0, "height_m": 1.0,
@@ -73,7 +74,19 @@ def read_observations(path: str | Path) -> Observations:
 
     **Arguments:**
 
-    - `path`: of the file; `jaxrock/observation_files.py` and `jaxrock invert --help` tell its columns.
+    - `path`: of the file.
+
+    The first line that is not a comment (#) names the columns, with their units; the others hold a rock each:
+
+    - `name`: optional.
+    - `alpha_rad` or `alpha_deg`, with `p_rad_per_s` or `half_diagonal_m` (of a rectangle); or `width_m` and `height_m`.
+    - Of rocks whose sides differ instead: `alpha1_rad` and `alpha2_rad` (or `_deg`), with `p1_rad_per_s` and
+      `p2_rad_per_s`, or `radius1_m` and `radius2_m`; optional `inertia_ratio` (m R1^2/I1; empty is 3/4) and `facing`
+      (1, -1; empty is not known).
+    - `restitution`: optional; empty is by angular momentum.
+    - `observed`: survived (stood), toppled (fell), or rotation (rocked); of the last `rotation_rad` or `rotation_deg`.
+    - `..._sd` of what was measured, such as `alpha_deg_sd`: standard deviation in the same unit; empty is 0. A rotation
+      needs one; `alpha2`, `p2_rad_per_s`, `radius2_m`, `inertia_ratio` and `facing` have none.
 
     **Returns:** an `Observations`.
 
@@ -179,6 +192,7 @@ def _rock(fields: dict[str, str]) -> dict:
                 return empty if value is None else value * factor, (sd or 0.0) * factor
         return empty, 0.0
 
+    _check_degrees(values)
     if called(fields["observed"]) is None:
         said = fields["observed"]
         raise ValueError(f"`observed` must be one of {', '.join(SEEN)}, but is {said!r}.{meant(said, CALLED)}")
@@ -191,12 +205,29 @@ def _rock(fields: dict[str, str]) -> dict:
         rock["alpha"], rock["alpha_sd"] = _given("alpha", get("alpha", None))
         rock |= _size(fields, get)
     rock["restitution"], rock["restitution_sd"] = get("restitution", np.nan)
-    rotation, deviation = get("rotation", None)
-    if rock["observed"] == "rotation" and (rotation is None or deviation <= 0):
-        raise ValueError("a measured rotation needs a value and a standard deviation.")
-    known = rock["observed"] == "rotation"
-    rock["rotation"], rock["rotation_sd"] = (rotation, deviation) if known else (1.0, 1.0)
+    rock["rotation"], rock["rotation_sd"] = _rotation(fields["observed"], get)
     return rock
+
+
+def _check_degrees(values: dict[str, float | None]) -> None:
+    """That slendernesses in degrees are none in radians."""
+    for name in ("alpha_deg", "alpha1_deg", "alpha2_deg"):
+        value = values.get(name)
+        if value is not None and 0 < value < _LEAST_DEGREES:
+            said = f"must be {_LEAST_DEGREES} or more, in degrees, but is {value:g}"
+            raise ValueError(f"`{name}` {said}; of radians the column is `{name.replace('deg', 'rad')}`.")
+
+
+def _rotation(observed: str, get) -> tuple[float, float]:
+    """The rotation that was measured, and its standard deviation; 1 where none was."""
+    rotation, deviation = get("rotation", None)
+    measured = called(observed) == "rotation"
+    if measured and (rotation is None or deviation <= 0):
+        raise ValueError("a measured rotation needs a value and a standard deviation.")
+    if not measured and rotation is not None:
+        said = f"`observed` is {observed!r}, but a rotation is given"
+        raise ValueError(f"{said}: call it rocked, or leave the rotation empty.")
+    return (rotation, deviation) if measured else (1.0, 1.0)
 
 
 def _size(fields: dict[str, str], get) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, as_real, checked, is_traced, one_program, placed, put_down, shown
+from jaxrock._checks import Values, as_real, checked, is_traced, not_negative, one_program, placed, put_down, shown
 from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
@@ -61,9 +61,10 @@ class Observations(eqx.Module):
     - `seen`: for each rock "survived", "toppled", or "rotation" (its largest rotation was measured, and it stands).
     - `restitution`: (rocks,) in [0, 1]; None, or NaN for a rock, is Housner's value, which follows alpha.
     - `alpha_sd`, `p_sd`, `restitution_sd`: (rocks,) or one number: standard deviations, 0 or more, in the units of what
-      they belong to. Alpha and p are uncertain by lognormal factors, the restitution by a normal sum within [0, 0.99].
-    - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive;
-      not read for rocks without one.
+      they belong to; of alpha and p below the value itself. Alpha and p are uncertain by lognormal factors, the
+      restitution by a normal sum within [0, 0.99].
+    - `rotation`, `rotation_sd`: (rocks,) the measured largest |rotation| and its standard deviation [rad], positive,
+      below 2 alpha and alpha; not read for rocks without one.
     - `names`: of the rocks; None numbers them.
     - `other`: what `Observations.asymmetric` knows of their second sides; None: symmetric ones.
 
@@ -118,13 +119,20 @@ class Observations(eqx.Module):
         self.restitution = _where(self.follows, self.by_momentum(self.alpha), given)
         deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
         self.alpha_sd, self.p_sd, self.restitution_sd = (
-            checked(name, _list(name, value, count), "be 0 or more and finite", lambda x: (x >= 0) & (x < np.inf))
-            for name, value in deviations.items()
+            not_negative(name, _list(name, value, count)) for name, value in deviations.items()
         )
+        _check_below("alpha_sd", self.alpha_sd, self.alpha, "`alpha`, and in radians")
+        _check_below("p_sd", self.p_sd, self.p, "`p`, and in rad/s")
         measured = np.asarray(self.seen) == ROTATION
         self.rotation, self.rotation_sd = (
             _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
         )
+        wider = self.alpha if other is None else self.alpha * np.maximum(1.0, other.alpha_ratio)
+        most = _where(measured, wider, np.inf)
+        _check_below(
+            "rotation", self.rotation, 2 * most, "twice `alpha`, from which no rock comes back, and in radians"
+        )
+        _check_below("rotation_sd", self.rotation_sd, most, "`alpha`, and in radians")
         self.label = Label(tuple(f"rock {i + 1}" for i in range(count)) if names is None else tuple(map(str, names)))
         if len(self.names) != count:
             raise ValueError(f"Argument `names` must have {count} names, but has {len(self.names)}.")
@@ -275,7 +283,8 @@ def _is_facing(x):
 def _list(name: str, value: Values, count: int) -> Rocks:
     array = as_real(name, value)
     if array.shape not in ((), (count,)):
-        raise ValueError(f"Argument `{name}` must have a value for each of {count} rocks, but has shape {array.shape}.")
+        each = "one rock" if count == 1 else f"each of {count} rocks"
+        raise ValueError(f"Argument `{name}` must have a value for {each}, but has shape {array.shape}.")
     return array if array.ndim else placed(np.full(count, array))
 
 
@@ -292,6 +301,15 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
 def called(word: str) -> str | None:
     """What has been seen of a rock, by the name that it has here; None for a word that is not known."""
     return CALLED.get(word.strip().lower()) if isinstance(word, str) else None
+
+
+def _check_below(name: str, value: Rocks, most: Rocks, what: str) -> None:
+    """Raise ValueError where a known value comes to a known bound: a slip of units."""
+    if is_traced((value, most)):
+        return
+    known, most = np.asarray(value), np.asarray(most)
+    if (known >= most).any():
+        raise ValueError(f"Argument `{name}` must be below {what}, but is {known[known >= most][0]:.4g}.")
 
 
 def _measured(name: str, value: Values | None, measured: np.ndarray) -> Rocks:

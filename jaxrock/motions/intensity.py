@@ -68,13 +68,18 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     check_single(motion=motion)
     peak, last = _peaks(motion)[1:]
     known = not isinstance(peak, jax.core.Tracer)
-    if known and isinstance(motion, Record) and motion.samples.size >= _LONG and abs(float(last)) > float(peak) / 4:
-        warnings.warn(
-            f"The ground of {motion.name or 'a record'} ends with {abs(float(last)):.3g} m/s, its peak is "
-            f"{float(peak):.3g} m/s: its baseline drifts. See `jaxrock.processing`.",
-            stacklevel=3,
-        )
+    if known and _is_long(motion) and abs(float(last)) > float(peak) / 4:
+        _warn_of_drift(motion, f"ends with {abs(float(last)):.3g} m/s, its peak is {float(peak):.3g} m/s")
     return peak
+
+
+def _is_long(motion: AbstractMotion) -> bool:
+    return isinstance(motion, Record) and motion.samples.size >= _LONG
+
+
+def _warn_of_drift(motion: AbstractMotion, how: str) -> None:
+    name = motion.name if isinstance(motion, Record) and motion.name else "a record"
+    warnings.warn(f"The ground of {name} {how}: its baseline drifts. See `jaxrock.processing`.", stacklevel=4)
 
 
 def peaks_of_motion(motion: AbstractMotion) -> tuple[Inexact[Array, ""], Inexact[Array, ""]]:
@@ -147,7 +152,8 @@ def peak_displacement(motion: AbstractMotion) -> float:
 
     - `motion`: one known motion; a record should have been corrected so that its displacement is meant.
 
-    **Returns:** the largest |displacement|, also between samples.
+    **Returns:** the largest |displacement|, also between samples. It warns of a record of 100 samples or more whose
+    ground ends further away than half of that: its baseline drifts. (Where a fault has moved the ground it may be so.)
     """
     lines = straight(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
@@ -161,6 +167,9 @@ def peak_displacement(motion: AbstractMotion) -> float:
         time = np.where((time > 0) & (time < lines.length), time, 0.0)
         there = places[:-1] + velocity * time + lines.begin * time**2 / 2 + slope * time**3 / 6
         largest = max(largest, np.abs(there).max(initial=0.0))
+    last = abs(float(places[-1]))
+    if _is_long(motion) and last > largest / 2:
+        _warn_of_drift(motion, f"ends {last:.3g} m away, its peak is {largest:.3g} m")
     return float(largest)
 
 

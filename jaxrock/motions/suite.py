@@ -1,9 +1,11 @@
 """Suites: many ground motions, of any kinds, with their peaks."""
 
 import contextlib
+import dataclasses
+import operator
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Annotated
+from collections.abc import Hashable, Iterator, Sequence
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -12,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, finite, is_traced, shown, watched
+from jaxrock._checks import Values, direction, is_traced, shown, watched
 from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
@@ -45,8 +47,8 @@ class Suite(AbstractNamed):
     - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Or a list of
       `Components`, each of which is one motion for every azimuth.
     - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
-    - `azimuth`: (azimuths,) of components [rad], from the first one towards the second: in which vertical planes a
-      block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
+    - `azimuth`: (azimuths,) of components [rad], within 2 pi, from the first one towards the second: in which vertical
+      planes a block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
 
     `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
     all scenes share the samples of all records.
@@ -96,13 +98,15 @@ class Suite(AbstractNamed):
         self.sources = self.names if sources is None else sources
         self.peak_acceleration, self.peak_velocity = map(jnp.concatenate, zip(*map(_peaks, self.groups)))
         if is_traced(self.peak_acceleration):
-            peaks, failed = (self.peak_acceleration, self.peak_velocity), ~jnp.all(self.peak_acceleration > _LEAST)
+            peaks = self.peak_acceleration, self.peak_velocity
+            failed = ~jnp.all((peaks[0] > _LEAST) & (peaks[1] > 0))
             self.peak_acceleration, self.peak_velocity = watched(
                 peaks, "Argument `motions` must move the ground", failed
             )
             return
-        for name, peak in zip(self.names, np.asarray(self.peak_acceleration)):
-            if not peak > _LEAST:
+        # What lasts for no time, as a record of one sample, has an acceleration, and no velocity.
+        for name, peak, speed in zip(self.names, np.asarray(self.peak_acceleration), np.asarray(self.peak_velocity)):
+            if not (peak > _LEAST and speed > 0):
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
 
     def __len__(self) -> int:
@@ -111,11 +115,11 @@ class Suite(AbstractNamed):
     def __getitem__(self, number) -> AbstractMotion:
         """One of its motions. Where its number is traced, scenes of all records share their samples.
 
-        **Raises:** IndexError for a number without a motion, ValueError for one that is traced; ValueError for a traced
-        number where motions are of several kinds, or made of records.
+        **Raises:** IndexError for a number without a motion, ValueError for one that is traced, or is no whole number;
+        ValueError for a traced number where motions are of several kinds, or made of records.
         """
         if not is_traced(number):
-            place = range(len(self))[number]
+            place = _place(number, len(self))
             ends = np.cumsum([size_of(group) for group in self.groups])
             group = int(np.searchsorted(ends, place, side="right"))
             return one_of_many(self.groups[group], place - int(ends[group]) + size_of(self.groups[group]))
@@ -151,11 +155,22 @@ class Suite(AbstractNamed):
                 yield one_of_many(group, index)
 
 
+def _place(number: Any, count: int) -> int:
+    """The place of a motion, from 0, by its number, which may be counted from the end."""
+    try:
+        place = operator.index(number)  # of arrays of one whole number, too
+    except TypeError:
+        raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.") from None
+    if not -count <= place < count:
+        raise IndexError(f"The number of a motion is out of range: {place} of {count} motions.")
+    return place % count
+
+
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None):
     """Components at all azimuths: motions, their names, the names of their records, and the azimuth of each."""
     if azimuth is None or not all(isinstance(each, Components) for each in motions):
         raise ValueError("Arguments `motions` and `azimuth` must be given for components alone, all of them.")
-    angles = np.asarray(finite("azimuth", azimuth), float)
+    angles = np.asarray(direction("azimuth", azimuth), float)
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
     own = [each.first.name or f"record {number + 1}" for number, each in enumerate(motions)]
@@ -191,6 +206,30 @@ def _names(motion: AbstractMotion, size: int) -> list[str]:
         inner = inner.motion  # of one that is scaled, say
     name = getattr(inner, "name", "") or type(motion).__name__
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
+
+
+def repeated(suite: Suite) -> tuple[str, str] | None:
+    """Names of two motions that are the same to the last sample; None where there are none, or some are traced."""
+    if is_traced(suite):
+        return None
+    seen: dict[Any, str] = {}
+    for name, motion in zip(suite.names, suite.motions()):
+        before = seen.setdefault(_content(motion), name)
+        if before is not name:
+            return before, name
+    return None
+
+
+def _content(value: Any) -> Hashable:
+    """What a motion is made of, but for its name and where it comes from (all labels are equal)."""
+    if isinstance(value, (np.ndarray, jax.Array)):
+        array = np.asarray(value)
+        return array.shape, array.dtype.str, array.tobytes()
+    if isinstance(value, eqx.Module):
+        return type(value), *(_content(getattr(value, field.name)) for field in dataclasses.fields(value))
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_content, value))
+    return value if isinstance(value, Hashable) else id(value)
 
 
 def _numbered(names: list[str]) -> list[str]:

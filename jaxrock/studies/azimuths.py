@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, finite, placed, scalar, shown, size
+from jaxrock._checks import Values, direction, placed, scalar, shown, size
 from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._progress import Progress
@@ -93,13 +93,13 @@ def azimuth_outcomes(
     """
     if not isinstance(rock, Rock) and (not callable(rock) or isinstance(rock, type)):
         raise ValueError(f"Argument `rock` must be a Rock, or a function of an azimuth, but is {shown(rock)}.")
-    angles = np.linspace(0, np.pi, 36, endpoint=False) if azimuth is None else np.asarray(finite("azimuth", azimuth))
+    angles = np.linspace(0, np.pi, 36, endpoint=False) if azimuth is None else np.asarray(direction("azimuth", azimuth))
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
     scales = np.atleast_1d(np.asarray(size("scale", scale), float))
     if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
         raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
-    first = float(scalar("orientation", finite("orientation", orientation)))
+    first = float(scalar("orientation", direction("orientation", orientation)))
     blocks = _blocks(rock, angles)
     model = current_model(model, blocks, components.first, scales)
     known = jax.tree.map(np.asarray, blocks)
