@@ -211,6 +211,36 @@ def test_a_history_in_both_modes():
     np.testing.assert_allclose(forward, differences.T, rtol=1e-7, atol=1e-9)
 
 
+def test_derivatives_at_the_end_of_a_history_and_of_its_events():
+    """By time the velocity, also where the history ends in motion; events outside of jit as within."""
+    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
+    history = rk.simulate(block, pulse, duration=3.0, samples=2)
+    by_time = jax.grad(lambda t: history(t)[0])
+    assert abs(history(3.0)[1]) > 0.01
+    for time in (1.0, 3.0):
+        assert by_time(time) == pytest.approx(float(history(time)[1]), rel=1e-12)
+
+    def second_impact(alpha):
+        return rk.simulate(rk.Block(alpha, 2.0, 0.9), pulse, duration=3.0, samples=2).impact_times[1]
+
+    assert jax.grad(second_impact)(0.2) == pytest.approx(float(jax.jit(jax.grad(second_impact))(0.2)), rel=1e-12)
+
+
+@pytest.mark.parametrize("what", ["least_normal", "largest_friction"])
+def test_slopes_of_forces_in_both_modes(what):
+    """By slenderness, amplitude and duration: steps that were not taken are no numbers, and have no part in it."""
+
+    def force(x):
+        block = rk.Block(x[0], 2.0)
+        response = rk.simulate(block, rk.SinePulse(x[1], x[2]), duration=2.0, samples=2)
+        return getattr(rk.responses.contact_forces(response, block), what)
+
+    x = jnp.array([0.2, 0.4, 0.6])
+    forward, reverse = jax.jit(lambda x: (jax.jacfwd(force)(x), jax.grad(force)(x)))(x)
+    assert np.abs(forward).min() > 1e-4
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+
+
 @pytest.mark.slow
 def test_second_derivatives_of_a_history():
     """Of rotations before and after impacts, and of the margin: differences of first derivatives, and symmetric."""

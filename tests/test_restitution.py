@@ -351,3 +351,22 @@ def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
 def test_parameters_have_ranges(given):
     with pytest.raises(ValueError, match="must be"):
         rk.restitution.SpeedDependent(*given)
+
+
+def test_two_sides_are_those_of_an_asymmetric_block():
+    """A block of one slenderness with two restitutions: turned round it does as with these exchanged; a symmetric one
+    has one."""
+    two, pulse = rk.restitution.PerSide(0.9, 0.7), rk.SinePulse(0.4, 0.6)
+
+    def peak(law, sign):
+        block = rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=law)
+        return float(rk.outcome(block, sign * pulse).max_rotation)
+
+    assert peak(two, 1) == pytest.approx(peak(two.mirrored, -1), rel=1e-13)
+    assert abs(peak(two, 1) - peak(two, -1)) > 0.02
+    for make in (
+        lambda: rk.Block(0.2, 2.0, two),
+        lambda: rk.blocks.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, restitution=two),
+    ):
+        with pytest.raises(ValueError, match="`restitution` must be the same on both sides"):
+            make()

@@ -103,7 +103,7 @@ class FlexibleBlock(Owner):
         self.masses = whole("masses", masses, least, 60)
         set_parameters(self, width=width, height=height, youngs_modulus=youngs_modulus, density=density)
         set_parameters(self, damping_ratio=damping_ratio, gravity=gravity)
-        self.law = law_of(restitution, Housner())
+        self.law = law_of(restitution, Housner(), symmetric=True)
         if restitution is None:
             flat = "be at most 1.41 times the height when `restitution` is None: Housner's value is negative above"
             self.width = checked("width", self.width, flat, lambda x: x <= math.sqrt(2) * self.height * (1 + 1e-6))

@@ -49,7 +49,7 @@ class Corners(NamedTuple):
     - `p`: frequency parameter about the corner that it leaves [rad/s].
     - `inertia_ratio`: m R^2/I about the corner that it comes to [-]; 3/4 for a rectangle.
     - `radius_ratio`: distance of the centre of mass from the corner that it leaves, over that from the other [-].
-    - `side`: 1 or -1, the side of which the impact ends a stay.
+    - `side`: 1 or -1, the side of which the impact ends a stay; of a symmetric block always 1.
     """
 
     alpha: Real
@@ -172,7 +172,7 @@ class AngularMomentum(AbstractRestitution):
 
 
 class PerSide(AbstractRestitution):
-    """A ratio of its own for the impacts that end the stays on either side of an asymmetric block.
+    """A ratio of its own for the impacts that end the stays on either side of an `AsymmetricBlock`.
 
     **Arguments:**
 
@@ -237,10 +237,17 @@ class SpeedDependent(AbstractRestitution):
 Restitution = ArrayLike | AbstractRestitution
 
 
-def law_of(restitution: Restitution | None, otherwise: AbstractRestitution) -> AbstractRestitution:
+def law_of(
+    restitution: Restitution | None, otherwise: AbstractRestitution, symmetric: bool = False
+) -> AbstractRestitution:
     """The law that an argument `restitution` means: itself, that of a number, or, for None, the usual one."""
     if restitution is None:
         return otherwise
+    if symmetric and isinstance(restitution, PerSide):
+        raise ValueError(
+            "Argument `restitution` must be the same on both sides of a symmetric block, but is a PerSide: "
+            "jaxrock.blocks.AsymmetricBlock(alpha, alpha, p, restitution=...) tells its sides apart."
+        )
     return restitution if isinstance(restitution, AbstractRestitution) else Constant(restitution)
 
 

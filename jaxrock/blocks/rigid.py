@@ -48,7 +48,7 @@ class Block(Owner):
     @with_throw
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None, *, throw: bool = True):
         set_parameters(self, alpha=alpha, p=p)
-        self.law = law_of(restitution, Housner())
+        self.law = law_of(restitution, Housner(), symmetric=True)
         self.alpha = fitting_alpha(self.law, self.alpha)
 
     @classmethod
@@ -113,7 +113,7 @@ class Block(Owner):
         if inertia_ratio is None:
             return cls(alpha, _rate_of_rectangle(gravity, radius), restitution)
         ratio = ratio_of_inertia("inertia_ratio", inertia_ratio)
-        return cls(alpha, jnp.sqrt(ratio * gravity / radius), law_of(restitution, Housner(ratio)))
+        return cls(alpha, jnp.sqrt(ratio * gravity / radius), law_of(restitution, Housner(ratio), symmetric=True))
 
     @property
     @one_program

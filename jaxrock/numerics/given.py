@@ -38,12 +38,16 @@ def given(rule: Callable, values: Tree, by: Any, *settings: Any) -> Tree:
     `rule` is a function of a module, `settings` are static. Changes that are zero are `SymbolicZero`; to the values
     that the rule is given their derivatives belong, so that those of higher order follow.
     """
-    leaves, structure = jax.tree.flatten(values)
-    more, of_by = jax.tree.flatten(by)
+    leaves, structure = _flat(values)
+    more, of_by = _flat(by)
     found = _given_p.bind(
         *map(jnp.asarray, (*leaves, *more)), rule=_Rule(rule, settings), structures=(structure, of_by)
     )
     return structure.unflatten(found)
+
+
+def _flat(tree: Any) -> tuple[list, Any]:
+    return jax.tree.flatten(tree)
 
 
 def is_zero(change: Any) -> bool:
@@ -65,7 +69,7 @@ def _moved(leaves, changes, *, rule, structures):
 
 def _of_many(rule: Callable, axes: tuple, values: Any, by: Any, changes: Any) -> Any:
     """A rule under `jax.vmap`, where values have a leading axis, and of `by` the leaves with an axis 0."""
-    own, structure = jax.tree.flatten(by)
+    own, structure = _flat(by)
     told = structure.flatten_up_to(changes)
     moving = [d for d in told if not is_zero(d)]
 

@@ -2,7 +2,7 @@
 
 import functools
 from dataclasses import replace
-from typing import Annotated, overload
+from typing import Annotated, Any, overload
 
 import equinox as eqx
 import jax
@@ -359,7 +359,8 @@ def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
     """The same, of which nothing moves but what an evaluation depends on."""
     scene, still = stepper.scene, jax.lax.stop_gradient(stepper)
     moving = {name: getattr(scene, name) for name in ("moments", "far", "p", "motion", "knots", "scales")}
-    return replace(still, scene=replace(still.scene, **moving))
+    moved: Any = {"scene": replace(still.scene, **moving)}  # a field of all that are no base
+    return replace(still, **moved)
 
 
 def _at(given) -> tuple[Scalar, Scalar]:
