@@ -90,7 +90,7 @@ def test_run_on_the_built_in_record(command, tmp_path):
     assert table["frequency parameter p"] == f"{float(BLOCK.p):.4f}"
     assert table["restitution"] == f"{1 - 1.5 * 0.04 / 1.04:.4f}"
     assert table["uplift threshold"] == "0.2000"
-    assert table["impacts"] == str(result.impact_count)
+    assert table["impacts during the motion"] == str(result.impact_count)
     assert table["peak rotation"] == f"{float(result.max_rotation):.6f}"
     assert table["at time"] == f"{float(result.time_of_max):.4f}"
     assert table["peak angular velocity"] == f"{float(result.max_velocity):.6f}"
@@ -134,7 +134,7 @@ def test_run_of_a_block_that_overturns(command, at2, tmp_path):
 def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
     status, table, _ = command("run", at2, *GIVEN, "--scale", "0.1")
     assert status == 0
-    assert (table["verdict"], table["impacts"], table["peak rotation"]) == ("stands", "0", "0.000000")
+    assert (table["verdict"], table["impacts during the motion"], table["peak rotation"]) == ("stands", "0", "0.000000")
     assert (tmp_path / "out" / "impacts.csv").read_text() == "time_s,velocity_before_rad_per_s\n"
 
 
@@ -528,3 +528,16 @@ def test_as_a_program_that_keeps_what_it_compiled(tmp_path, monkeypatch, capsys)
 def test_nothing_is_kept_where_that_is_off(capsys):
     assert main(["cache"]) == 0
     assert "off" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("raised", "status"), [(KeyboardInterrupt, 130), (BrokenPipeError, 141)])
+def test_what_ends_a_command_from_outside_is_no_bad_input(monkeypatch, capfd, raised, status):
+    """Interrupted, or read by nobody any more: no traceback, and a status of its own."""
+
+    def ended(words):
+        raise raised
+
+    monkeypatch.setattr("jaxrock.command_line.main._done", ended)
+    monkeypatch.setattr("os.dup2", lambda *_: None)
+    assert main(["run"]) == status
+    assert capfd.readouterr().err == ("jaxrock: interrupted\n" if status == 130 else "")

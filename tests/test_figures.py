@@ -124,3 +124,29 @@ def test_feasible_region():
 def test_units_of_parameters_are_those_declared():
     assert UNITS == {"amplitude": "g", "duration": "s", "period": "s", "center": "s", "phase": "rad"}
     assert set(PULSES) >= {"sine", "half-sine", "rectangle", "mavroeidis-papageorgiou"}
+
+
+def test_a_map_of_one_row_or_column_is_drawn():
+    """Its cells have a width, whatever the order of the axes; overturned ones are not the colour of the safe."""
+    grid = np.linspace(0.5, 8, 9), np.array([3.0])
+    states = np.asarray(rk.overturning_map(*grid, alpha=0.2, progress=False).state)[0]
+    assert set(states) == {0, 1, 2}
+    mixed = np.random.default_rng(1).permutation(9)
+    for first in (grid[0], grid[0][mixed]):
+        axis = rk.plot.overturning(rk.overturning_map(first, grid[1], alpha=0.2, progress=False))
+        drawn = axis.collections[-1]
+        np.testing.assert_array_equal(np.ma.filled(drawn.get_array(), 0).ravel(), states)
+        assert np.ptp(drawn.get_coordinates()[..., 1]) > 0.1 and np.ptp(axis.get_ylim()) > 0.1
+        plt.close(axis.figure)
+
+
+def test_sizes_that_overturn_alone_are_shaded():
+    """A spectrum's overturned sizes each have a cell, half way to their neighbours."""
+    spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), np.linspace(0.5, 8, 200), progress=False)
+    lost, places = np.asarray(spectrum.overturned), np.asarray(spectrum.abscissa)
+    axis, _ = rk.plot.spectrum(spectrum)
+    spans = sorted((patch.get_x(), patch.get_x() + patch.get_width()) for patch in axis.patches)
+    shaded = np.any([(places > begin) & (places < end) for begin, end in spans], axis=0)
+    np.testing.assert_array_equal(shaded, lost)
+    assert min(end - begin for begin, end in spans) < 1.5 * (places[1] - places[0])  # one stands alone
+    plt.close(axis.figure)

@@ -95,6 +95,7 @@ def _write(
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
     report.wrote(folder / "stripes.csv")
+    (folder / "fragility.xml").unlink(missing_ok=True)  # of an earlier run, which may have had a fit
     if fit is not None:
         rk.hazard.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
         report.wrote(folder / "fragility.xml")

@@ -2,6 +2,8 @@
 
 import argparse
 import contextlib
+import io
+import os
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +37,7 @@ _EXAMPLES = """\
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
 """
-_EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input"
+_EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted"
 
 
 def _epilog(command: str = "") -> str:
@@ -71,8 +73,25 @@ def main(words: list[str] | None = None) -> int:
 
     - `words`: of the command; None: those that the program was called with.
 
-    **Returns:** the exit status: 0 good, 1 not computed, 2 bad input.
+    **Returns:** the exit status: 0 good, 1 not computed, 2 bad input; 130 if it is interrupted, and 141 if nobody reads
+    what it says any more.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what it cannot show is no reason to stop
+    try:
+        status = _done(words)
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        print("jaxrock: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more at its end
+        return 141
+
+
+def _done(words: list[str] | None) -> int:
     arguments = _parser().parse_args(words)
     command = _COMMANDS[arguments.command]
     report = Report(command.name, arguments.json, arguments.quiet)
@@ -81,10 +100,12 @@ def main(words: list[str] | None = None) -> int:
             if command.computes:
                 _prepare(arguments)
             command.run(arguments, report)
+            return report.finished()
+        except BrokenPipeError:
+            raise
         except (ValueError, OSError) as error:
             print(f"jaxrock: error: {as_typed(str(error), arguments)}", file=sys.stderr)
             return 2
-        return report.finished()
 
 
 def _prepare(arguments: argparse.Namespace) -> None:

@@ -15,7 +15,10 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
     parser.add_argument("--height", type=number, default=3.0, help="full height [m] (default 3)")
     parser.add_argument(
-        "--duration", type=number, help="how long to follow the block [s] (default: a little past the record)"
+        "--duration",
+        type=number,
+        help="of the history that is drawn and written [s] (default: a little past the record); the table is of the "
+        "whole motion and of what follows",
     )
     parser.add_argument(
         "--animate",
@@ -60,7 +63,7 @@ def _entries(size: Entry, block: rk.Block, record: rk.Record, model, result: rk.
         Entry("p", "frequency parameter p", float(block.p), ".4f", "rad/s"),
         Entry("restitution", "restitution", float(block.restitution), ".4f"),
         Entry("uplift_threshold", "uplift threshold", float(model.moments(block).threshold), ".4f", "g"),
-        Entry("impacts", "impacts", int(result.impact_count)),
+        Entry("impacts", "impacts during the motion", int(result.impact_count)),
         Entry("peak_rotation", "peak rotation", unless_lost(result.max_rotation), ".6f", "rad", instead),
         Entry("peak_rotation_over_alpha", "peak rotation / alpha", unless_lost(ratio), ".6f", shown=instead),
         Entry("time_of_peak", "at time", unless_lost(result.time_of_max), ".4f", "s", "-" if lost else None),

@@ -47,3 +47,28 @@ def broken_curve(axis, abscissa, values, **line):
     alone = there[1:-1] & ~there[:-2] & ~there[2:]  # survivors between overturned blocks, of which no line is drawn
     axis.plot(abscissa[alone], values[alone], ".", color=drawn.get_color(), markersize=4)
     return drawn
+
+
+def cell_edges(places: np.ndarray) -> np.ndarray:
+    """Where the cells about places that rise, or fall, begin and end: half way between them; one alone is as wide as a
+    tenth of what it is."""
+    if places.size == 1:
+        return places[0] + np.array([-1, 1]) * (0.05 * abs(places[0]) or 0.5)
+    inner = (places[1:] + places[:-1]) / 2
+    return np.concatenate([[2 * places[0] - inner[0]], inner, [2 * places[-1] - inner[-1]]])
+
+
+def shade(axis: "Axes", places: np.ndarray, which: np.ndarray, **patch) -> None:
+    """Shade the cells about some of the places, from the lower to the upper end of an axis.
+
+    **Arguments:**
+
+    - `axis`: matplotlib axis.
+    - `places`: (n,) rising or falling; `which`: (n,) whether each is shaded.
+    - `patch`: colour and label, as matplotlib names them.
+    """
+    edges, label = cell_edges(places), patch.pop("label", None)
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], which.astype(int), [0]])))
+    for begin, end in ends.reshape(-1, 2):
+        axis.axvspan(edges[begin], edges[end], label=label, **patch)
+        label = None

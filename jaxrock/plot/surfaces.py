@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED, broken_curve
+from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, cell_edges, shade
 from jaxrock.studies.borders import Region, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -19,7 +19,7 @@ _DURATION = "pulse duration $p\\,t_d$"
 
 
 def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
-    """Draw a rocking spectrum: peak rotation and peak velocity; overturned blocks at the top edge.
+    """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
 
     **Arguments:**
 
@@ -40,22 +40,20 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     if axes is None:
         _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), layout="constrained")
     abscissa = np.asarray(result.pulse_duration if by_duration else result.abscissa)
+    order = np.argsort(abscissa)
+    abscissa = abscissa[order]
     labels = result.uplift_strength if by_duration else result.intensity
-    rows = np.atleast_2d(np.asarray(result.overturned))
+    rows = np.atleast_2d(np.asarray(result.overturned))[:, order]
     for axis, values in zip(axes, (result.max_rotation, result.max_velocity)):
-        values = np.atleast_2d(np.asarray(values))
+        values = np.atleast_2d(np.asarray(values))[:, order]
         colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(values))) if len(values) > 1 else [BLUE]
         for i, (curve, color) in enumerate(zip(values, colors)):
             label = None if labels is None else f"{float(labels[i]):g}"
             broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
-        axis.set_ylim(bottom=0)
-        lost = rows.any(axis=0)
-        if lost.any():
-            where = lost if len(values) == 1 else rows.all(axis=0)
-            axis.fill_between(
-                abscissa, 0, 1, where=where, transform=axis.get_xaxis_transform(), color=RED, alpha=0.15,
-                linewidth=0, label="overturned" if len(values) == 1 else "all overturned", step="mid",
-            )  # fmt: skip
+        if axis.get_yscale() == "linear":
+            axis.set_ylim(bottom=0)
+        said = "overturned" if len(values) == 1 else "all overturned"
+        shade(axis, abscissa, rows.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
     axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
     axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
     self_similar = result.intensity is not None
@@ -102,31 +100,34 @@ def overturning(
         _, axis = plt.subplots(figsize=(7, 5), layout="constrained")
     x = np.asarray(result.pulse_duration if by_duration else result.frequency_ratio)
     y = np.asarray(result.uplift_strength if by_duration else result.intensity)
-    state = np.asarray(result.state)
+    rows, columns = np.argsort(y), np.argsort(x)
+    x, y, state = x[columns], y[rows], np.asarray(result.state)[np.ix_(rows, columns)]
+    edges = cell_edges(x), cell_edges(y)
     axis.set_facecolor(_SAFE[0])
     if safe:
         shades = LinearSegmentedColormap.from_list("survivors", _SAFE)
-        peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation), np.nan))
-        picture = axis.pcolormesh(x, y, peaks, cmap=shades, vmin=0, vmax=1, shading="nearest", rasterized=True)
+        peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation)[np.ix_(rows, columns)], np.nan))
+        picture = axis.pcolormesh(*edges, peaks, cmap=shades, vmin=0, vmax=1, rasterized=True)
         axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
     pixels = np.ones(x.size, bool)
     if _is_quick(result) if exact is None else exact:
         found = overturning_borders(result)
-        pixels = _within(np.asarray(result.frequency_ratio), found.crowded)
+        pixels = _within(np.asarray(result.frequency_ratio)[columns], found.crowded)
         for region in found.regions:
             draw_region(axis, region, by_duration)
     lost = np.ma.masked_where((state == 0) | ~pixels, state)
     colors, norm = ListedColormap(_STATES), BoundaryNorm((-1.5, 0.5, 1.5, 2.5), 3)
-    axis.pcolormesh(x, y, lost, cmap=colors, norm=norm, shading="nearest", rasterized=True)
+    axis.pcolormesh(*edges, lost, cmap=colors, norm=norm, rasterized=True)
     if (state == -1).any():
-        rows, columns = np.nonzero(state == -1)
-        axis.plot(x[columns], y[rows], "kx", markersize=3)
+        unknown = np.nonzero(state == -1)
+        axis.plot(x[unknown[1]], y[unknown[0]], "kx", markersize=3)
     names = {-1: "not computed", 0: "safe", 1: "overturned without impact", 2: "overturned after impacts"}
     colors = dict(zip((-1, 1, 2, 0), (*_STATES, _SAFE[0])))
     shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
     handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
     axis.legend(handles=handles, loc="lower right" if by_duration else "upper left", fontsize=8)
-    axis.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()))
+    xlim, ylim = ((at[0], at[-1]) if at.size > 1 else tuple(ends) for at, ends in zip((x, y), edges))
+    axis.set(xlim=xlim, ylim=ylim)
     axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
     axis.set_ylabel(
         "uplift strength (uplift threshold / peak acceleration)"
