@@ -150,3 +150,14 @@ def test_sizes_that_overturn_alone_are_shaded():
     np.testing.assert_array_equal(shaded, lost)
     assert min(end - begin for begin, end in spans) < 1.5 * (places[1] - places[0])  # one stands alone
     plt.close(axis.figure)
+
+
+def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
+    """Where exact borders take too long, and it is said; where they were asked for they are drawn."""
+    monkeypatch.setattr("jaxrock.plot.surfaces._SCENES", 5000)
+    surface = rk.overturning_map(np.linspace(1, 8, 6), np.linspace(1.05, 9, 6), alpha=0.2, progress=False)
+    with caplog.at_level("INFO", "jaxrock"):
+        pixels = rk.plot.overturning(surface)
+    assert "too many islands" in caplog.text and len(pixels.lines) == 0
+    assert len(rk.plot.overturning(surface, exact=True).lines) > 2
+    plt.close("all")

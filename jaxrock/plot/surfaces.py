@@ -1,5 +1,6 @@
 """Figures of many responses: spectra and overturning maps."""
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -7,12 +8,14 @@ import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, cell_edges, shade
-from jaxrock.studies.borders import Region, overturning_borders
+from jaxrock.studies.borders import Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_LOG = logging.getLogger("jaxrock")
+_SCENES = 500_000  # for exact borders: a sine takes 50,000 to 130,000, one and a half cycles 340,000
 _SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
 _DURATION = "pulse duration $p\\,t_d$"
@@ -84,7 +87,8 @@ def overturning(
     - `by_duration`: uplift strength over pulse duration, as single-lobe pulses are drawn, in place of intensity over
       frequency ratio.
     - `exact`: whether borders are drawn where they are (`overturning_borders`: islands and gaps too, whatever the grid;
-      pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map.
+      pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map,
+      if they take half a million scenes at most.
     - `safe`: whether survivors are coloured, with a scale beside the axis.
 
     **Returns:** the axis.
@@ -109,9 +113,14 @@ def overturning(
         peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation)[np.ix_(rows, columns)], np.nan))
         picture = axis.pcolormesh(*edges, peaks, cmap=shades, vmin=0, vmax=1, rasterized=True)
         axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
-    pixels = np.ones(x.size, bool)
-    if _is_quick(result) if exact is None else exact:
+    pixels, found = np.ones(x.size, bool), None
+    if exact:
         found = overturning_borders(result)
+    elif exact is None and _is_quick(result):
+        found = borders_within(result, _SCENES)
+        if found is None:
+            _LOG.info("too many islands for exact borders: pixels are drawn (exact=True takes the time)")
+    if found is not None:
         pixels = _within(np.asarray(result.frequency_ratio)[columns], found.crowded)
         for region in found.regions:
             draw_region(axis, region, by_duration)

@@ -84,7 +84,41 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
         raise ValueError(
             "Argument `result` must be a map of two axes, with two values or more each, from `overturning_map`."
         )
-    search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress)
+    found = borders_within(result, None, progress)
+    assert found is not None  # of as many scenes as it takes
+    return found
+
+
+def borders_within(result: OverturningMap, most: int | None, progress: bool | None = False) -> Borders | None:
+    """The same of a map of two axes; None if it takes more scenes than `most`."""
+    ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
+    search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress, _Budget(most))
+    try:
+        return _found(search, ratio)
+    except _TooMany:
+        return None
+
+
+class _TooMany(Exception):
+    """More scenes than a search may ask."""
+
+
+class _Budget:
+    """How many scenes may still be asked; None: any number."""
+
+    def __init__(self, most: int | None):
+        self.left = most
+
+    def take(self, count: int) -> None:
+        """Take some of them, or raise `_TooMany`."""
+        if self.left is None:
+            return
+        self.left -= count
+        if self.left < 0:
+            raise _TooMany
+
+
+def _found(search: "_Search", ratio: np.ndarray) -> Borders:
     columns = {x: column for x, column in zip(np.unique(ratio), search.columns(np.unique(ratio)))}
     width = float(np.ptp(ratio))
     while True:
@@ -103,9 +137,11 @@ class _Search(NamedTuple):
     low: float
     high: float
     progress: bool | None
+    budget: _Budget = _Budget(None)
 
     def at(self, z: np.ndarray, ratio: np.ndarray) -> tuple:
         """Margin, its slope and impacts at logarithms of intensities, and frequency ratios beside them."""
+        self.budget.take(z.size)
         return tuple(map(np.asarray, surface(_point, (z, ratio), self.scene, "borders", self.progress, outer=False)))
 
     def columns(self, ratio: np.ndarray) -> list[list[_Interval]]:
