@@ -211,6 +211,17 @@ def test_a_history_in_both_modes():
     np.testing.assert_allclose(forward, differences.T, rtol=1e-7, atol=1e-9)
 
 
+def test_a_block_at_rest_does_not_lean():
+    """From rest a little rotation to either side falls back before the ground moves: its slope is zero."""
+
+    @jax.jit
+    def peak(rotation):
+        return rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6), initial=(rotation, 0.0)).max_rotation
+
+    assert jax.grad(peak)(0.0) == 0
+    np.testing.assert_allclose([peak(1e-7), peak(-1e-7)], peak(0.0), rtol=1e-9)
+
+
 def test_derivatives_at_the_end_of_a_history_and_of_its_events():
     """By time the velocity, also where the history ends in motion; events outside of jit as within."""
     block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)

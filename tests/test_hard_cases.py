@@ -556,3 +556,10 @@ def test_the_error_of_a_small_peak(dtype):
     peak, error, other = (np.asarray(x, float) for x in jax.jit(jax.vmap(both))(rate))
     assert peak.min() < 1e-7 and np.all(np.abs(peak - other) <= error)
     assert np.all(error < 5e-16 if dtype == jnp.float64 else error < 1e-6)
+
+
+@pytest.mark.parametrize("engine", [EXACT, LOOSE], ids=["series", "diffrax"])
+def test_a_start_whose_square_vanishes_is_rest(engine):
+    """A velocity of 1e-160 rad/s: the block stands."""
+    found = rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.01, 0.5), initial=(0.0, 1e-160), engine=engine)
+    assert found.status == rk.Status.successful and not found.overturned and found.max_rotation < 1e-100

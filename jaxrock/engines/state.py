@@ -51,8 +51,11 @@ _MOST = 1e30  # [g], [rad/s], [s]
 def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
+    least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # below it squares vanish
+    rotation, velocity = (where(jnp.abs(x) < least, 0.0, x) for x in (rotation, velocity))
     side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
-    opening, outward = jnp.abs(rotation), side * velocity
+    # Of a block at rest nothing moves: the slope of |0| would be 1.
+    opening, outward = jnp.abs(side * rotation), side * velocity
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
     moments = scene.on(side).moments
