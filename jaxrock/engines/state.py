@@ -8,6 +8,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.uncertainty import Spread
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
 from jaxrock.status import Status
 
 Scalar = Inexact[Array, ""]
@@ -52,7 +53,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     """State at time 0 from rotation [rad] and angular velocity [rad/s]."""
     velocity = velocity / scene.p
     least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # below it squares vanish
-    rotation, velocity = (where(jnp.abs(x) < least, 0.0, x) for x in (rotation, velocity))
+    rotation, velocity = (where(jnp.abs(x) < least, x - fixed(x), x) for x in (rotation, velocity))
     side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
     # Of a block at rest nothing moves: the slope of |0| would be 1.
     opening, outward = jnp.abs(side * rotation), side * velocity
