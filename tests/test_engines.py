@@ -346,3 +346,11 @@ def test_lanes_of_histories_are_not_copied_at_every_step():
     lines = jax.jit(jax.vmap(run)).lower(lasts).as_text().splitlines()
     chosen = [line for line in lines if "stablehlo.select" in line]
     assert chosen and not any("4x101x" in line for line in chosen)
+
+
+def test_diffrax_in_single_precision():
+    """By its default tolerances, which are for double precision: five digits."""
+    block, pulse = jax.tree.map(jnp.float32, (rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)))
+    found, exact = (rk.outcome(block, pulse, engine=engine) for engine in (rk.Diffrax(), rk.Series()))
+    assert found.status == rk.Status.successful and found.max_rotation.dtype == jnp.float32
+    assert abs(found.max_rotation - exact.max_rotation) < 2e-5

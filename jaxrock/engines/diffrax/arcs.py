@@ -63,7 +63,8 @@ class Diffrax(AbstractEngine):
     **Arguments:**
 
     - `solver`: any diffrax solver of ordinary differential equations.
-    - `rtol`: tolerance of a step relative to the state, in (0, 1); 1e-12 is about the tightest in double precision.
+    - `rtol`: tolerance of a step relative to the state, in (0, 1); 1e-12 is about the tightest in double precision,
+      2e-6 in single, where less is taken for that (and a tenth of scenes use their budget up).
     - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits.
     - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is
       only what it is trusted to keep.
@@ -146,9 +147,16 @@ class Diffrax(AbstractEngine):
         """A loop that goes with the adjoint."""
         return eqxi.while_loop(unfinished, step, carry, max_steps=budget, kind=_ADJOINTS[type(self.adjoint)])
 
+    def within(self, dtype) -> tuple[float, float]:
+        """The relative tolerance, and the least absolute one over alpha, that this precision allows: in single
+        precision what rounding leaves of a step is more than the usual ones."""
+        eps = float(jnp.finfo(dtype).eps)
+        return (max(self.rtol, 16 * eps), 8 * eps) if eps > 1e-10 else (self.rtol, 0.0)
+
     def limits(self, scene: Scene, piece: Int[Array, ""]) -> tuple[Scalar, Scalar]:
         """Absolute tolerance [rad], and the longest step (p t) in a piece of the motion; without derivatives."""
-        atol = (self.atol or 1e-8 * self.rtol) * scene.alpha
+        rtol, least = self.within(scene.p.dtype)
+        atol = max(self.atol or 1e-8 * rtol, least) * scene.alpha
         # A fraction of the time in which the forcing changes: a step sees at most one turn of it.
         return jax.lax.stop_gradient((atol, jnp.minimum(POLICY.longest, scene.p * scene.scale(piece))))
 
@@ -157,9 +165,10 @@ class Diffrax(AbstractEngine):
         length = jnp.where(arc.side != 0, length, 0.0)
         # Where it is longer than the arc, diffrax cuts it, and the step ends with the arc; cut here it would only half
         # do so: of two equal times, derivatives go with each by one half.
-        first = first_step(arc, self.rtol)
+        rtol, _ = self.within(arc.opening.dtype)
+        first = first_step(arc, rtol)
         first = jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0))
-        controller = self.controller or StepControl(self.rtol, limits[0], dtmax=limits[1], first=first)
+        controller = self.controller or StepControl(rtol, limits[0], dtmax=limits[1], first=first)
         term, zero, y0 = diffrax.ODETerm(field), jnp.zeros_like(length), jnp.stack([arc.opening, arc.velocity])
         return diffrax.diffeqsolve(
             term,
@@ -313,7 +322,8 @@ class ArcStepper(AbstractStepper):
         scene, engine = self.scene, self.engine
         lost = escaped(self, state, Angle.of(state.opening)) & (not self.history)
         room = jnp.where(rocking & ~lost, self.room(state), 0.0)
-        share = POLICY.share * jnp.minimum(usual_step(engine.rtol) / scene.p, scene.scale(state.piece))
+        rtol, _ = engine.within(scene.p.dtype)
+        share = POLICY.share * jnp.minimum(usual_step(rtol) / scene.p, scene.scale(state.piece))
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)
@@ -337,7 +347,7 @@ class ArcStepper(AbstractStepper):
         full = ~happened & whole
         piece, local, over = self.move_on(state, jnp.where(full, room, elapsed), full)
         steps = jnp.maximum(solution.stats["num_accepted_steps"], 1)
-        off = 2.5 * engine.rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
+        off = 2.5 * rtol * steps * jnp.maximum(jnp.abs(y), jnp.stack([state.opening, jnp.abs(state.velocity)]))
         spread = errors_after(self, state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
         moved = time > 0
         opening, velocity = landed(scene, hits, y[0], y[1])
