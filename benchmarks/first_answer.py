@@ -104,6 +104,17 @@ QUESTIONS = {
         "answer = jax.hessian(misfit)(jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]))",
         30.0, 1.5,
     ),
+    "history_diffrax": (
+        "history by the diffrax engine",
+        "answer = rk.simulate(block, pulse, engine=rk.Diffrax())",
+        6.0, 1.0,
+    ),
+    "histories": (
+        "`sweep` of two histories under a record",
+        "record = 1.5 * rk.example_record()\n"
+        "answer = rk.sweep(lambda p: rk.simulate(rk.Block(0.2, p), record).rotation, p=[1.0, 2.0], progress=False)",
+        6.0, 1.0,
+    ),
     "samples": (
         "gradient by all samples of a record",
         "samples, dt = 1.5 * rk.example_record().samples, rk.example_record().dt\n"

@@ -16,6 +16,7 @@ from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given
 from jaxrock.numerics.xla_cpu import marking
+from jaxrock.transforms.differentiation import differentiable
 
 RNG = np.random.default_rng(7)
 NUMBERS = RNG.uniform(0.1, 1.2, 12)
@@ -206,6 +207,16 @@ def recipe_in(jaxpr):
             if hasattr(value, "jaxpr") and (found := recipe_in(value.jaxpr)) is not None:
                 return found
     return None
+
+
+def test_a_function_of_traced_numbers_keeps_its_kind_of_derivatives():
+    """What it holds of the trace around it becomes an argument, and nothing else changes."""
+
+    def of(a):
+        return differentiable(lambda x: a * x**2, derivatives="in a direction")(3.0)
+
+    assert recipe_in(jax.make_jaxpr(of)(2.0).jaxpr).derivatives == "in a direction"
+    assert jax.jvp(of, (2.0,), (1.0,))[1] == 9.0
 
 
 @pytest.mark.parametrize(

@@ -289,6 +289,59 @@ def test_second_derivatives_of_a_speed_between_impacts(engine):
     assert np.abs(found).min() > 1e-3
 
 
+WAVE = 0.35 * np.sin(0.13 * np.arange(90))
+TWICE = {  # what is differentiated twice, and where
+    "speed by 90 samples": (lambda s: rk.outcome(rk.Block(0.2, 2.0), rk.Record(s, 0.012)).max_velocity, WAVE),
+    "rotation by 40 samples": (lambda s: rk.outcome(rk.Block(0.2, 2.0), rk.Record(s, 0.027)).max_rotation, WAVE[:80:2]),
+    "margin by samples and dt": (
+        lambda q: rk.outcome(rk.Block(q[0], q[1]), rk.Record(q[3:], q[2])).margin,
+        np.array([0.2, 2.0, 0.012, *WAVE]),
+    ),
+    "both directions of two sides": (
+        lambda q: (
+            rk.outcome(
+                rk.blocks.AsymmetricBlock(q[0], q[1], q[2]),
+                rk.SinePulse(q[3], q[4]).with_vertical(rk.SinePulse(0.3 * q[3], 0.5 * q[4])),
+            ).margin
+        ),
+        np.array([0.2, 0.25, 2.0, 0.3, 1.4]),
+    ),
+    "diffrax": (
+        lambda q: (
+            rk.outcome(rk.Block(*q[:3]), rk.SinePulse(q[3], q[4]), engine=rk.Diffrax(rtol=1e-11, atol=1e-13)).margin
+        ),
+        np.array([0.2, 2.0, 0.9, 0.23, 1.4]),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", TWICE)
+def test_second_derivatives_in_every_nesting(what):
+    """In one direction: differences of gradients, and gradients those of values."""
+    result, x = TWICE[what]
+    x = jnp.asarray(x)
+    direction = 0.3 * jnp.cos(1.0 + jnp.arange(x.size)) * jnp.maximum(jnp.abs(x), 0.01)
+
+    def along(function):
+        return lambda x: jax.jvp(function, (x,), (direction,))[1]
+
+    def sloped(function):
+        return lambda x: jax.grad(function)(x) @ direction
+
+    nested = {"ff": along(along(result)), "fr": along(sloped(result)), "rf": sloped(along(result))}
+    nested["rr"] = sloped(sloped(result))
+    found = {name: float(jax.jit(function)(x)) for name, function in nested.items()}
+    value, slope, step = jax.jit(result), jax.jit(sloped(result)), 3e-4
+
+    def difference(function):
+        at = [function(x + k * step * direction) for k in (-2, -1, 1, 2)]
+        return float(at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+
+    assert found == pytest.approx(dict.fromkeys(found, difference(slope)), rel=1e-6, abs=1e-9)
+    assert float(slope(x)) == pytest.approx(difference(value), rel=1e-6, abs=1e-9)
+
+
 @pytest.mark.slow  # fast: `test_given_values_in_a_scan` of what was wrong
 @pytest.mark.parametrize("of", ["margin", "history"])
 def test_second_derivatives_by_all_samples(of):

@@ -1,7 +1,7 @@
 """Values as they are given, whose derivatives follow a rule.
 
 As by `jax.custom_jvp`, but one operation, of which JAX keeps the rule wherever it goes: where a `jax.lax.scan` is
-differentiated in reverse and then once more, JAX (0.10 to 0.12 at least) forgets that of `custom_jvp`, and second
+differentiated in reverse and then once more, JAX 0.10 (0.12 does not) forgets that of `custom_jvp`, and second
 derivatives lack what it tells, without a word.
 """
 

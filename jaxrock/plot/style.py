@@ -51,11 +51,13 @@ def broken_curve(axis, abscissa, values, **line):
 
 def cell_edges(places: np.ndarray) -> np.ndarray:
     """Where the cells about places that rise, or fall, begin and end: half way between them; one alone is as wide as a
-    tenth of what it is."""
+    tenth of what it is. Cells of positive places are positive, for logarithmic axes."""
     if places.size == 1:
         return places[0] + np.array([-1, 1]) * (0.05 * abs(places[0]) or 0.5)
     inner = (places[1:] + places[:-1]) / 2
-    return np.concatenate([[2 * places[0] - inner[0]], inner, [2 * places[-1] - inner[-1]]])
+    ends = 2 * places[[0, -1]] - inner[[0, -1]]
+    ends = np.where((places[[0, -1]] > 0) & (ends <= 0), places[[0, -1]] / 2, ends)
+    return np.concatenate([ends[:1], inner, ends[1:]])
 
 
 def shade(axis: "Axes", places: np.ndarray, which: np.ndarray, **patch) -> None:

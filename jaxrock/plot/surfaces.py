@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LOG = logging.getLogger("jaxrock")
-_SCENES = 500_000  # for exact borders: a sine takes 50,000 to 130,000, one and a half cycles 340,000
+_SCENES = 500_000  # that exact borders of a figure may take: more than those of any pulse but the longest
 _SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
 _DURATION = "pulse duration $p\\,t_d$"

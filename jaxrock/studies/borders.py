@@ -90,7 +90,7 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
 
 
 def borders_within(result: OverturningMap, most: int | None, progress: bool | None = False) -> Borders | None:
-    """The same of a map of two axes; None if it takes more scenes than `most`."""
+    """As `overturning_borders`, of a map that is known to have two axes; None if it takes more scenes than `most`."""
     ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress, _Budget(most))
     try:

@@ -78,7 +78,7 @@ def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
     outside = [isinstance(x, jax.core.Tracer) for x in program.consts]
     if not any(outside):
         return recipe, leaves
-    more = [x for x, traced in zip(program.consts, outside) if traced]
+    more = [_strong(x) for x, traced in zip(program.consts, outside) if traced]
     count = len(leaves)
 
     def function(all_leaves):
@@ -89,4 +89,5 @@ def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
 
     like = [*recipe.like, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in more)]
     structure = jax.tree.structure(like)
-    return Recipe(function, structure, like, in_lanes=recipe.in_lanes, refilled=recipe.refilled), [*leaves, *more]
+    ways = {"in_lanes": recipe.in_lanes, "refilled": recipe.refilled, "derivatives": recipe.derivatives}
+    return Recipe(function, structure, like, **ways), [*leaves, *more]
