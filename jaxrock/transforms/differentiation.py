@@ -89,5 +89,8 @@ def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
 
     like = [*recipe.like, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in more)]
     structure = jax.tree.structure(like)
-    ways = {"in_lanes": recipe.in_lanes, "refilled": recipe.refilled, "derivatives": recipe.derivatives}
-    return Recipe(function, structure, like, **ways), [*leaves, *more]
+    kept = Recipe(
+        function, structure, like,
+        in_lanes=recipe.in_lanes, refilled=recipe.refilled, derivatives=recipe.derivatives,
+    )  # fmt: skip
+    return kept, [*leaves, *more]
