@@ -133,6 +133,63 @@ def test_all_samples_of_a_record(model):
         assert summed == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
 
 
+SEEN = (*RESULTS, "margin", "clearance")
+
+
+def whole(kind, x):
+    """What is seen of a block under a part of the record and more, all of which moves."""
+    samples, dt, numbers = x
+    block, motion = rk.Block(*numbers[:3]), rk.Record(samples, dt)
+    start, model = (0.0, 0.0), rk.Linear() if kind == "linear" else rk.Housner()
+    if kind == "beside a pulse":
+        motion = motion + rk.SinePulse(0.06, numbers[3])
+    if kind == "vertical":
+        motion = motion.with_vertical(0.4 * motion)
+    if kind == "in motion":
+        start = 0.05 * numbers[3], 0.01
+    if kind == "asymmetric":
+        block = rk.blocks.AsymmetricBlock(numbers[0], 0.9 * numbers[0], numbers[1], restitution=(numbers[2], 0.95 * numbers[2]))
+    found = rk.outcome(block, motion, model, initial=start)
+    return jnp.stack([getattr(found, name) for name in SEEN])
+
+
+@pytest.mark.parametrize("factor", [1.2, 2.0])
+@pytest.mark.parametrize(
+    "kind", ["linear", *map(slow, ["nonlinear", "beside a pulse", "vertical", "in motion", "asymmetric"])]
+)
+def test_along_the_steps_reverse_is_forward(kind, factor):
+    """By all samples, their step and a block at once: along a change of all, beside forward mode in that direction."""
+    record = rk.example_record()
+    x = factor * record.samples[500:1500], record.dt, jnp.array([0.2, 2.0, 0.9, 0.7])
+    random = np.random.default_rng(1)
+    change = jax.tree.map(lambda value: 0.1 * value * random.normal(size=jnp.shape(value)), x)
+
+    def moved(t):
+        return whole(kind, jax.tree.map(lambda a, b: a + t * b, x, change))
+
+    value, forward = jax.jvp(moved, (0.0,), (1.0,))
+    slopes = jax.jit(jax.jacrev(functools.partial(whole, kind)))(x)
+    each = jax.tree.map(lambda slope, d: jnp.tensordot(slope, d, axes=jnp.ndim(d)), slopes, change)
+    np.testing.assert_allclose(sum(each), forward, rtol=1e-8, atol=1e-13)
+    assert np.any(forward != 0) and (kind, factor) != ("linear", 2.0) or np.all(forward != 0)  # a clearance, too
+
+
+def test_by_more_numbers_than_machine_code_takes_at_once(caplog):
+    """Eleven: a few directions at a time, in machine code; each beside its own."""
+    caplog.set_level("DEBUG", "jaxrock")
+
+    def peak(x):
+        motion = rk.SinePulse(x[3], x[4]) + rk.MavroeidisPapageorgiouPulse(*x[5:9]) + rk.CosinePulse(x[9], x[10])
+        return rk.outcome(rk.Block(*x[:3]), motion, rk.Linear()).max_rotation
+
+    x = jnp.array([0.2, 1.5, 0.9, 0.4, 1.0, 0.1, 1.4, 2.0, 0.3, 0.1, 0.6])
+    all_at_once = jax.jit(jax.vmap(jax.grad(peak)))(x * jnp.array([[1.0], [1.01]]))
+    assert "left to XLA" not in caplog.text
+    for place in (0, 4, 7, 10):
+        alone = jax.jit(jax.grad(lambda t, place=place: peak(x.at[place].set(t))))(x[place])
+        assert float(all_at_once[0, place]) == pytest.approx(float(alone), rel=1e-11) != 0
+
+
 SETTINGS = {"linear": {"model": rk.Linear(), "engine": rk.Series(order=6)}, "nonlinear": {}}
 
 

@@ -1,6 +1,7 @@
 """A scene: block, motion and model reduced to the numbers that the engines need."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -53,6 +54,14 @@ def uplift_threshold(block: Block | AsymmetricBlock, model: AbstractEquation) ->
     return _least_threshold(*_moments(block, model))
 
 
+class Here(NamedTuple):
+    """The one piece of which a step is told, where derivatives by a whole motion become those by a few numbers."""
+
+    number: Int[Array, ""]
+    start: Scalar  # [s]
+    length: Scalar  # [s]
+
+
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
@@ -74,6 +83,7 @@ class Scene(eqx.Module):
     falls_flat: bool = eqx.field(static=True)
     first: Int[Array, ""] | None = None  # piece, where the motion is one of many that follow one another; None: 0
     room: int | None = eqx.field(static=True, default=None)  # for pieces of one of them
+    here: Here | None = None  # None: all are known
 
     @classmethod
     def of(
@@ -180,7 +190,15 @@ class Scene(eqx.Module):
 
     def length(self, piece: Int[Array, ""]) -> Scalar:
         """How long a piece lasts [s]; the quiet after the motion has no end."""
+        if self.here is not None:
+            return self.here.length
         return where(piece < self.pieces, self.motion.length(jnp.minimum(piece, self.pieces - 1)), jnp.inf)
+
+    def start(self, piece: Int[Array, ""]) -> Scalar:
+        """When a piece begins [s]."""
+        if self.here is None:
+            return pick(self.knots, piece)
+        return self.here.start + where(piece > self.here.number, self.here.length, 0.0)
 
     def scale(self, piece: Int[Array, ""]) -> Scalar | float:
         """Time in which the acceleration of a piece changes [s]."""

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Inexact, Int, PyTree
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -94,7 +93,7 @@ class AbstractStepper(eqx.Module):
 
     def time(self, state: State) -> Scalar:
         """Time of a state [s]."""
-        return pick(self.scene.knots, state.piece) + state.local
+        return self.scene.start(state.piece) + state.local
 
     def room(self, state: State) -> Scalar:
         """Time to the next knot or the stop [s]."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
 from jaxrock.numerics.choice import where
+from jaxrock.transforms.differentiation import differentiable
 
 
 class Trajectory(eqx.Module):
@@ -80,30 +81,86 @@ def _in_order(happened, order, values) -> tuple[tuple, Int[Array, ""]]:
     return tuple(found), happened.sum()
 
 
+_STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
+
+
+def states_of(stepper: Any, state: PyTree) -> tuple[PyTree, PyTree]:
+    """Follow a block to the end: the last state, and every state by its number of steps; after the last
+    it may stand again, or zeros."""
+    engine = stepper.engine
+    budget = engine.budget(stepper.scene, history=True)
+    if not engine.in_lanes:
+        return followed(stepper.advance, state, budget, engine.loop)
+    many = differentiable(_stride_of, name="stride", results=_rows, in_lanes=True, derivatives="in a direction")
+    return _in_strides(lambda s: many((stepper, s)), state, budget, engine.loop, _STRIDE)
+
+
+def _stride_of(given) -> tuple[PyTree, PyTree]:
+    stepper, state = given
+    return _stride(stepper.advance, state, stepper.engine.budget(stepper.scene, history=True), _STRIDE)
+
+
+def _rows(given) -> tuple[PyTree, PyTree]:
+    _, state = given
+    return state, jax.tree.map(lambda x: jax.ShapeDtypeStruct((_STRIDE, *x.shape), x.dtype), state)
+
+
+def rows_of(engine: Any, budget: int) -> int:
+    """For how many states there is room."""
+    length = _STRIDE if engine.in_lanes else 1
+    return -(-budget // length) * length + 1
+
+
 def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> tuple[PyTree, PyTree]:
-    """Repeat `advance` until the state is done, at most `budget` times, and keep all states.
+    """Repeat `advance` until the state is done, at most `budget` times, and keep all states, as `states_of`.
 
-    `loop(unfinished, step, carry, budget)` repeats. **Returns:** the last state, and every state by its number of
-    steps.
+    `loop(unfinished, step, carry, budget)` repeats.
     """
+    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, 1)
 
-    def store(nodes, state):
-        return jax.tree.map(lambda buffer, x: buffer.at[state.steps].set(x), nodes, state)
 
-    def unfinished(state):
-        return ~state.done & (state.steps < budget)
+def _in_strides(stride: Callable, state: PyTree, budget: int, loop: Callable, length: int) -> tuple[PyTree, PyTree]:
+    most = -(-budget // length)
 
     def step(carry):
-        before, nodes = carry
-        going, after = unfinished(before), advance(before)
-        state = jax.tree.map(lambda new, old: where(going, new, old), after, before)
-        return state, store(nodes, state)
+        turn, state, nodes = carry
+        state, rows = stride(state)
+        kept = jax.tree.map(
+            lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, turn * length + 1, 0), nodes, rows
+        )
+        return turn + 1, state, kept
 
-    nodes = jax.tree.map(lambda x: jnp.zeros((budget + 1,) + x.shape, x.dtype), state)
-    start = state, store(nodes, state)
+    nodes = jax.tree.map(lambda x: jnp.zeros((most * length + 1, *x.shape), x.dtype).at[0].set(x), state)
     # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
     # wait, and keep their last state once more.
-    return loop(lambda carry: unvmap_any(unfinished(carry[0])), step, start, budget)
+    _, state, nodes = loop(
+        lambda carry: unvmap_any(_unfinished(carry[1], budget)), step, (jnp.int32(0), state, nodes), most
+    )
+    return state, nodes
+
+
+def _unfinished(state: PyTree, budget: int) -> Bool[Array, ""]:
+    return ~state.done & (state.steps < budget)
+
+
+def _stride(advance: Callable, state: PyTree, budget: int, length: int) -> tuple[PyTree, PyTree]:
+    """The state after so many steps, and after each of them; one that is done, or has taken `budget` steps, waits."""
+
+    def step(state):
+        going, after = _unfinished(state, budget), advance(state)
+        return jax.tree.map(lambda new, old: where(going, new, old), after, state)
+
+    def one_more(carry):
+        left, state, kept = carry
+        state = step(state)
+        # The rows move up: at places of its own each would be a choice among all.
+        return left - 1, state, jax.tree.map(lambda rows, x: jnp.concatenate([rows[1:], x[None]]), kept, state)
+
+    if length == 1:
+        state = step(state)
+        return state, jax.tree.map(lambda x: x[None], state)
+    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *x.shape)), state)
+    return jax.lax.while_loop(lambda carry: carry[0] > 0, one_more, (jnp.int32(length), state, kept))[1:]
 
 
 def times_of(time: Callable, nodes: PyTree, last: PyTree) -> Inexact[Array, " nodes"]:

@@ -18,7 +18,7 @@ from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
-from jaxrock.engines.trajectory import Trajectory, followed, times_of
+from jaxrock.engines.trajectory import Trajectory, rows_of, states_of, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
@@ -281,8 +281,8 @@ def _like(given) -> tuple[State, State, Outcome]:
     def made(block, motion, model, initial, stop):
         scene = Scene.of(block, motion, model)
         state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-        budget = engine.budget(scene, history=True)
-        return state, jax.tree.map(lambda x: jnp.zeros((budget + 1, *x.shape), x.dtype), state)
+        rows = rows_of(engine, engine.budget(scene, history=True))
+        return state, jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), state)
 
     return *jax.eval_shape(made, *given[:-1]), outcome_like(given)
 
@@ -299,24 +299,10 @@ def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
     """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
     scene = Scene.of(block, motion, model)
     stop = stop.astype(scene.p.dtype)
-    stepper, budget = engine.stepper(scene, stop, history=True, taped=taped), engine.budget(scene, history=True)
+    stepper = engine.stepper(scene, stop, history=True, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    if taped:
-        state, nodes = stepper.on_tape(state, budget)
-        nodes = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]])[: budget + 1], nodes, state)
-    elif not engine.in_lanes:
-        state, nodes = followed(lambda s: stepper.advance(s), state, budget, engine.loop)
-    else:
-        step = differentiable(
-            _step, name="step", results=lambda given: given[1], in_lanes=True, derivatives="in a direction"
-        )
-        state, nodes = followed(lambda s: step((stepper, s)), state, budget, engine.loop)
+    state, nodes = stepper.on_tape(state) if taped else states_of(stepper, state)
     return state, nodes, _concluded(stepper, state, taped)
-
-
-def _step(given) -> State:
-    stepper, state = given
-    return stepper.advance(state)
 
 
 def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:

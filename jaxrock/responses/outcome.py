@@ -214,7 +214,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
     if taped:
         # A tape holds all steps, as a history does.
-        state, _ = stepper.on_tape(state, engine.budget(scene, history=True))
+        state, _ = stepper.on_tape(state)
     else:
         state = _to_the_end(stepper, state)
     return conclude(stepper, state)

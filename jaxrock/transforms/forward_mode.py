@@ -1,5 +1,5 @@
-"""Derivatives of a recipe, as recipes: value and Jacobian by all that moves, value and change in one direction, and the
-transpose of that change."""
+"""Derivatives of a recipe, as recipes: value and Jacobian by all that moves, value and change in one direction or in a
+few, and the transpose of that change."""
 
 import functools
 import math
@@ -22,6 +22,11 @@ def value_and_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 def value_and_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     """The recipe of (value, change) in one direction, whose leaves follow the recipe's; for integers None."""
     return recipe.derivative(moves, _with_change)
+
+
+def value_and_changes(recipe: Recipe, moves: tuple[bool, ...], count: int) -> Recipe:
+    """The recipe of (value, changes) in so many directions, which have a leading axis."""
+    return recipe.derivative(moves, _with_changes, count)
 
 
 def pulled_back(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
@@ -61,6 +66,22 @@ def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
     results = _with_each(recipe.results, lambda out: jax.ShapeDtypeStruct(out.shape, out.dtype))
     return _made(recipe, moves, both, like, "change", results, directions=sum(moves), origin=(recipe, moves))
+
+
+def _with_changes(recipe: Recipe, moves: tuple[bool, ...], count: int) -> Recipe:
+    def many(x):
+        return jax.ShapeDtypeStruct((count, *x.shape), x.dtype)
+
+    def both(leaves):
+        own, directions = leaves[: len(moves)], leaves[len(moves) :]
+        pushed = functools.partial(_pushed, recipe, moves, own)
+        value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions)
+        changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
+
+    like = (*recipe.like, *map(many, _moving(recipe.like, moves)))
+    results = _with_each(recipe.results, many)
+    return _made(recipe, moves, both, like, f"{count} changes", results, directions=sum(moves))
 
 
 def _transposed(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
@@ -125,6 +146,18 @@ def directions_of(moving: Sequence) -> list:
     whole = jnp.eye(sum(sizes), dtype=jnp.result_type(*(leaf.dtype for leaf in moving)))
     parts = jnp.split(whole, np.cumsum(sizes)[:-1], axis=1)
     return [part.reshape(-1, *leaf.shape).astype(leaf.dtype) for part, leaf in zip(parts, moving)]
+
+
+def in_rows(directions: Sequence, most: int) -> list:
+    """Directions in rows of at most so many, the last filled up with zeros."""
+    count = len(directions[0])
+    rows = -(-count // most)
+    width = -(-count // rows)
+
+    def cut(x):
+        return jnp.pad(x, [(0, rows * width - count), *[(0, 0)] * (x.ndim - 1)]).reshape(rows, width, *x.shape[1:])
+
+    return [cut(x) for x in directions]
 
 
 def columns_of(out: Any, column: Any, moving: Sequence) -> list | None:

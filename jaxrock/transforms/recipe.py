@@ -60,9 +60,10 @@ class Recipe:
     - `results`: what it returns, a tree of `jax.ShapeDtypeStruct`; None: tracing tells.
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
     - `order`: of the derivatives that it computes.
-    - `derivatives`: how forward mode makes more of them: value and Jacobian at once; the Jacobian by directions, which
-      are scenes of their own, as of all that computes derivatives already; value and change in one direction alone,
-      which does not transpose; or the change alone, which does, since reverse mode goes through the function's code.
+    - `derivatives`: how forward mode makes more of them: value and Jacobian at once (by more than eight numbers a few
+      directions at a time); the Jacobian by directions, which are scenes of their own, as of all that computes
+      derivatives already; value and change in one direction alone, which does not transpose; or the change alone, which
+      does, since reverse mode goes through the function's code.
     - `directions`: how many of the last leaves are the direction of a change that it computes; that of what, by which
       leaves, is told by `origin`.
     """
@@ -146,11 +147,12 @@ class Recipe:
             self.on_tape, self.structure, self.like, facts=facts, results=self.results, derivatives="on a tape"
         )
 
-    def derivative(self, moves: tuple[bool, ...], make: Callable) -> "Recipe":
-        """The recipe of value and derivatives by some leaves, which `make(recipe, moves)` makes once."""
-        if (make, moves) not in self._derivatives:
-            self._derivatives[make, moves] = make(self, moves)
-        return self._derivatives[make, moves]
+    def derivative(self, moves: tuple[bool, ...], make: Callable, *settings: int) -> "Recipe":
+        """The recipe of value and derivatives by some leaves, which `make(recipe, moves, *settings)` makes once."""
+        key = make, moves, settings
+        if key not in self._derivatives:
+            self._derivatives[key] = make(self, moves, *settings)
+        return self._derivatives[key]
 
     @functools.cached_property
     def name(self) -> str:

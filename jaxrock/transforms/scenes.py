@@ -7,6 +7,7 @@
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,19 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like
-from jaxrock.transforms.forward_mode import columns_of, directions_of, pulled_back, value_and_change, value_and_jacobian
+from jaxrock.transforms.forward_mode import (
+    columns_of,
+    directions_of,
+    in_rows,
+    pulled_back,
+    value_and_change,
+    value_and_changes,
+    value_and_jacobian,
+)
 from jaxrock.transforms.lowering import lowered
 from jaxrock.transforms.recipe import Recipe
 
+AT_ONCE = 8  # directions of which machine code keeps the changes in registers
 _MANY = 64  # numbers to differentiate by, from which on a Jacobian is dearer than a tape
 
 scenes_p = Primitive("scenes")
@@ -114,9 +124,12 @@ def _pushed(leaves, changes, *, recipe, own, size):
         return value, _pushed_in_a_direction(leaves, moves, moving, taped, own, size)[1]
     if recipe.derivatives == "in a direction":
         return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
-    by_directions = recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes)
-    derive = _jacobian_by_directions if by_directions else _jacobian_at_once
-    value, jacobian = derive(leaves, moves, recipe, own, size)
+    if recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes):
+        value, jacobian = _jacobian_by_directions(leaves, moves, recipe, own, size)
+    elif recipe.in_lanes and numbers > AT_ONCE:
+        value, jacobian = _jacobian_in_rows(leaves, moves, recipe, own, size)
+    else:
+        value, jacobian = _jacobian_at_once(leaves, moves, recipe, own, size)
 
     def contracted(columns, *moving):
         return sum(jnp.tensordot(column, d, axes=d.ndim) for column, d in zip(columns, moving))
@@ -165,6 +178,30 @@ def _jacobian_by_directions(leaves, moves, recipe, own, size):
 
     value, changes = jax.vmap(one, out_axes=(None, 0))(*directions_of(moving))
     return value, [None if d is None else columns_of(x, d, moving) for x, d in zip(value, changes, strict=True)]
+
+
+def _jacobian_in_rows(leaves, moves, recipe, own, size):
+    """The same, a few directions at a time: machine code for all at once would be without end, or not at all."""
+    moving = [x for x, move in zip(recipe.like, moves) if move]
+    rows = in_rows(directions_of(moving), AT_ONCE)
+    both = value_and_changes(recipe, moves, rows[0].shape[1])
+
+    def one(*row):
+        found = scenes_p.bind(*leaves, *row, recipe=both, own=(*own, *[False] * len(moving)), size=size)
+        value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
+        return jax.tree.leaves(value), changes
+
+    value, changes = jax.vmap(one, out_axes=(None, 0))(*rows)
+    count = sum(math.prod(x.shape) for x in moving)
+
+    def column(x, d):
+        if d is None:
+            return None
+        if size is not None:  # directions before scenes
+            d = jnp.moveaxis(d, 1, 2)
+        return columns_of(x, d.reshape(-1, *d.shape[2:])[:count], moving)
+
+    return value, [column(*each) for each in zip(value, changes, strict=True)]
 
 
 ad.primitive_jvps[scenes_p] = _pushed

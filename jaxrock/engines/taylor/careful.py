@@ -27,10 +27,10 @@ from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
-from jaxrock.engines.taylor.checkpointing import on_tape
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
 from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
 from jaxrock.engines.taylor.policy import POLICY, exact
+from jaxrock.engines.taylor.tape import on_tape
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
@@ -49,7 +49,7 @@ from jaxrock.numerics.polynomial import (
 )
 from jaxrock.numerics.xla_cpu import keep, unseen_one
 from jaxrock.status import Status
-from jaxrock.transforms.branches import either, when
+from jaxrock.transforms.branches import when
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[Array, ""]
@@ -144,9 +144,9 @@ class TaylorStepper(AbstractStepper):
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
         return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
 
-    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
-        """Follow a block so that reverse mode goes through: the last state, and the states before every step."""
-        return on_tape(self.step, self.shaking, state, budget)
+    def on_tape(self, state: State) -> tuple[State, State]:
+        """Follow a block so that reverse mode goes through: as `states_of`."""
+        return on_tape(self, state)
 
     def finish(self, state: State) -> State:
         """The free stage by energy."""
@@ -265,9 +265,7 @@ class TaylorStepper(AbstractStepper):
         def happen(passed, needed, inside):
             return self._happen(state, passed, start, step, (length, opening, velocity), cut, inside)
 
-        stepped = (either if self.taped else when)(
-            step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed
-        )
+        stepped = when(step.eventful & (hits.impact | hits.turning | hits.saddle), happen, passed)
         down = stepped.opening >= jnp.pi / 2
         overturned = state.overturned | lost | down if self.scene.falls_flat else state.overturned | lost
         # A history goes on to the ground; for an outcome the verdict is enough.

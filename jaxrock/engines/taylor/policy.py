@@ -16,7 +16,6 @@ class Policy(NamedTuple):
     - `fast_steps`: after which a scene is left to the careful pass, besides three for each piece.
     - `shorter`: shares of a step that are tried for a certificate, after the whole.
     - `round`: steps after which scenes under a record make up new chunks where XLA follows them.
-    - `between_checkpoints`: steps of a history that are computed again on the way back.
     """
 
     pulse_order: int = 16
@@ -28,7 +27,6 @@ class Policy(NamedTuple):
     fast_steps: int = 1000
     shorter: tuple[float, ...] = (0.4, 0.1)
     round: int = 256
-    between_checkpoints: int = 64
 
     def is_record(self, pieces: int) -> bool:
         """Whether a motion of so many pieces counts as a record."""

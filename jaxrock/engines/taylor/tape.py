@@ -1,0 +1,214 @@
+"""A run of steps on tape: derivatives by many numbers at once, such as all samples of a record, in reverse mode.
+
+A run without derivatives tells the states before all steps. Each step is then a scene of its own: where a block is
+after it, by where it was, by what the step is told of the ground, and by the numbers of the block. These slopes are
+computed for many steps at once; changes go from step to step by products with them, and such a chain transposes.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact, Int
+
+from jaxrock.engines.scene import Here
+from jaxrock.engines.state import State
+from jaxrock.engines.trajectory import states_of
+from jaxrock.motions.shaking import Shaking
+from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.given import given, is_zero
+from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.forward_mode import columns_of, directions_of, in_rows
+from jaxrock.transforms.scenes import AT_ONCE
+
+Scalar = Inexact[Array, ""]
+Stepper = Any  # a `TaylorStepper`, whose module imports this one
+_TOGETHER = 256  # steps whose slopes are computed at once
+_PATH = ("local", "opening", "velocity")  # what a step starts from
+# What a state has seen so far is kept by a step, or found anew from the path; but for two, which become the first of
+# these as it was.
+_FIRST = ("peak", "clearance")
+_LATER = ("second", "peak_clearance")
+_OTHERS = ("peak_time", "fastest", "impact_time", "impact_velocity", "closeness", "closeness_beyond")
+_SEEN = (*_FIRST, *_LATER, *_OTHERS)
+
+
+class _Ground(NamedTuple):
+    """What a step is told of the motion: its series about a time `local` after the start of a piece."""
+
+    shaking: Shaking
+    unit: Scalar
+    start: Scalar
+    length: Scalar
+
+    @classmethod
+    def of(cls, stepper: Stepper, piece: Int[Array, ""], local: Scalar) -> "_Ground":
+        """At this time."""
+        shaking, unit = stepper.shaking(piece, local)
+        return cls(shaking, unit, stepper.scene.start(piece), stepper.scene.length(piece))
+
+
+class _Numbers(NamedTuple):
+    """What the steps of a scene depend on, besides the motion."""
+
+    moments: Any
+    far: Any
+    p: Scalar
+    alpha: Scalar
+    reset: Any
+    far_reset: Any
+    stop: Scalar | None
+
+    @classmethod
+    def of(cls, stepper: Stepper) -> "_Numbers":
+        """Those of a scene."""
+        scene = stepper.scene
+        return cls(scene.moments, scene.far, scene.p, scene.alpha, scene.reset, scene.far_reset, stepper.stop)
+
+    def put_into(self, stepper: Stepper, here: Here) -> Stepper:
+        """The stepper with these numbers, of which a motion has one piece."""
+        numbers = self._asdict()
+        stop = numbers.pop("stop")
+        return replace(stepper, scene=replace(stepper.scene, **numbers, here=here), stop=stop)
+
+
+class _Slopes(NamedTuple):
+    """Derivatives of path and what is seen after a step.
+
+    - `columns`: of each of these, in directions of the path and of all numbers that move: a list.
+    - `kept`: of what is seen by itself; `passed`: of the later ones by the first.
+    """
+
+    columns: list
+    kept: list
+    passed: list
+
+
+def on_tape(stepper: Stepper, state: State) -> tuple[State, State]:
+    """Follow a block: the last state, and those before every step, as `states_of` tells them; with derivatives of which
+    reverse mode takes the product with very many numbers."""
+    still, start = fixed((replace(stepper, taped=False), state))
+    last, nodes = fixed(states_of(still, start))
+    ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
+    by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps
+    ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
+    return _with_reals(last, ends), _with_reals(nodes, starts)
+
+
+def _reals(states: State) -> list:
+    return [getattr(states, name) for name in (*_PATH, *_SEEN)]
+
+
+def _with_reals(states: State, reals: list) -> State:
+    return eqx.tree_at(_reals, states, reals)  # of many states, too, which have an axis in front
+
+
+def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
+    """Changes of the last state, and of those before every step: along the steps, by products with their slopes."""
+    (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
+    first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
+    moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, d_told)
+    rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, d_told)
+    directions = jax.tree.map(lambda d: None if is_zero(d) else d, d_told, is_leaf=is_zero)
+    # Of what a step is told: the numbers that all share, and what is told of the ground there.
+    shared, own = zip(moving, rest, directions)
+
+    @jax.checkpoint
+    def stretch(change, rows):
+        number, node, own = rows
+
+        def go(change):
+            products = jax.vmap(lambda node, own: _products(still, node, zip(shared, own)))(node, own)
+            return jax.lax.scan(_one, change, (number < steps, *products))
+
+        def wait(change):
+            return change, jnp.broadcast_to(change, (_TOGETHER, *change.shape))
+
+        return jax.lax.cond(number[0] < steps, go, wait, change)
+
+    rows = jnp.arange(nodes.steps.size), _with_reals(nodes, reals), own
+    last, found = jax.lax.scan(stretch, first, jax.tree.map(_in_stretches, rows))
+    return list(last), list(found.reshape(-1, first.size)[: nodes.steps.size].T)
+
+
+def _in_stretches(x: Array) -> Array:
+    """Rows of many steps, the last again and again where there is room for more."""
+    stretches = -(-x.shape[0] // _TOGETHER)
+    more = jnp.broadcast_to(x[-1:], (stretches * _TOGETHER - x.shape[0], *x.shape[1:]))
+    return jnp.concatenate([x, more]).reshape(stretches, _TOGETHER, *x.shape[1:])
+
+
+def _one(change: Array, step: tuple) -> tuple[Array, Array]:
+    """The change of a state after a step, and that before it."""
+    going, by_path, kept, passed, own = step
+    path, seen = change[: len(_PATH)], change[len(_PATH) :]
+    none = jnp.zeros_like(change)
+    later = jnp.concatenate([none[: len(_FIRST)], passed * seen[: len(_FIRST)], none[: len(_OTHERS)]])
+    after = own + (by_path * path).sum(axis=1) + jnp.concatenate([none[: len(_PATH)], kept * seen + later])
+    return jnp.where(going, after, change), change
+
+
+def _products(still: Stepper, node: State, told: Iterable) -> tuple:
+    """Of a step: slopes by the path, of what is seen by itself, and the change by all else that moves."""
+    moving, rest, changes = told
+    leaves = [*_path_of(node), *jax.tree.leaves(moving)]
+    slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
+    rows = in_rows(directions_of(leaves), AT_ONCE)
+    found, kept, passed = jax.vmap(lambda *row: slopes((still, rest, moving, node, row)))(*rows)
+    count = sum(x.size for x in leaves)
+    columns = [columns_of(node.local, each.reshape(-1)[:count], leaves) or [] for each in found]
+    by_path = jnp.array([each[: len(_PATH)] for each in columns])
+
+    def change(each):
+        pairs = zip(each[len(_PATH) :], jax.tree.leaves(changes), strict=True)
+        return sum((jnp.tensordot(column, d, axes=d.ndim) for column, d in pairs), start=jnp.zeros_like(node.local))
+
+    return (
+        by_path,
+        jnp.array([x[0] for x in kept]),
+        jnp.array([x[0] for x in passed]),
+        jnp.array([*map(change, columns)]),
+    )
+
+
+def _slopes(given_: tuple) -> _Slopes:
+    """Derivatives of a step in directions of its path and of all that moves."""
+    stepper, rest, moving, node, directions = given_
+    local = fixed(node.local)
+    leaves, structure = jax.tree.flatten(moving)
+    path, seen = _path_of(node), [getattr(node, name) for name in _SEEN]
+
+    def step(path, seen, moving):
+        numbers, ground = eqx.combine(moving, rest)
+        told = numbers.put_into(stepper, Here(node.piece, ground.start, ground.length))
+        before = replace(node, **dict(zip(_PATH, path)), **dict(zip(_SEEN, seen)))
+        # The same numbers; but the start of the step moves with what came before.
+        after = told.step(before, ground.shaking.shifted((before.local - local) / ground.unit), ground.unit)
+        return [getattr(after, name) for name in (*_PATH, *_SEEN)]
+
+    def by_path(seen):
+        def pushed(*direction):
+            def moved(*x):
+                return step(x[: len(path)], seen, structure.unflatten(x[len(path) :]))
+
+            return jax.jvp(moved, (*path, *leaves), direction)
+
+        return jax.vmap(pushed, out_axes=(None, 0))(*directions)
+
+    def by_seen(*direction):
+        (_, columns), (changes, _) = jax.jvp(by_path, (seen,), (list(direction),))
+        return columns, changes[len(path) :]
+
+    # Two directions tell all slopes of what is seen: the first ones with the others, and the later ones.
+    later = jnp.array([name in _LATER for name in _SEEN])
+    both = jnp.stack([~later, later]).astype(node.local.dtype)
+    columns, seen_by = jax.vmap(by_seen, out_axes=(None, 0))(*both.T)
+    kept = [each[int(name in _LATER)] for name, each in zip(_SEEN, seen_by)]
+    return _Slopes(columns, kept, [each[0] for name, each in zip(_SEEN, seen_by) if name in _LATER])
+
+
+def _path_of(node: State) -> list:
+    return [getattr(node, name) for name in _PATH]
