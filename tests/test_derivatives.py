@@ -148,7 +148,7 @@ def whole(kind, x):
     if kind == "in motion":
         start = 0.05 * numbers[3], 0.01
     if kind == "asymmetric":
-        block = rk.blocks.AsymmetricBlock(numbers[0], 0.9 * numbers[0], numbers[1], restitution=(numbers[2], 0.95 * numbers[2]))
+        block = rk.blocks.AsymmetricBlock(numbers[0], 0.9 * numbers[0], numbers[1], restitution=(numbers[2], 0.9))
     found = rk.outcome(block, motion, model, initial=start)
     return jnp.stack([getattr(found, name) for name in SEEN])
 
