@@ -222,6 +222,21 @@ def test_a_block_at_rest_does_not_lean():
     np.testing.assert_allclose([peak(1e-7), peak(-1e-7)], peak(0.0), rtol=1e-9)
 
 
+@pytest.mark.parametrize("engine", [rk.Series(order=8), pytest.param(rk.Diffrax(), marks=pytest.mark.slow)])
+def test_a_block_that_is_lifted_at_once_leans_to_its_side(engine):
+    """Where a pulse begins by a jump a start on the side to which the block goes, here -1, is one that it keeps."""
+
+    @jax.jit
+    def peak(start):
+        block, pulse = rk.Block(0.2, 2.0, 0.9), rk.RectangularPulse(0.3, 0.4)
+        return rk.outcome(block, pulse, initial=(start[0], start[1]), engine=engine).max_rotation
+
+    start, step = jnp.zeros(2), -1e-6
+    aside = [(peak(step * row) - peak(start)) / step for row in np.eye(2)]
+    assert max(aside) < -0.1
+    np.testing.assert_allclose(jax.grad(peak)(start), aside, rtol=1e-4)
+
+
 def test_derivatives_at_the_end_of_a_history_and_of_its_events():
     """By time the velocity, also where the history ends in motion; events outside of jit as within."""
     block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
