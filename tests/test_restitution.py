@@ -243,6 +243,25 @@ def test_a_law_that_gains_energy_has_no_result(engine):
     assert found.status == rk.Status.not_finite
 
 
+class Fixed(rk.restitution.AbstractRestitution):
+    """A number, whatever it is."""
+
+    value: jax.Array
+
+    def ratio(self, corners, speed):
+        return self.value
+
+    @property
+    def depends_on_speed(self):
+        return False
+
+
+def test_a_number_that_is_no_ratio_has_no_result():
+    for value, status in {1.1: "not_finite", -0.1: "not_finite", 0.9: "successful"}.items():
+        found = rk.outcome(rk.Block(0.2, 2.0, Fixed(jnp.asarray(value))), PULSE, rk.Linear(), engine=SHORT)
+        assert found.status == getattr(rk.Status, status)
+
+
 def test_the_laws_of_momentum():
     """Housner's is that of a rectangle, on one side as on two."""
     alpha = np.linspace(0.05, 0.9, 9)

@@ -75,8 +75,8 @@ class AbstractRestitution(Owner):
         - `corners`: the `Corners` of the impact.
         - `speed`: |angular velocity| just before it [rad/s], 0 or more.
 
-        **Returns:** the ratio, in [0, 1] if it depends on the speed (a response with any other has the status
-        `not_finite`), smooth in the speed.
+        **Returns:** the ratio, smooth in the speed, in [0, 1]: a response with any other has the status `not_finite`.
+        Of an asymmetric block one that does not depend on the speed may exceed 1.
         """
 
     @property
@@ -300,11 +300,13 @@ class Reset(eqx.Module):
     p: Real | None  # unit of the speeds [rad/s]
 
     @classmethod
-    def of(cls, law: AbstractRestitution, corners: Corners, p: Real) -> "Reset":
-        """Bind a law to a corner."""
+    def of(cls, law: AbstractRestitution, corners: Corners, p: Real, most: float = np.inf) -> "Reset":
+        """Bind a law to a corner, whose ratio is `most` at most if it does not depend on the speed."""
         if law.depends_on_speed:
             return cls(law, corners, p)
         ratio = law.ratio(corners, jnp.zeros_like(p))
+        if type(law) not in _ALIKE:  # whose parameters have been checked
+            ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
         # As it is: of two corners of unequal height the ratio at one may exceed 1.
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 

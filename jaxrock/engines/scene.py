@@ -104,7 +104,8 @@ class Scene(eqx.Module):
             far = None if corners[0] is corners[1] else moments
         else:
             p, alpha, corners = block.p1, jnp.minimum(block.alpha1, block.alpha2), block.corners
-        reset, far_reset = (Reset.of(block.law, each, p) for each in corners)
+        most = 1.0 if isinstance(block, Block) else jnp.inf
+        reset, far_reset = (Reset.of(block.law, each, p, most) for each in corners)
         return cls(
             moments=moments,
             far=far,

@@ -85,7 +85,7 @@ def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
     """The impacts that end the stays on side 1 and on side 2, or one for both."""
     one, other = on_sides(block.law, block.corners)
     corners = (one,) if one is other else (one, other)
-    return tuple(Reset.of(block.law, each, jnp.ones_like(block.alpha)) for each in corners)
+    return tuple(Reset.of(block.law, each, jnp.ones_like(block.alpha), 1.0) for each in corners)
 
 
 def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:
