@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, check_shapes, checked, is_traced, not_negative, share, size, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -65,6 +65,9 @@ class AbstractRestitution(Owner):
     """A law of restitution. Its fields are parameters, such as derivatives are taken by."""
 
     __repr__ = described
+
+    def __check_init__(self):
+        check_declared(self)
 
     @abc.abstractmethod
     def ratio(self, corners: Corners, speed: Real) -> Real:
