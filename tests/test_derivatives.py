@@ -252,6 +252,22 @@ def test_derivatives_at_the_end_of_a_history_and_of_its_events():
     assert jax.grad(second_impact)(0.2) == pytest.approx(float(jax.jit(jax.grad(second_impact))(0.2)), rel=1e-12)
 
 
+def test_a_history_of_the_diffrax_engine_moves_at_its_end():
+    """Rotation and velocity: their derivatives by time there are those just before."""
+    response = rk.simulate(
+        rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6), duration=3.0, samples=2, engine=rk.Diffrax()
+    )
+    slopes = jax.jacrev(lambda t: jnp.stack(response(t)))
+    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-6)
+
+
+def test_the_history_of_a_column_moves_at_its_end():
+    block = rk.blocks.FlexibleBlock(1.0, 5.0, 3e9, 2000.0, 0.02, 3, restitution=0.9)
+    response = rk.simulate(block, rk.SinePulse(0.4, 0.9), duration=3.0, samples=2)
+    slopes = jax.jacfwd(lambda t: jnp.stack(response(t)))
+    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-5)
+
+
 def test_slopes_of_forces_in_both_modes():
     """By slenderness, amplitude and duration: steps that were not taken are no numbers, and have no part in it."""
 
