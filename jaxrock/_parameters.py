@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxrock._checks import RANGES, Range, check_shapes, finite, one_of
+from jaxrock._checks import RANGES, Range, check_shapes, finite, is_marking, is_traced, one_of
 
 
 class Parameter(NamedTuple):
@@ -64,7 +64,8 @@ def parameter(
     - `is_whole`: whether it is a count or a place among others, which stays a whole number. All other numbers of a
       block or a motion are real, of whatever kind they are given.
 
-    **Returns:** a field for an Equinox module.
+    **Returns:** a field for an Equinox module. A value outside of its range raises ValueError where an object is made;
+    of traced ones nothing is asked.
     """
     if isinstance(range, str):
         range = RANGES[one_of("range", range, tuple(RANGES))]
@@ -90,6 +91,21 @@ def set_parameters(owner: eqx.Module, **values: Any) -> None:
             raise ValueError(f"Argument `{called}` must hold at least one number, but has shape {array.shape}.")
         setattr(owner, name, array)
     check_shapes(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
+
+
+def check_declared(owner: eqx.Module) -> None:
+    """Raise ValueError for a value outside of what a class of the user's own declares: for `__check_init__`.
+
+    Classes of the package check what they are given themselves. What is traced is not looked at, nor what stands for a
+    value (None), and nothing is raised where numbers are to be marked.
+    """
+    kind = type(owner)
+    if kind.__module__.partition(".")[0] == __name__.partition(".")[0] or is_marking():
+        return
+    for name, known in declared(kind).items():
+        value = getattr(owner, name)
+        if value is not None and not is_traced(value):
+            known.range(known.argument or name, value)
 
 
 if TYPE_CHECKING:

@@ -41,7 +41,8 @@ class Status(Enumeration):
     successful = item("The response was computed.")
     step_budget_exhausted = item(
         "The step budget was used up before the motion ended, usually by impacts that do not die out "
-        "(restitution at or near 1). Raise `max_steps` of the engine."
+        "(restitution at or near 1). Raise that of the engine (`max_steps`, or `max_solves` of Diffrax); where its "
+        "solver is of low order, raise `atol`."
     )
     undecided = item(
         "Too close to call: a near balance, a grazing impact or long chaotic rocking makes the response so sensitive "

@@ -43,6 +43,16 @@ def test_equal_settings_are_one_engine():
 def test_single_budget():
     found = rk.outcome(BLOCK, PULSE, rk.Linear(), engine=rk.Diffrax(max_solves=3))
     assert found.status == rk.Status.step_budget_exhausted
+    assert "`max_solves`" in rk.Status[found.status]
+
+
+def test_a_solver_of_low_order_needs_an_absolute_tolerance():
+    """Its status says so; with one a hundredth of the relative it ends, and near the truth."""
+    usual, eased = (rk.Diffrax(diffrax.Heun(), rtol=1e-6, atol=atol) for atol in (None, 1e-8))
+    assert "raise `atol`" in rk.Status[rk.outcome(BLOCK, PULSE, engine=usual).status]
+    found = rk.outcome(BLOCK, PULSE, engine=eased)
+    assert found.status == rk.Status.successful
+    assert found.max_rotation == pytest.approx(float(rk.outcome(BLOCK, PULSE).max_rotation), rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -194,6 +194,21 @@ def test_vertical_motion_and_contact_forces():
     assert found.keeps_contact and found.sticks(0.3) and not found.sticks(0.2)
 
 
+def test_forces_are_those_of_the_response_and_its_block():
+    block = rk.Block(0.2, 2.0)
+    response = rk.simulate(block, rk.SinePulse(0.4, 0.6), engine=rk.Series(order=8), samples=2)
+    for other in (rk.Block(0.3, 2.0), rk.Block(0.2, 3.0), rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0)):
+        with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose"):
+            rk.responses.contact_forces(response, other)
+    assert rk.responses.contact_forces(response, block).keeps_contact
+    for law in (rk.restitution.PerSide(0.9, 0.8), None):  # one that tells sides apart, and two sides of one slenderness
+        own = rk.Block(0.2, 2.0, law) if law else rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0)
+        response = rk.simulate(own, rk.SinePulse(0.4, 0.6), engine=rk.Series(order=8), samples=2)
+        assert rk.responses.contact_forces(response, own).keeps_contact
+        with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose"):
+            rk.responses.contact_forces(response, rk.Block(0.2, 2.0))
+
+
 @needs_references
 def test_housner_friction():
     """A rectangle needs 3 tan(alpha)/(4 + tan^2(alpha)) at an impact; one that never moves, the motion's peak."""

@@ -481,6 +481,15 @@ def test_pushover_and_restitution():
     assert bool(blow(velocity * (1 + 1e-12))) and not bool(blow(velocity * (1 - 1e-12)))
 
 
+def test_pushover_has_ranges():
+    for ask in (pushover.spring_force, pushover.overturning_moment_ratio):
+        for rotation in (1.6, -0.1):
+            with pytest.raises(ValueError, match=r"Argument `rotation` must be in \[0, pi/2\), but is"):
+                ask(rotation, 0.2)
+    with pytest.raises(ValueError, match="Argument `impacts` must be 0 or more"):
+        pushover.amplitude_after(-5, 0.9, 0.5)
+
+
 def test_free_rocking():
     """Housner's period and decay against a history."""
     block, quiet = rk.Block(ALPHA, 2.0, 0.9), rk.Record(np.zeros(2), 1.0)

@@ -279,6 +279,21 @@ def test_a_block_at_rest_does_not_lean():
     np.testing.assert_allclose([peak(1e-7), peak(-1e-7)], peak(0.0), rtol=1e-9)
 
 
+@pytest.mark.parametrize("engine", [rk.Series(order=8), pytest.param(rk.Diffrax(), marks=pytest.mark.slow)])
+def test_a_block_that_is_lifted_at_once_leans_to_its_side(engine):
+    """Where a pulse begins by a jump a start on the side to which the block goes, here -1, is one that it keeps."""
+
+    @jax.jit
+    def peak(start):
+        block, pulse = rk.Block(0.2, 2.0, 0.9), rk.RectangularPulse(0.3, 0.4)
+        return rk.outcome(block, pulse, initial=(start[0], start[1]), engine=engine).max_rotation
+
+    start, step = jnp.zeros(2), -1e-6
+    aside = [(peak(step * row) - peak(start)) / step for row in np.eye(2)]
+    assert max(aside) < -0.1
+    np.testing.assert_allclose(jax.grad(peak)(start), aside, rtol=1e-4)
+
+
 def test_derivatives_at_the_end_of_a_history_and_of_its_events():
     """By time the velocity, also where the history ends in motion; events outside of jit as within."""
     block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
@@ -292,6 +307,22 @@ def test_derivatives_at_the_end_of_a_history_and_of_its_events():
         return rk.simulate(rk.Block(alpha, 2.0, 0.9), pulse, duration=3.0, samples=2).impact_times[1]
 
     assert jax.grad(second_impact)(0.2) == pytest.approx(float(jax.jit(jax.grad(second_impact))(0.2)), rel=1e-12)
+
+
+def test_a_history_of_the_diffrax_engine_moves_at_its_end():
+    """Rotation and velocity: their derivatives by time there are those just before."""
+    response = rk.simulate(
+        rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6), duration=3.0, samples=2, engine=rk.Diffrax()
+    )
+    slopes = jax.jacrev(lambda t: jnp.stack(response(t)))
+    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-6)
+
+
+def test_the_history_of_a_column_moves_at_its_end():
+    block = rk.blocks.FlexibleBlock(1.0, 5.0, 3e9, 2000.0, 0.02, 3, restitution=0.9)
+    response = rk.simulate(block, rk.SinePulse(0.4, 0.9), duration=3.0, samples=2)
+    slopes = jax.jacfwd(lambda t: jnp.stack(response(t)))
+    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-5)
 
 
 def test_slopes_of_forces_in_both_modes():

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
-from jaxrock.blocks.restitution import Corners, Reset
+from jaxrock.blocks.restitution import Corners, Reset, on_sides
 from jaxrock.studies.parameters import named, rebuilt
 
 SOFT = rk.restitution.SpeedDependent(0.95, 0.6, 0.3)  # changes much within the speeds that occur here
@@ -243,6 +243,25 @@ def test_a_law_that_gains_energy_has_no_result(engine):
     assert found.status == rk.Status.not_finite
 
 
+class Fixed(rk.restitution.AbstractRestitution):
+    """A number, whatever it is."""
+
+    value: jax.Array
+
+    def ratio(self, corners, speed):
+        return self.value
+
+    @property
+    def depends_on_speed(self):
+        return False
+
+
+def test_a_number_that_is_no_ratio_has_no_result():
+    for value, status in {1.1: "not_finite", -0.1: "not_finite", 0.9: "successful"}.items():
+        found = rk.outcome(rk.Block(0.2, 2.0, Fixed(jnp.asarray(value))), PULSE, rk.Linear(), engine=SHORT)
+        assert found.status == getattr(rk.Status, status)
+
+
 def test_the_laws_of_momentum():
     """Housner's is that of a rectangle, on one side as on two."""
     alpha = np.linspace(0.05, 0.9, 9)
@@ -262,6 +281,111 @@ def test_a_pair_and_its_mirror():
     one = rk.outcome(block, rk.SinePulse(0.6, 1.0), engine=SHORT)
     other = rk.outcome(block.mirrored, rk.SinePulse(-0.6, 1.0), engine=SHORT)
     np.testing.assert_allclose(float(one.margin), float(other.margin), rtol=1e-12)
+
+
+class Leaning(rk.restitution.AbstractRestitution):
+    """A law of one's own that tells sides apart."""
+
+    first: jax.Array
+
+    def ratio(self, corners, speed):
+        return jnp.where(corners.side < 0, 0.7, self.first) + 0 * speed
+
+
+@pytest.mark.parametrize("law", [rk.restitution.PerSide(0.9, 0.7), Leaning(jnp.asarray(0.9))])
+def test_a_symmetric_block_whose_law_tells_sides_apart(law):
+    """It is an asymmetric block of equal sides, also where many are asked for at once."""
+    block, pair = rk.Block(0.2, 2.0, law), rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=law)
+
+    def peaks(block):
+        signs = jnp.array([1.0, -1.0])
+        return jax.vmap(lambda sign: rk.outcome(block, sign * PULSE, engine=SHORT).max_rotation)(signs)
+
+    one, other = peaks(block), [float(rk.outcome(pair, sign * PULSE, engine=SHORT).max_rotation) for sign in (1, -1)]
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert abs(one[0] - one[1]) > 1e-3
+    engine = rk.Diffrax(rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(rk.outcome(block, -PULSE, engine=engine).max_rotation, one[1], rtol=1e-7)
+
+
+def test_turned_round_a_block_does_as_with_its_ratios_exchanged():
+    """Mirror images, on corners of one height and of two; so is a suite both ways round."""
+    law, pulse = rk.restitution.PerSide(0.9, 0.7), rk.SinePulse(0.4, 0.6)
+
+    def peak(make, law, sign):
+        return float(rk.outcome(make(law), sign * pulse).max_rotation)
+
+    for make in (
+        lambda law: rk.Block(0.2, 2.0, law),
+        lambda law: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=law),
+    ):
+        assert peak(make, law, 1) == pytest.approx(peak(make, law.mirrored, -1), rel=1e-13)
+        assert abs(peak(make, law, 1) - peak(make, law, -1)) > 0.02
+    ways = rk.hazard.suite_outcomes(rk.Block(0.2, 2.0, law), [pulse], facing="both", progress=False).rotation.ravel()
+    np.testing.assert_allclose(ways * 0.2, [peak(lambda law: rk.Block(0.2, 2.0, law), law, s) for s in (1, -1)])
+
+
+def test_what_a_symmetric_block_of_two_ratios_is_refused():
+    """A ratio above 1, which it needs no other height for; and what takes one number for both sides."""
+    with pytest.raises(ValueError, match=r"`restitution\[1\]` must be in \[0, 1\], but is 1.2"):
+        rk.Block(0.2, 2.0, rk.restitution.PerSide(0.8, 1.2))
+    with pytest.raises(ValueError, match=r"`restitution\[1\]` must be in \[0, 1\], but is 1.2"):
+        rk.blocks.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, restitution=rk.restitution.PerSide(0.8, 1.2))
+    block = rk.Block(0.2, 2.0, rk.restitution.PerSide(0.9, 0.7))
+    with pytest.raises(ValueError, match="the same on both sides"):
+        rk.studies.similarity.groups(block, 0.3, 6.0)
+    with pytest.raises(ValueError, match="`restitution` must be 0"):
+        rk.blocks.draw_blocks(block, 3, restitution=0.1)
+    assert rk.blocks.draw_blocks(block, 3, alpha=0.1).law.second.shape == (3,)
+
+
+class Written(rk.restitution.AbstractRestitution):
+    """One without parameters."""
+
+    def ratio(self, corners, speed):
+        return (0.7 if corners.side < 0 else 0.9) + 0 * speed
+
+    @property
+    def depends_on_speed(self):
+        return False
+
+
+class Falling(rk.restitution.AbstractRestitution):
+    """One without parameters that depends on the speed."""
+
+    def ratio(self, corners, speed):
+        return 0.95 - 0.3 * jnp.tanh(speed)
+
+
+@pytest.mark.parametrize(
+    "law, names", [(rk.restitution.PerSide(0.9, 0.7), ["first", "second"]), (Written(), []), (Falling(), [])]
+)
+def test_parameters_of_laws_that_are_more_than_a_number(law, names):
+    """A scene that is made again of its parameters does the same."""
+    block, pulse = rk.Block(0.2, 2.0, law), rk.SinePulse(0.4, 0.6)
+    values = named(block, pulse)
+    assert [name for name in values if "restitution" in name] == [f"restitution.{name}" for name in names]
+    again = rebuilt(block, pulse, values)[0]
+    one, other = (float(rk.outcome(each, pulse, engine=SHORT).max_rotation) for each in (block, again))
+    assert one == pytest.approx(other, rel=1e-13)
+
+
+def test_laws_that_do_not_ask_for_the_side_take_one():
+    corners = rk.Block(0.2, 2.0).corners
+    for law in (*LAWS.values(), rk.restitution.Constant(0.9), rk.restitution.Housner()):
+        one, other = on_sides(law, corners)
+        assert one is other
+
+
+def test_a_flexible_block_whose_law_tells_sides_apart():
+    """It falls back on one side first, and after that impact the pulse is over: the ratio is that of this side."""
+
+    def peak(restitution, sign):
+        block = rk.blocks.FlexibleBlock(1.0, 5.0, 3e9, 2000.0, 0.02, 3, restitution=restitution)
+        return float(rk.outcome(block, sign * rk.SinePulse(0.4, 0.9), duration=6.0).max_rotation)
+
+    law = rk.restitution.PerSide(0.9, 0.7)
+    assert [peak(law, 1), peak(law, -1)] == [peak(0.7, 1), peak(0.9, 1)]
 
 
 def test_a_rock_with_a_law():
@@ -351,22 +475,3 @@ def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
 def test_parameters_have_ranges(given):
     with pytest.raises(ValueError, match="must be"):
         rk.restitution.SpeedDependent(*given)
-
-
-def test_two_sides_are_those_of_an_asymmetric_block():
-    """A block of one slenderness with two restitutions: turned round it does as with these exchanged; a symmetric one
-    has one."""
-    two, pulse = rk.restitution.PerSide(0.9, 0.7), rk.SinePulse(0.4, 0.6)
-
-    def peak(law, sign):
-        block = rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=law)
-        return float(rk.outcome(block, sign * pulse).max_rotation)
-
-    assert peak(two, 1) == pytest.approx(peak(two.mirrored, -1), rel=1e-13)
-    assert abs(peak(two, 1) - peak(two, -1)) > 0.02
-    for make in (
-        lambda: rk.Block(0.2, 2.0, two),
-        lambda: rk.blocks.FlexibleBlock(5.0, 25.0, 30e9, 2500.0, 0.01, restitution=two),
-    ):
-        with pytest.raises(ValueError, match="`restitution` must be the same on both sides"):
-            make()

@@ -118,6 +118,13 @@ def test_a_stout_block_has_no_balance():
     with pytest.raises(Exception, match="must be below pi/4"):
         jax.block_until_ready(jax.jit(lambda alpha: spring.moments(rk.Block(alpha, 1.0)).saddle)(0.8))
     assert rk.Spring("SM1", "plastic").moments(rk.Block(0.8, 1.0)).saddle == pytest.approx(0.8, rel=1e-15)
+    for ask in (rk.outcome, rk.simulate):
+        with pytest.raises(ValueError, match="Argument `block.alpha` must be below pi/4 .* but is 0.8"):
+            ask(rk.Block(0.8, 1.0), rk.SinePulse(2.0, 0.6), spring)
+        with pytest.raises(ValueError, match="Argument `block.alpha2` must be below pi/4 .* but is 0.8"):
+            ask(rk.blocks.AsymmetricBlock(0.5, 0.8, 1.0), rk.SinePulse(2.0, 0.6), spring)
+    found = rk.outcome(rk.Block(0.8, 1.0), rk.SinePulse(2.0, 0.6), spring, throw=False)
+    assert found.status == rk.Status.not_finite and np.isnan(found.max_rotation)
 
 
 # ---- References ----

@@ -74,6 +74,17 @@ class Softer(rk.models.AbstractEquation):
         return rk.models.Coefficients(restoring, rk.models.Terms(sine=sine, cosine=cosine))
 
 
+def test_what_is_declared_has_its_range():
+    """Where an object is made, of numbers that are known."""
+    corners = jnp.asarray(CORNERS)
+    with pytest.raises(ValueError, match="Argument `step` must be positive and finite, but is -0.7"):
+        Ramps(1.0, corners, -0.7)
+    with pytest.raises(ValueError, match=r"Argument `strength` must be in \[0, 1\], but is 1.5"):
+        Softer(np.array([0.5, 1.5]))
+    made = jax.vmap(lambda step: Ramps(1.0, corners, step))(jnp.array([0.2, -0.2]))
+    assert made.step.shape == (2,)
+
+
 def ramps(height=1.0):
     return Ramps(jnp.asarray(height), jnp.asarray(CORNERS), jnp.asarray(0.25), jnp.asarray(1.0))
 

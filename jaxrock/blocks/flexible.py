@@ -140,7 +140,7 @@ class FlexibleBlock(Owner):
     @property
     def restitution(self) -> Real:
         """Velocities after an impact over those before it (D&F 2017, 21: Housner's); if that depends on the speed, of
-        the gentlest."""
+        the gentlest, and if on the side, of one that ends a stay on side 1."""
         return self.law.ratio(self.corners, jnp.zeros_like(self.alpha))
 
     @property

@@ -11,6 +11,7 @@ from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import not_negative, positive, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.blocks.rock import Rock
 
@@ -47,6 +48,8 @@ def draw_blocks(
     check_single(block=block)
     if restitution != 0 and block.law.depends_on_speed:
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
+    if restitution != 0 and tells_sides(block.law, block.corners):
+        raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution tells its sides apart.")
     keys = jax.random.split(jax.random.key(seed), 3)
     normal = [jax.random.normal(key, (draws,)) for key in keys[:2]]
     alphas, ps = block.alpha * jnp.exp(alpha * normal[0]), block.p * jnp.exp(p * normal[1])

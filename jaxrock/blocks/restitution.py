@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, check_shapes, checked, not_negative, share, size, with_throw
+from jaxrock._checks import Range, check_shapes, checked, is_traced, not_negative, share, size, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -49,7 +49,8 @@ class Corners(NamedTuple):
     - `p`: frequency parameter about the corner that it leaves [rad/s].
     - `inertia_ratio`: m R^2/I about the corner that it comes to [-]; 3/4 for a rectangle.
     - `radius_ratio`: distance of the centre of mass from the corner that it leaves, over that from the other [-].
-    - `side`: 1 or -1, the side of which the impact ends a stay; of a symmetric block always 1.
+    - `side`: 1 or -1, the side of which the impact ends a stay; of a law that depends on the speed it may be traced:
+      `jnp.where(corners.side < 0, ...)`.
     """
 
     alpha: Real
@@ -65,6 +66,9 @@ class AbstractRestitution(Owner):
 
     __repr__ = described
 
+    def __check_init__(self):
+        check_declared(self)
+
     @abc.abstractmethod
     def ratio(self, corners: Corners, speed: Real) -> Real:
         """Angular velocity after an impact over that before it.
@@ -74,8 +78,8 @@ class AbstractRestitution(Owner):
         - `corners`: the `Corners` of the impact.
         - `speed`: |angular velocity| just before it [rad/s], 0 or more.
 
-        **Returns:** the ratio, in [0, 1] if it depends on the speed (a response with any other has the status
-        `not_finite`), smooth in the speed.
+        **Returns:** the ratio, smooth in the speed, in [0, 1]: a response with any other has the status `not_finite`.
+        Of an asymmetric block one that does not depend on the speed may exceed 1.
         """
 
     @property
@@ -172,14 +176,14 @@ class AngularMomentum(AbstractRestitution):
 
 
 class PerSide(AbstractRestitution):
-    """A ratio of its own for the impacts that end the stays on either side of an `AsymmetricBlock`.
+    """A ratio of its own for the impacts that end the stays on either side of a block.
 
     **Arguments:**
 
-    - `first`, `second`: the ratio at the end of a stay on side 1, and on side 2, 0 or more.
+    - `first`, `second`: the ratio at the end of a stay on side 1 (rotation > 0), and on side 2, 0 or more.
 
     **Raises:** ValueError where their product, which is the energy that two impacts keep, exceeds 1. (One of them may:
-    about corners of unequal height it often does.)
+    about corners of unequal height it often does. On a symmetric block neither may.)
     """
 
     first: Real = parameter("-", not_negative, symbol="e1", argument="restitution")
@@ -235,6 +239,32 @@ class SpeedDependent(AbstractRestitution):
 
 
 Restitution = ArrayLike | AbstractRestitution
+_ALIKE = (Constant, Housner, AngularMomentum, SpeedDependent)  # laws that do not ask for the side
+
+
+def on_sides(law: AbstractRestitution, corners: Corners) -> tuple[Corners, Corners]:
+    """What a law sees of a symmetric block on side 1, and on side 2; the same object where it does not ask."""
+    return (corners, corners._replace(side=-1)) if tells_sides(law, corners) else (corners, corners)
+
+
+def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
+    """Whether the ratio depends on the side: whether its programs on either side are two."""
+    if type(law) in _ALIKE:
+        return False
+    arrays, others = eqx.partition((law, corners), eqx.is_array)
+
+    def program(side: int):
+        def ratio(arrays):
+            law, corners = eqx.combine(arrays, others)
+            return law.ratio(corners._replace(side=side), jnp.zeros_like(corners.p))
+
+        return jax.make_jaxpr(ratio)(arrays)
+
+    one, other = program(1), program(-1)
+    if str(one) != str(other):
+        return True
+    pairs = zip(one.consts, other.consts)
+    return any(a is not b and (is_traced((a, b)) or not np.array_equal(a, b)) for a, b in pairs)
 
 
 def law_of(
@@ -243,11 +273,9 @@ def law_of(
     """The law that an argument `restitution` means: itself, that of a number, or, for None, the usual one."""
     if restitution is None:
         return otherwise
-    if symmetric and isinstance(restitution, PerSide):
-        raise ValueError(
-            "Argument `restitution` must be the same on both sides of a symmetric block, but is a PerSide: "
-            "jaxrock.blocks.AsymmetricBlock(alpha, alpha, p, restitution=...) tells its sides apart."
-        )
+    if symmetric and isinstance(restitution, PerSide):  # corners of one height: no impact is faster than it came
+        both = share("restitution[0]", restitution.first), share("restitution[1]", restitution.second)
+        return eqx.tree_at(lambda law: (law.first, law.second), restitution, both)
     return restitution if isinstance(restitution, AbstractRestitution) else Constant(restitution)
 
 
@@ -275,11 +303,13 @@ class Reset(eqx.Module):
     p: Real | None  # unit of the speeds [rad/s]
 
     @classmethod
-    def of(cls, law: AbstractRestitution, corners: Corners, p: Real) -> "Reset":
-        """Bind a law to a corner."""
+    def of(cls, law: AbstractRestitution, corners: Corners, p: Real, most: float = np.inf) -> "Reset":
+        """Bind a law to a corner, whose ratio is `most` at most if it does not depend on the speed."""
         if law.depends_on_speed:
             return cls(law, corners, p)
         ratio = law.ratio(corners, jnp.zeros_like(p))
+        if type(law) not in _ALIKE:  # whose parameters have been checked
+            ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
         # As it is: of two corners of unequal height the ratio at one may exceed 1.
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 

@@ -118,7 +118,8 @@ class Block(Owner):
     @property
     @one_program
     def restitution(self) -> Inexact[Array, "..."]:
-        """Angular velocity after an impact over that before it; if it depends on the speed, of the gentlest."""
+        """Angular velocity after an impact over that before it; if it depends on the speed, of the gentlest, and if on
+        the side, of one that ends a stay on side 1."""
         return self.law.ratio(self.corners, jnp.zeros_like(self.p))
 
     @property

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, checked, finite, one_of, share
+from jaxrock._checks import acute, checked, finite, not_negative, one_of, share
 from jaxrock.transforms.elementwise import elementwise
 
 __all__ = [
@@ -29,7 +29,12 @@ def _below_one(name, value):
     return checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
 
 
-_elementwise = elementwise(alpha=acute, rotation=finite, amplitude=_below_one, restitution=share, impacts=finite)
+def _leaning(name, value):
+    return checked(name, value, "be in [0, pi/2)", lambda x: (x >= 0) & (x < jnp.pi / 2))
+
+
+_elementwise = elementwise(alpha=acute, rotation=finite, amplitude=_below_one, restitution=share, impacts=not_negative)
+_of_springs = elementwise(alpha=acute, rotation=_leaning)
 
 
 @_elementwise
@@ -48,22 +53,22 @@ def force(rotation: Real, alpha: Real) -> Result:
     return jnp.tan(alpha - rotation)
 
 
-@_elementwise
+@_of_springs
 def _force_sine(rotation, alpha):
     return jnp.tan(alpha) - jnp.tan(rotation)  # D&F 2017, 17
 
 
-@_elementwise
+@_of_springs
 def _force_linear(rotation, alpha):
     return jnp.tan(alpha) * (1 - rotation / alpha) / jnp.cos(rotation)  # as 17, with the moment of 5, 8, 11, 14
 
 
-@_elementwise
+@_of_springs
 def _force_plastic_diagonal(rotation, alpha):
     return jnp.tan(alpha) / jnp.cos(rotation) - jnp.tan(rotation) / jnp.cos(alpha)  # D&F 2017, 18
 
 
-@_elementwise
+@_of_springs
 def _force_plastic_height(rotation, alpha):
     return jnp.tan(alpha) / jnp.cos(rotation) - jnp.tan(rotation)  # D&F 2017, 19
 
@@ -90,7 +95,7 @@ def spring_force(rotation: Real, alpha: Real, kind: str = "SM1", law: str = "lin
     return {"sine": _force_sine, "linear": _force_linear, "plastic": plastic}[law](rotation, alpha)
 
 
-@_elementwise
+@_of_springs
 def overturning_moment_ratio(rotation: Real, alpha: Real) -> Result:
     """Overturning moment of the spring models over that of the block, under one ground acceleration.
 
@@ -147,7 +152,7 @@ def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result
 
     **Arguments:**
 
-    - `impacts`: how many. `amplitude`: largest rotation over alpha before, in [0, 1).
+    - `impacts`: how many, 0 or more. `amplitude`: largest rotation over alpha before, in [0, 1).
     - `restitution`: angular velocity after over before an impact, in [0, 1].
 
     **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.

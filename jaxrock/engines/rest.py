@@ -14,6 +14,7 @@ from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.polynomial import Watch, first_event, longest, meet, step_length
+from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -60,9 +61,9 @@ def wait(
     piece, local, over = stepper.move_on(state, x * length * unit, full)
     piece = where(full & ~over & (not stepper.history), scene.after_quiet(piece), piece)
     waited = replace(state, piece=piece, local=local, done=over | (never & ~early))
-    waited = lift(waited, where(second, -1.0, 1.0), met, met)
+    waited = lift(waited, where(second, -1.0, 1.0), met, met, zero > 0)
     (first, touching), (other, touching2) = lifted
-    at_once = lift(state, where(first, 1.0, -1.0), first | other, where(first, touching, touching2))
+    at_once = lift(state, where(first, 1.0, -1.0), first | other, where(first, touching, touching2), first | other)
     return jax.tree.map(lambda a, b: where(first | other, a, b), at_once, waited)
 
 
@@ -84,10 +85,17 @@ def _changes(shaking: Shaking) -> Flag:
     return functools.reduce(operator.or_, [c != 0 for c in later], jnp.zeros((), bool))
 
 
-def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag) -> State:
-    """Leave rest to a side where `lifts`; `continuous`: with zero acceleration."""
+def lift(state: State, side: Scalar, lifts: Flag, continuous: Flag, at_once: Flag) -> State:
+    """Leave rest to a side where `lifts`; `continuous`: with zero acceleration.
+
+    Where that is `at_once` the state that was given at time 0 moves on, of one side; it does not outlast a wait.
+    """
+    moving = where(at_once, side, 0.0)
+    opening, velocity = (with_derivatives_of(fixed(x), moving * x) for x in (state.opening, state.velocity))
     return replace(
         state,
+        opening=opening,
+        velocity=velocity,
         side=where(lifts, side, state.side),
         uplifting=where(lifts, continuous, state.uplifting),
         beyond=where(lifts, False, state.beyond),

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._parameters import check_single, in_precision
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import Reset
+from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.outlook import Outlook
 from jaxrock.models.coefficients import Coefficients
@@ -65,8 +65,9 @@ class Here(NamedTuple):
 class Scene(eqx.Module):
     """One block under one motion. Piece `pieces` (one past the last) is the quiet after the motion.
 
-    A symmetric block has one `moments` for both sides. That of an asymmetric one is for the side on which it stands
-    (rotation > 0 unless `on` tells otherwise), and `far` for the other.
+    A symmetric block has one `moments` for both sides. That of an asymmetric one, or of one whose law of restitution
+    tells sides apart, is for the side on which it stands (rotation > 0 unless `on` tells otherwise), and `far` for the
+    other.
     """
 
     moments: AbstractMoments
@@ -109,10 +110,12 @@ class Scene(eqx.Module):
             )
         moments, far = _moments(block, model)
         if isinstance(block, Block):
-            p, alpha, corners = block.p, block.alpha, (block.corners, block.corners)
+            p, alpha, corners = block.p, block.alpha, on_sides(block.law, block.corners)
+            far = None if corners[0] is corners[1] else moments
         else:
             p, alpha, corners = block.p1, jnp.minimum(block.alpha1, block.alpha2), block.corners
-        reset, far_reset = (Reset.of(block.law, each, p) for each in corners)
+        most = 1.0 if isinstance(block, Block) else jnp.inf
+        reset, far_reset = (Reset.of(block.law, each, p, most) for each in corners)
         return cls(
             moments=moments,
             far=far,

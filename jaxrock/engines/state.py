@@ -10,6 +10,7 @@ from jaxrock.models.equation import Angle
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
 from jaxrock.status import Status
+from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -55,8 +56,9 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     least = float(jnp.finfo(rotation.dtype).tiny) ** 0.5  # below it squares vanish
     rotation, velocity = (where(jnp.abs(x) < least, x - fixed(x), x) for x in (rotation, velocity))
     side = where(rotation != 0, jnp.sign(rotation), jnp.sign(velocity))
-    # Of a block at rest nothing moves: the slope of |0| would be 1.
-    opening, outward = jnp.abs(side * rotation), side * velocity
+    # At rest they move as on side 1, until it shows to which side the block goes (`rest.lift`).
+    opening = with_derivatives_of(jnp.abs(rotation), where(side < 0, -rotation, rotation))
+    outward = with_derivatives_of(side * velocity, where(side < 0, -velocity, velocity))
     zero, no = jnp.zeros_like(opening), jnp.zeros_like(opening, bool)
     count = jnp.zeros_like(opening, jnp.int32)
     moments = scene.on(side).moments
@@ -83,10 +85,10 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         uplifting=no,
         beyond=beyond,
         extremal=no,
-        peak=opening,
+        peak=where(side == 0, zero, opening),
         peak_time=zero,
         error=zero,
-        fastest=jnp.abs(outward),
+        fastest=where(side == 0, zero, jnp.abs(outward)),
         impacts=count,
         impact_time=zero,
         impact_velocity=zero,

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.blocks.restitution import Reset
 from jaxrock.flexible.column import Column
 from jaxrock.flexible.phases import Phase, arc, locked_phase, rocking_phase
 from jaxrock.flexible.remainder import NonlinearArc, Tangents, nonlinear_arc
-from jaxrock.flexible.stepper import FlexibleScene, FlexibleState
+from jaxrock.flexible.stepper import FlexibleScene, FlexibleState, resets_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.status import Status
 
@@ -36,9 +35,8 @@ class NonlinearScene(FlexibleScene):
         rocking, whole = rocking_phase(numbers)
         # A column that leans too far before it balances is none of these.
         whole &= (numbers.balance > 0) & (numbers.balance < jnp.pi / 2) & (numbers.squares > 0).all()
-        reset = Reset.of(block.law, block.corners, jnp.ones_like(block.alpha))
-        locked = locked_phase(numbers)
-        return cls(block, ground, stop, numbers, locked, rocking, whole, reset, ground.knots, tangents)
+        locked, resets = locked_phase(numbers), resets_of(block)
+        return cls(block, ground, stop, numbers, locked, rocking, whole, resets, ground.knots, tangents)
 
     def longest(self, state: FlexibleState) -> Scalar:
         """How long a step may be [s]."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Inexact, Int
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.blocks.restitution import Reset
+from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
 from jaxrock.motions.motion import AbstractMotion
@@ -81,6 +81,18 @@ class FlexibleOutcome(AbstractTable):
         return {name: Column(axes, getattr(self, name), units.get(name, "-")) for name in names}
 
 
+def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
+    """The impacts that end the stays on side 1 and on side 2, or one for both."""
+    one, other = on_sides(block.law, block.corners)
+    corners = (one,) if one is other else (one, other)
+    return tuple(Reset.of(block.law, each, jnp.ones_like(block.alpha), 1.0) for each in corners)
+
+
+def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:
+    ratios = [reset.ratio(speed) for reset in resets]
+    return ratios[0] if len(ratios) == 1 else jnp.where(side < 0, ratios[1], ratios[0])
+
+
 class FlexibleScene(eqx.Module):
     """A flexible block under a motion, reduced to what a step needs."""
 
@@ -91,7 +103,7 @@ class FlexibleScene(eqx.Module):
     locked: Phase
     rocking: Phase
     whole: Bool[Array, ""]
-    reset: Reset  # with speeds in rad/s
+    reset: tuple[Reset, ...]  # with speeds in rad/s: on side 1 and 2, or one for both
     knots: Inexact[Array, " knots"]
 
     @classmethod
@@ -99,7 +111,7 @@ class FlexibleScene(eqx.Module):
         """Build the scene from scalars."""
         numbers = Numbers.of(block)
         rocking, whole = rocking_phase(numbers)
-        reset = Reset.of(block.law, block.corners, jnp.ones_like(block.alpha))
+        reset = resets_of(block)
         return cls(block, ground, stop, numbers, locked_phase(numbers), rocking, whole, reset, ground.knots)
 
     def start(self) -> FlexibleState:
@@ -213,9 +225,9 @@ class FlexibleScene(eqx.Module):
         stay = jnp.where(rocking, state.stay + elapsed, 0.0)
         # A column that trembles while the base uplifts must not use up the impact that ends the rocking.
         counts = (state.side != state.last_side) | (stay > state.braked_stay) | (self.block.impacts == "every")
-        counts &= returned
-        n = numbers.rotation.size
-        after = jnp.where(counts, still.at[n:-1].multiply(self.reset.ratio(jnp.abs(speed))), still)
+        counts, n = counts & returned, numbers.rotation.size
+        slowed = still.at[n:-1].multiply(_ratio(self.reset, state.side, jnp.abs(speed)))
+        after = jnp.where(counts, slowed, still)
         # A damped column may push the base over at once.
         pushed = self.moment(after)
         over = numbers.damped & (jnp.abs(pushed) > numbers.strength)

@@ -18,6 +18,7 @@ from jaxrock._checks import Values, checked, positive, shown, size
 from jaxrock._parameters import leaves_of
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
@@ -157,7 +158,8 @@ def suite_outcomes(
     - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (blocks,) many.
     - `motions`: a `Suite`, or what makes one; `Suite(components, azimuth=...)` of records with two components.
     - `scale`: factors on all motions, a number (1: as recorded) or a list, positive and rising.
-    - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block is a mirror image.
+    - `facing`: "one": as it stands; "both": also turned round, which for a symmetric block of one
+      restitution is a mirror image.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `SuiteOutcomes`; `fit_probit` takes columns of its `table()`. It warns of a motion that is there
@@ -177,7 +179,7 @@ def suite_outcomes(
     strongest = float(np.max(suite.peak_acceleration))
     checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
     blocks, ways = stacked(block), _FACINGS[facing]
-    symmetric = isinstance(block, Block)
+    symmetric = isinstance(block, Block) and not tells_sides(block.law, block.corners)
     factors = np.concatenate([way * scales for way in (ways[:1] if symmetric else ways)])
     found = scenes(blocks, suite, factors, model, engine, progress)
     draws = jax.tree.leaves(blocks)[0].shape[0]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from jaxrock._parameters import Owner
+from jaxrock._parameters import Owner, check_declared
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.numerics.choice import where
@@ -122,6 +122,9 @@ class AbstractEquation(Owner):
     is false). Its fields are parameters: what is an array there may be differentiated by, and may differ from lane to
     lane under `jax.vmap`.
     """
+
+    def __check_init__(self):
+        check_declared(self)
 
     @abc.abstractmethod
     def moments(self, block: Block | Side) -> AbstractMoments:

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Inexact
 
 from jaxrock._checks import checked, one_of, whole
 from jaxrock.blocks.rigid import Block, Side
@@ -60,10 +61,7 @@ class Spring(AbstractEquation):
 
     def _moments(self, block: Block | Side) -> Coefficients:
         """The same over the block's moment of inertia."""
-        alpha, leans_by_height = block.alpha, self.kind in ("SM2", "SM3")
-        if self.law == "plastic" and leans_by_height:
-            message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
-            alpha = checked("block.alpha", alpha, message, lambda angle: angle < jnp.pi / 4)
+        alpha, leans_by_height = self.balanced("block.alpha", block.alpha), self.kind in ("SM2", "SM3")
         sine, cosine = sine_cosine(alpha)
         arm = Terms(cosine=cosine)
         if self.law == "sine":
@@ -72,6 +70,13 @@ class Spring(AbstractEquation):
             return Coefficients(Terms(constant=sine, line=-sine / alpha), arm)  # D&F 2017, 5, 8, 11, 14
         weight = cosine if leans_by_height else jnp.ones_like(alpha)
         return Coefficients(Terms(constant=sine, sine=-weight), arm)  # D&F 2017, 6, 15; 9, 12
+
+    def balanced(self, name: str, alpha: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+        """A slenderness angle, checked where the spring balances no others; what is none was seen before."""
+        if self.law != "plastic" or self.kind not in ("SM2", "SM3"):
+            return alpha
+        message = f"be below pi/4 in Spring({self.kind!r}, law='plastic'), which never overturns above"
+        return checked(name, alpha, message, lambda angle: ~(angle >= jnp.pi / 4))
 
     @property
     def feels_weight(self) -> bool:

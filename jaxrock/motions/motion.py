@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import count_up_to, pick
@@ -30,6 +30,9 @@ class AbstractMotion(Owner):
     """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
     __repr__ = described
+
+    def __check_init__(self):
+        check_declared(self)
 
     @property
     @abc.abstractmethod

@@ -2,14 +2,15 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import scalar
+from jaxrock._checks import is_traced, scalar
 from jaxrock._parameters import check_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import ratio_of_inertia
+from jaxrock.blocks.restitution import ratio_of_inertia, tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle, Rolled
@@ -71,7 +72,7 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
 
     **Returns:** a `Contact`.
 
-    **Raises:** ValueError for a value outside its range.
+    **Raises:** ValueError for a value outside its range, or for another block than that of the response.
 
     **Source:** momentum of the centre of mass, on a circle about the corner, or as it rolls (Shenton 1996 for the
     beginning of rocking); at an impact, of the impulse that angular momentum about the new corner implies.
@@ -79,7 +80,27 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
     check_single(block=block)
     response.trajectory.check_single()
+    _check_own(response.scene, block)
     return _contact(response, block, ratio)
+
+
+def _check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
+    """Raise ValueError where a block is known not to be that of a scene."""
+    if is_traced((scene.p, scene.alpha, block)):
+        return
+    if isinstance(block, Block):
+        fits = scene.far is None or tells_sides(block.law, block.corners)
+        angles, rate = [block.alpha], block.p
+    else:
+        angles, rate, fits = [block.alpha1, block.alpha2], block.p1, scene.far is not None
+    own, given = np.array([scene.alpha, scene.p]), np.array([np.min(angles), rate])
+    alike = np.allclose(own, given, rtol=1e-5 if own.dtype.itemsize < 8 else 1e-9, atol=0, equal_nan=True)
+    if not (alike and fits):
+        told = "alpha and p are {:.6g} rad and {:.6g} rad/s".format
+        raise ValueError(
+            f"Argument `block` must be that of the response, whose {told(*own)}, but is a {type(block).__name__} whose "
+            f"{told(*given)}."
+        )
 
 
 @jax.jit

@@ -1,16 +1,19 @@
 """Models whose functions are a user's own, as they are when they are asked for."""
 
 import functools
+import operator
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxrock._checks import is_traced, put_down
+from jaxrock._checks import is_traced, marked, put_down
 from jaxrock._guard import guarded
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions
 from jaxrock.transforms.user_function import UserFunction
 
@@ -43,11 +46,14 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
     return jax.tree.map(current, model, is_leaf=_is_functions)
 
 
-def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block | AsymmetricBlock:
-    """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one.
+def standing(block: Block | AsymmetricBlock, model: AbstractEquation, throw: bool = True) -> Block | AsymmetricBlock:
+    """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one, or
+    balances on a spring.
 
     Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
     """
+    if isinstance(model, Spring):
+        return _balanced(block, model, throw)
     if not isinstance(model, Equation):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
@@ -55,6 +61,19 @@ def standing(block: Block | AsymmetricBlock, model: AbstractEquation) -> Block |
         found = _faults(model, side) if is_traced((model, side)) else _compiled_faults(model, side)
         for message, applies in found.items():
             block = guarded(block, applies, message)
+    return block
+
+
+def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Block | AsymmetricBlock:
+    """The block, whose angles are checked where they are known, and marked where nothing is to be raised."""
+    for name in ("alpha",) if isinstance(block, Block) else ("alpha1", "alpha2"):
+        alpha = getattr(block, name)
+        if throw and is_traced(alpha):
+            continue
+        with marked(unless=throw):
+            found = spring.balanced(f"block.{name}", alpha)
+        if found is not alpha:
+            block = eqx.tree_at(operator.attrgetter(name), block, found)
     return block
 
 

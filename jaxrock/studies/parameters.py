@@ -10,7 +10,7 @@ from jaxrock._checks import not_negative, share
 from jaxrock._parameters import Leaf, Parameter, declared, leaves_of
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.blocks.restitution import Constant, PerSide
+from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
 from jaxrock.motions.intensity import peaks_of_motion
@@ -80,6 +80,8 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
         law = eqx.tree_at(
             lambda law: [_at(law, leaf.path[1:]) for leaf in own], block.law, [values[x.name] for x in own]
         )
+    elif not _of_law(block):
+        return new
     elif len(_of_law(block)) == 1:
         value = values["restitution"] if isinstance(block.law, Constant) else following("restitution")
         law = eqx.tree_at(lambda constant: constant.value, Constant(0.0), value)
@@ -106,7 +108,7 @@ def _declared(block: AnyBlock) -> dict[str, Parameter]:
 
 def _of_own(block: AnyBlock) -> list[Leaf]:
     """Parameters of a law of restitution that is more than one number for each side."""
-    if isinstance(block.law, (Constant, PerSide)):
+    if isinstance(block.law, Constant) or (isinstance(block.law, PerSide) and isinstance(block, AsymmetricBlock)):
         return []
     return [
         Leaf(("restitution", *leaf.path), leaf.value, leaf.declared) for leaf in leaves_of(block.law) if leaf.is_number
@@ -114,10 +116,14 @@ def _of_own(block: AnyBlock) -> list[Leaf]:
 
 
 def _of_law(block: AnyBlock) -> dict[str, Real]:
-    """Parameters of the restitution."""
+    """Parameters of the restitution; none of a law without numbers that is not one for each side either."""
     own = _of_own(block)
     if own:
         return {leaf.name: leaf.value for leaf in own}
+    if block.law.depends_on_speed:
+        return {}
+    if not isinstance(block, AsymmetricBlock) and tells_sides(block.law, block.corners):
+        return {}
     two_sided = isinstance(block, AsymmetricBlock) and not isinstance(block.law, Constant)
     names = ("restitution1", "restitution2") if two_sided else ("restitution",)
     return {name: getattr(block, name) for name in names}

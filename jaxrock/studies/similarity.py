@@ -21,6 +21,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import as_real, not_nan, one_of, positive, share, size
 from jaxrock._described import described
 from jaxrock._parameters import declared
+from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.responses.history import Response
@@ -119,6 +120,8 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     amplitude, frequency = size("amplitude", amplitude), size("frequency", frequency)
     if block.law.depends_on_speed:
         raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
+    if tells_sides(block.law, block.corners):
+        raise ValueError("Argument `block` must have a restitution that is the same on both sides.")
     if one_of("kind", kind, KINDS) == "slender":
         return Groups(frequency / block.p, block.alpha / amplitude, block.restitution)  # 4.11
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3

@@ -343,7 +343,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         status=Status.where(unclear, Status.undecided, state.status),
     )
     side = where(second, -1.0, 1.0)
-    return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts)
+    return lift(rested, side, (lifts | meets) & ~unclear & ~never, meets & ~lifts, lifts)
 
 
 def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
