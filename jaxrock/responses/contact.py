@@ -15,7 +15,7 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle, Rolled
 from jaxrock.motions.shaking import Shaking
-from jaxrock.responses.history import Response
+from jaxrock.responses.history import Response, evaluation
 
 Scalar = Inexact[Array, ""]
 _WITHIN = 8  # parts of each step at whose ends the extremes are looked for
@@ -189,7 +189,7 @@ def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
     """Largest friction needed and least normal force below the saddle, over points in all steps."""
     path = response.trajectory
     stepper, nodes, times = path.stepper, path.nodes, path.times
-    shares = jnp.linspace(0.0, 1.0, _WITHIN + 1)
+    shares, follow = jnp.linspace(0.0, 1.0, _WITHIN + 1), evaluation(stepper)
 
     def step(node, start, end):
         # What is infinite has derivatives that are not numbers, wherever it is left out later.
@@ -198,10 +198,10 @@ def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
         lasts = jnp.where(ends, end - start, 0.0)
 
         def at(share):
-            opening, speed = stepper.evaluate(node, share * lasts)
+            rotation, velocity = follow(node, share * lasts)
             still = (share == 0) | (node.side == 0) | node.done
-            opening = jnp.where(still, node.opening, opening)
-            speed = jnp.where(still, node.velocity * stepper.scene.p, speed)
+            opening = jnp.where(still, node.opening, node.side * rotation)
+            speed = jnp.where(still, node.velocity * stepper.scene.p, node.side * velocity)
             # Just inside the step: an end may be a jump of the motion.
             time = start + jnp.clip(share, 1e-9, 1 - 1e-9) * lasts
             forces = _forces(stepper.scene, sides, time, node.side * opening, node.side * speed, node.side)

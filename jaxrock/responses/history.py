@@ -1,6 +1,7 @@
 """The history of a block under a motion."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, overload
 
@@ -318,27 +319,25 @@ def _end(given) -> Outcome:
 @jax.jit
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    stepper, engine, at = path.stepper, path.stepper.engine, _at
-    if not engine.reverse:
-        stepper = _moving_in_evaluation(stepper)
-        at = differentiable(
-            _at,
-            _at,
-            None,
-            "evaluation",
-            lambda given: (given[2], given[2]),
-            engine.in_lanes,
-            derivatives="by directions",
-        )
+    at = evaluation(path.stepper)
+    return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(lambda t: at(*path.before(t)))(time.ravel()))
 
-    def found(time):
-        node, elapsed = path.before(time)
-        if not engine.reverse:
-            moving = {name: getattr(node, name) for name in ("local", "opening", "velocity")}
-            node = replace(jax.lax.stop_gradient(node), **moving)
-        return at((stepper, node, elapsed))
 
-    return jax.tree.map(lambda x: x.reshape(time.shape), jax.vmap(found)(time.ravel()))
+def evaluation(stepper: AbstractStepper) -> Callable:
+    """`at(node, elapsed)`: rotation [rad] and angular velocity [rad/s], so long after a node and before the next."""
+    if stepper.engine.reverse:
+        return lambda node, elapsed: _at((stepper, node, elapsed))
+    stepper = _moving_in_evaluation(stepper)
+    in_lanes = stepper.engine.in_lanes
+    at = differentiable(
+        _at, _at, None, "evaluation", lambda given: (given[2], given[2]), in_lanes, derivatives="by directions"
+    )
+
+    def found(node, elapsed):
+        moving = {name: getattr(node, name) for name in ("local", "opening", "velocity")}
+        return at((stepper, replace(jax.lax.stop_gradient(node), **moving), elapsed))
+
+    return found
 
 
 def _moving_in_evaluation(stepper: AbstractStepper) -> AbstractStepper:
