@@ -161,3 +161,48 @@ def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
     assert "too many islands" in caplog.text and len(pixels.lines) == 0
     assert len(rk.plot.overturning(surface, exact=True).lines) > 2
     plt.close("all")
+
+
+def map_of(state, ratio, intensity):
+    state = jnp.asarray(state)
+    peaks, counts = jnp.where(state == 0, 0.5, jnp.inf), jnp.zeros_like(state)
+    return rk.studies.OverturningMap(
+        jnp.asarray(ratio), jnp.asarray(intensity), state, peaks, counts, peaks, rk.Status.successful
+    )
+
+
+def spectrum_of(lost, abscissa):
+    lost = jnp.asarray(lost)
+    peaks, counts = jnp.where(lost, jnp.inf, 0.5), jnp.zeros(lost.shape, int)
+    return rk.studies.Spectrum(jnp.asarray(abscissa), peaks, peaks, counts, lost, peaks, rk.Status.successful)
+
+
+def wrong_figures():
+    """Calls with an argument that is not what is asked for, and what is said of it."""
+    spectrum, told = spectrum_of([False], [1.0]), sensitivity_of([1.0, 2.0])
+    surface = rk.studies.SensitivityMap(jnp.ones(1), jnp.ones(1), jnp.zeros(()), told)
+    numbers, counts, verdicts = jnp.zeros(3), jnp.zeros(3, int), jnp.zeros(3, bool)
+    one = rk.studies.Critical(
+        jnp.array(3), numbers, numbers, verdicts, counts, verdicts, numbers[:, None], jnp.array(True), ("alpha",)
+    )
+    one_axis = plt.figure().add_subplot()
+    plot = rk.plot
+    return [
+        (lambda: plot.history(an_outcome()), "`response` must be a Response"),
+        (lambda: plot.phase(an_outcome()), "`response` must be a Response"),
+        (lambda: plot.spectrum(map_of([[0]], [1.0], [1.0])), "`result` must be a Spectrum"),
+        (lambda: plot.overturning(spectrum), "`result` must be an OverturningMap"),
+        (lambda: plot.overturning(map_of([[0]], [1.0], [1.0]), [one_axis]), "`axis` must be an axis of matplotlib"),
+        (lambda: plot.spectrum(spectrum, one_axis), "`axes` must be 2 axes of matplotlib, but is Axes"),
+        (lambda: plot.spectrum(spectrum, [one_axis]), "`axes` must be 2 axes of matplotlib, but is list of 1"),
+        (lambda: plot.tornado(told, "rotation"), "`result` must be .*max_rotation"),
+        (lambda: plot.sensitivity_map(surface, "shap"), "`parameter` must be .*alpha"),
+        (lambda: plot.scene(rk.Block(0.2, 2.0), None, plt.figure()), "`axis` must be an axis of matplotlib"),
+        (lambda: plot.critical([1.0], one), "`abscissa` and `ends` must be of as many scenes"),
+    ]
+
+
+def test_arguments_of_figures_are_checked():
+    for call, words in wrong_figures():
+        with pytest.raises(ValueError, match=f"Arguments? {words}"):
+            call()

@@ -8,12 +8,13 @@ import numpy as np
 from jaxrock.hazard.fragility import LogNormalFragility
 from jaxrock.hazard.simulation import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
-from jaxrock.plot.style import BLUE, RED, SAND, log_ticks
+from jaxrock.plot.style import BLUE, RED, SAND, figure, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(1)
 def fragility(
     simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis: "Axes | None" = None
 ) -> "Axes":
@@ -47,6 +48,7 @@ def fragility(
     return log_ticks(axis)
 
 
+@figure(1)
 def fragility_surface(
     simulated: SimulatedSurface,
     fit: SurfaceFragility | None = None,

@@ -7,12 +7,13 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED, log_ticks
+from jaxrock.plot.style import GREY, RED, figure, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(1)
 def feasible_region(
     region: FeasibleRegion, estimate: Estimate | None = None, wall: Unexceeded | None = None, axis: "Axes | None" = None
 ) -> "Axes":
@@ -51,6 +52,7 @@ def feasible_region(
     return axis
 
 
+@figure(1)
 def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes | None" = None) -> "Axes":
     """Draw where the search of an estimate has been: a line from each start to a dot where it ended.
 

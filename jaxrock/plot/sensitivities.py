@@ -5,14 +5,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxrock.plot.style import BLUE, RED, SAND
+from jaxrock._checks import one_of
+from jaxrock.plot.style import BLUE, RED, SAND, figure
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_RESULTS = ("max_rotation", "max_velocity", "margin")
 
+
+@figure(1)
 def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes | None" = None) -> "Axes":
     """Draw the elasticities of one result as bars, the largest on top.
 
@@ -26,6 +30,7 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
     """
     import matplotlib.pyplot as plt
 
+    one_of("result", result, _RESULTS)
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 3), layout="constrained")
     elasticity = np.asarray(getattr(sensitivity, result).elasticity)
@@ -37,6 +42,7 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
     return axis
 
 
+@figure(1)
 def sensitivity_map(
     surface: SensitivityMap,
     parameter: str,
@@ -60,6 +66,8 @@ def sensitivity_map(
     """
     import matplotlib.pyplot as plt
 
+    one_of("result", result, _RESULTS)
+    one_of("parameter", parameter, surface.sensitivity.names)
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
     sensitivity = surface.sensitivity
@@ -76,6 +84,7 @@ def sensitivity_map(
     return axis
 
 
+@figure(1)
 def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) -> "Axes":
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
 
@@ -89,6 +98,11 @@ def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) ->
     """
     import matplotlib.pyplot as plt
 
+    if ends.intensity.ndim != 2 or np.shape(abscissa) != ends.intensity.shape[:1]:
+        raise ValueError(
+            f"Arguments `abscissa` and `ends` must be of as many scenes, along one axis, but have shapes "
+            f"{np.shape(abscissa)} and {ends.intensity.shape[:-1]}."
+        )
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     x = np.broadcast_to(np.asarray(abscissa)[:, None], ends.intensity.shape)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, cell_edges, shade
+from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, cell_edges, figure, shade
 from jaxrock.studies.borders import Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -21,6 +21,7 @@ _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overt
 _DURATION = "pulse duration $p\\,t_d$"
 
 
+@figure(2)
 def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
     """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
 
@@ -70,6 +71,7 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     return axes
 
 
+@figure(1)
 def overturning(
     result: OverturningMap,
     axis: "Axes | None" = None,
@@ -157,6 +159,7 @@ def draw_region(axis: "Axes", region: Region, by_duration: bool = False) -> None
         axis.plot(x, edge, color="black", linewidth=0.5)
 
 
+@figure(1)
 def borders(
     result: OverturningMap, axis: "Axes | None" = None, *, by_strength: bool = False, scale: float = 1.0, **line: Any
 ) -> "Axes":
