@@ -121,6 +121,47 @@ def test_feasible_region():
     np.testing.assert_allclose(axis.lines[0].get_ydata(), 0.5)
 
 
+def maps_of(rows, columns):
+    """Figures of a feasible region, sensitivities and a fragility surface of so many rows and columns, which have one
+    value each."""
+    up, across = jnp.geomspace(0.1, 1.0, rows), jnp.geomspace(0.2, 2.0, columns)
+    ones = jnp.ones((rows, columns))
+    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), ones, ones > 0)
+    told = rk.studies.SensitivityMap(up, across, jnp.asarray(0.0), sensitivity_of(jnp.ones((rows, columns, 2))))
+    shares = rk.hazard.SimulatedSurface(up, across, np.ones((1, rows, columns, 1), np.int8))
+    return (
+        rk.plot.feasible_region(region),
+        rk.plot.sensitivity_map(told, "alpha"),
+        rk.plot.fragility_surface(shares, contours=(0.5,)),
+    )
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (1, 3), (1, 1)])
+@pytest.mark.filterwarnings("error")
+def test_other_maps_of_one_row_or_column_are_drawn(shape):
+    for axis in maps_of(*shape):
+        cells = axis.collections[0]
+        corners = cells.get_coordinates()
+        assert np.ma.getdata(cells.get_array()).shape == shape
+        assert np.diff(corners[..., 0], axis=1).min() > 0 and np.diff(corners[..., 1], axis=0).min() > 0
+        assert np.ptp(axis.get_xlim()) > 0 and np.ptp(axis.get_ylim()) > 0
+
+
+def test_a_feasible_region_is_drawn_in_order():
+    """Whatever the order of its lists, cells and border are the same."""
+    rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
+
+    def drawn(up, across):
+        up, across = rows[jnp.array(up)], columns[jnp.array(across)]
+        likelihood = -((jnp.log(up / 0.4)[:, None]) ** 2) - jnp.log(across / 0.7) ** 2
+        region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), likelihood, likelihood > -1)
+        cells, border = rk.plot.feasible_region(region).collections
+        return cells.get_array(), cells.get_coordinates(), border.get_paths()[0].vertices
+
+    for found, expected in zip(drawn([2, 0, 3, 1], [4, 3, 2, 1, 0]), drawn(range(4), range(5))):
+        np.testing.assert_allclose(found, expected)
+
+
 def test_units_of_parameters_are_those_declared():
     assert UNITS == {"amplitude": "g", "duration": "s", "period": "s", "center": "s", "phase": "rad"}
     assert set(PULSES) >= {"sine", "half-sine", "rectangle", "mavroeidis-papageorgiou"}
@@ -175,6 +216,13 @@ def spectrum_of(lost, abscissa):
     lost = jnp.asarray(lost)
     peaks, counts = jnp.where(lost, jnp.inf, 0.5), jnp.zeros(lost.shape, int)
     return rk.studies.Spectrum(jnp.asarray(abscissa), peaks, peaks, counts, lost, peaks, rk.Status.successful)
+
+
+def test_a_spectrum_may_have_a_logarithmic_axis():
+    for axis in rk.plot.spectrum(spectrum_of([False, True, False], [1.0, 2.0, 3.0])):
+        assert axis.get_ylim()[0] == 0
+        axis.set_yscale("log")
+        assert 0 < axis.get_ylim()[0] < 0.5 < axis.get_ylim()[1]
 
 
 def wrong_figures():

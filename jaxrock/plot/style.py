@@ -1,4 +1,4 @@
-"""Colours that all figures share, curves with gaps, and ticks of logarithmic axes."""
+"""Colours that all figures share, cells of maps, curves with gaps, and ticks of logarithmic axes."""
 
 import functools
 import inspect
@@ -100,6 +100,17 @@ def cell_edges(places: np.ndarray) -> np.ndarray:
     ends = 2 * places[[0, -1]] - inner[[0, -1]]
     ends = np.where((places[[0, -1]] > 0) & (ends <= 0), places[[0, -1]] / 2, ends)
     return np.concatenate([ends[:1], inner, ends[1:]])
+
+
+def draw_cells(axis: "Axes", across: np.ndarray, up: np.ndarray, values: np.ndarray, **style):
+    """Draw values (up, across) as cells about places that rise, or fall: those of a single one have a width, too."""
+    return axis.pcolormesh(cell_edges(across), cell_edges(up), values, rasterized=True, **style)
+
+
+def limits_of(places: np.ndarray) -> tuple[float, float]:
+    """From where to where an axis shows places that rise: the first and the last, or the cell of a single one."""
+    ends = cell_edges(places) if places.size == 1 else places
+    return float(ends[0]), float(ends[-1])
 
 
 def shade(axis: "Axes", places: np.ndarray, which: np.ndarray, **patch) -> None:
