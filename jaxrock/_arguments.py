@@ -178,10 +178,10 @@ def word_of(*words: str) -> Check:
 
 
 def path_of(name: str, value: Any) -> Path:
-    """The path of a file."""
+    """The path of a file; `~` is the folder of a user."""
     if not isinstance(value, (str, os.PathLike)) or "\0" in os.fsdecode(value) or not _can_be_named(value):
         raise ValueError(f"Argument `{name}` must be the path of a file, but is {shown(value)}.")
-    return Path(os.fsdecode(value))
+    return Path(os.path.expanduser(os.fsdecode(value)))  # an unknown user's stays as it is
 
 
 def _can_be_named(value: Any) -> bool:

@@ -168,6 +168,18 @@ def test_borders_over_each_other(surface):
     highest = max(np.nanmax(line.get_ydata()) for line in axis.lines)
     assert highest < 1 and [line.get_label() for line in axis.lines].count("one") == 1
     assert {line.get_color() for line in axis.lines} == {"red"}
+    assert (axis.get_xlabel(), axis.get_ylabel()) == (r"frequency ratio $\omega/p$", "uplift strength")
+    assert rk.plot.borders(surface, scale=2.0).get_ylabel() == "intensity times 2"
+
+
+@pytest.mark.parametrize(
+    "draw, given", [(rk.plot.borders, {}), (rk.plot.overturning, {"exact": True}), (rk.plot.overturning, {})]
+)
+def test_progress_of_a_figure(surface, capsys, draw, given):
+    draw(surface, **given)
+    assert capsys.readouterr().err == ""
+    draw(surface, progress=True, **given)
+    assert "borders" in capsys.readouterr().err
 
 
 def test_curves_reach_their_tips():

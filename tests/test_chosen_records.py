@@ -178,6 +178,14 @@ def test_pulses_of_one_kind_are_chosen_by_number():
     np.testing.assert_allclose(found, [0.4, 0.3], rtol=1e-9)
 
 
+def test_records_times_factors_are_chosen_by_number():
+    """Alone or as many factors of one record, beside records as they are."""
+    suite = rk.motions.Suite([RECORDS[0], 0.5 * RECORDS[2], np.array([0.4, 0.6]) * RECORDS[3]])
+    found = jax.vmap(lambda number: outcome(suite[number]).margin)(jnp.arange(4))
+    expected = [outcome(motion).margin for motion in suite]
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
 MIXED = rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
 
 
@@ -187,7 +195,7 @@ MIXED = rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
         (lambda: SUITE[4], IndexError, "out of range"),
         (lambda: float(jax.jit(lambda k: outcome(SUITE[k]).margin)(4)), Exception, r"must be in \[0, 3\]"),
         (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(1.5), ValueError, "has a whole number"),
-        (lambda: jax.jit(lambda k: outcome(MIXED[k]).margin)(1), ValueError, "must be records, or"),
+        (lambda: jax.jit(lambda k: outcome(MIXED[k]).margin)(1), ValueError, "must be records, also times factors, or"),
     ],
 )
 def test_what_is_refused(choose, error, message):

@@ -1,6 +1,8 @@
 """The command line: what it writes and prints, and one clear line where the input is bad."""
 
 import argparse
+import errno
+import io
 import json
 import logging
 import os
@@ -154,6 +156,48 @@ def test_no_film_of_a_block_that_never_moves(words, at2, tmp_path, capsys, monke
         assert printed.splitlines()[-1] == "no film: the block never uplifts"
 
 
+def test_impacts_of_a_history_that_is_shorter(command, at2, tmp_path):
+    """The table counts those of the motion, and those in the file beside them."""
+    words = ("run", at2, *GIVEN, "--duration", "0.01")
+    _, table, _ = command(*words)
+    assert int(table["impacts during the motion"]) > 0
+    assert table["impacts in 0.01 s of history"] == "0"
+    assert (tmp_path / "out" / "impacts.csv").read_text().count("\n") == 1
+
+
+class Unwritable(io.StringIO):
+    """What is written to it fails."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def flush(self):
+        raise self.error
+
+
+@pytest.mark.parametrize("words", [["cache"], ["cache", "--json"]])
+@pytest.mark.parametrize(
+    "error, status, said",
+    [
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141, ""),
+        (OSError(errno.ENOSPC, "No space left on device"), 2, "jaxrock: error: [Errno 28] No space left on device\n"),
+    ],
+)
+def test_output_that_cannot_be_written(monkeypatch, capsys, words, error, status, said):
+    """At once, or at the end of what is said; nothing is left for Python to complain of."""
+    monkeypatch.setattr(sys, "stdout", Unwritable(error))
+    assert main(words) == status
+    assert capsys.readouterr().err == said
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_the_work(monkeypatch, capsys, at2, tmp_path):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(rk, "simulate", None)
+    assert main(["run", at2, "--out", str(tmp_path / "new" / "folder")]) == 2
+    assert "Argument `--out` must be a folder that can be written" in capsys.readouterr().err
+
+
 def test_run_that_cannot_be_completed(command, at2):
     """Impacts that never die out: exit status 1, and the reason."""
     status, table, errors = command("run", at2, *ENDLESS)
@@ -183,6 +227,9 @@ def test_fragility(command, column, tmp_path):
     )
     assert status == 0 and f"{float(fit.fragility.median):.4f}" in table["median PGA"]
     assert " to ".join(f"{end:.3f}" for end in found.intervals().dispersion) == table["95 % interval of the dispersion"]
+    words[words.index("6")] = "0.21"  # none topples: no fit, and none of the run before in its place
+    assert command("fragility", column, other, *words)[0] == 1
+    assert not (tmp_path / "out" / "fragility.xml").exists()
 
 
 def test_spectrum(command, column, tmp_path):

@@ -121,6 +121,47 @@ def test_feasible_region():
     np.testing.assert_allclose(axis.lines[0].get_ydata(), 0.5)
 
 
+def maps_of(rows, columns):
+    """Figures of a feasible region, sensitivities and a fragility surface of so many rows and columns, which have one
+    value each."""
+    up, across = jnp.geomspace(0.1, 1.0, rows), jnp.geomspace(0.2, 2.0, columns)
+    ones = jnp.ones((rows, columns))
+    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), ones, ones > 0)
+    told = rk.studies.SensitivityMap(up, across, jnp.asarray(0.0), sensitivity_of(jnp.ones((rows, columns, 2))))
+    shares = rk.hazard.SimulatedSurface(up, across, np.ones((1, rows, columns, 1), np.int8))
+    return (
+        rk.plot.feasible_region(region),
+        rk.plot.sensitivity_map(told, "alpha"),
+        rk.plot.fragility_surface(shares, contours=(0.5,)),
+    )
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (1, 3), (1, 1)])
+@pytest.mark.filterwarnings("error")
+def test_other_maps_of_one_row_or_column_are_drawn(shape):
+    for axis in maps_of(*shape):
+        cells = axis.collections[0]
+        corners = cells.get_coordinates()
+        assert np.ma.getdata(cells.get_array()).shape == shape
+        assert np.diff(corners[..., 0], axis=1).min() > 0 and np.diff(corners[..., 1], axis=0).min() > 0
+        assert np.ptp(axis.get_xlim()) > 0 and np.ptp(axis.get_ylim()) > 0
+
+
+def test_a_feasible_region_is_drawn_in_order():
+    """Whatever the order of its lists, cells and border are the same."""
+    rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
+
+    def drawn(up, across):
+        up, across = rows[jnp.array(up)], columns[jnp.array(across)]
+        likelihood = -((jnp.log(up / 0.4)[:, None]) ** 2) - jnp.log(across / 0.7) ** 2
+        region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), likelihood, likelihood > -1)
+        cells, border = rk.plot.feasible_region(region).collections
+        return cells.get_array(), cells.get_coordinates(), border.get_paths()[0].vertices
+
+    for found, expected in zip(drawn([2, 0, 3, 1], [4, 3, 2, 1, 0]), drawn(range(4), range(5))):
+        np.testing.assert_allclose(found, expected)
+
+
 def test_units_of_parameters_are_those_declared():
     assert UNITS == {"amplitude": "g", "duration": "s", "period": "s", "center": "s", "phase": "rad"}
     assert set(PULSES) >= {"sine", "half-sine", "rectangle", "mavroeidis-papageorgiou"}
@@ -161,3 +202,55 @@ def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
     assert "too many islands" in caplog.text and len(pixels.lines) == 0
     assert len(rk.plot.overturning(surface, exact=True).lines) > 2
     plt.close("all")
+
+
+def map_of(state, ratio, intensity):
+    state = jnp.asarray(state)
+    peaks, counts = jnp.where(state == 0, 0.5, jnp.inf), jnp.zeros_like(state)
+    return rk.studies.OverturningMap(
+        jnp.asarray(ratio), jnp.asarray(intensity), state, peaks, counts, peaks, rk.Status.successful
+    )
+
+
+def spectrum_of(lost, abscissa):
+    lost = jnp.asarray(lost)
+    peaks, counts = jnp.where(lost, jnp.inf, 0.5), jnp.zeros(lost.shape, int)
+    return rk.studies.Spectrum(jnp.asarray(abscissa), peaks, peaks, counts, lost, peaks, rk.Status.successful)
+
+
+def test_a_spectrum_may_have_a_logarithmic_axis():
+    for axis in rk.plot.spectrum(spectrum_of([False, True, False], [1.0, 2.0, 3.0])):
+        assert axis.get_ylim()[0] == 0
+        axis.set_yscale("log")
+        assert 0 < axis.get_ylim()[0] < 0.5 < axis.get_ylim()[1]
+
+
+def wrong_figures():
+    """Calls with an argument that is not what is asked for, and what is said of it."""
+    spectrum, told = spectrum_of([False], [1.0]), sensitivity_of([1.0, 2.0])
+    surface = rk.studies.SensitivityMap(jnp.ones(1), jnp.ones(1), jnp.zeros(()), told)
+    numbers, counts, verdicts = jnp.zeros(3), jnp.zeros(3, int), jnp.zeros(3, bool)
+    one = rk.studies.Critical(
+        jnp.array(3), numbers, numbers, verdicts, counts, verdicts, numbers[:, None], jnp.array(True), ("alpha",)
+    )
+    one_axis = plt.figure().add_subplot()
+    plot = rk.plot
+    return [
+        (lambda: plot.history(an_outcome()), "`response` must be a Response"),
+        (lambda: plot.phase(an_outcome()), "`response` must be a Response"),
+        (lambda: plot.spectrum(map_of([[0]], [1.0], [1.0])), "`result` must be a Spectrum"),
+        (lambda: plot.overturning(spectrum), "`result` must be an OverturningMap"),
+        (lambda: plot.overturning(map_of([[0]], [1.0], [1.0]), [one_axis]), "`axis` must be an axis of matplotlib"),
+        (lambda: plot.spectrum(spectrum, one_axis), "`axes` must be 2 axes of matplotlib, but is Axes"),
+        (lambda: plot.spectrum(spectrum, [one_axis]), "`axes` must be 2 axes of matplotlib, but is list of 1"),
+        (lambda: plot.tornado(told, "rotation"), "`result` must be .*max_rotation"),
+        (lambda: plot.sensitivity_map(surface, "shap"), "`parameter` must be .*alpha"),
+        (lambda: plot.scene(rk.Block(0.2, 2.0), None, plt.figure()), "`axis` must be an axis of matplotlib"),
+        (lambda: plot.critical([1.0], one), "`abscissa` and `ends` must be of as many scenes"),
+    ]
+
+
+def test_arguments_of_figures_are_checked():
+    for call, words in wrong_figures():
+        with pytest.raises(ValueError, match=f"Arguments? {words}"):
+            call()

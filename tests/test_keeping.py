@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock._arguments import path_of
 from jaxrock.keeping import facts, folder
+from jaxrock.sweeps.store import local
 from jaxrock.transforms import lowering
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
@@ -23,6 +25,14 @@ QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "kept"))
     return folder.folder()
+
+
+def test_the_folder_may_be_that_of_a_user(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("JAXROCK_CACHE", "~/kept")
+    assert folder.folder().parent == tmp_path / "kept"
+    assert path_of("path", "~/record.AT2") == tmp_path / "record.AT2"
+    assert local("store", "~/outcomes.zarr") == tmp_path / "outcomes.zarr"
 
 
 def test_what_is_written_is_read(place):

@@ -162,6 +162,10 @@ def test_figures(tmp_path):
     """Every function draws into given axes or its own, and returns them."""
     surface = rk.overturning_map(RATIOS[::6], INTENSITIES[::4], **LINEAR)
     response = rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.5, 1.1), QUICK["model"], engine=QUICK["engine"])
+    with plt.style.context("dark_background"):
+        dark = rk.plot.history(response)[2].lines[0].get_color()
+        letters = {text.get_text(): text.get_color() for text in rk.plot.scene(rk.Block(0.2, 2.0)).texts}
+    assert dark == "white" and letters["$m$"] == letters["$R$"] == "black" and letters["$O$"] == "white"
     axes = rk.plot.history(response)
     assert len(axes) == 3 and axes[2].get_xlabel() == "time [s]"
     assert "manifold" in rk.plot.phase(response).get_legend().get_texts()[0].get_text()

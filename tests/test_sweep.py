@@ -24,6 +24,11 @@ jax.monitoring.register_event_duration_secs_listener(
 )
 
 
+def test_whole_numbers_that_single_precision_lacks_are_refused():
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"`n` must be whole numbers .*int32.*3000000000"):
+        rk.sweep(lambda n: n, n=np.array([3_000_000_000, 5]), progress=False)
+
+
 def simple(alpha, p):
     """Something of every kind, which NumPy gives to the last bit."""
     return {"sum": alpha + 16 * p, "above": alpha > p, "count": jnp.int32(8 * p), "pair": jnp.stack([alpha, p])}

@@ -80,14 +80,12 @@ def main(words: list[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # what it cannot show is no reason to stop
     try:
-        status = _done(words)
-        sys.stdout.flush()
-        return status
+        return _done(words)
     except KeyboardInterrupt:
         print("jaxrock: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains once more at its end
+        _drop_output()
         return 141
 
 
@@ -100,12 +98,24 @@ def _done(words: list[str] | None) -> int:
             if command.computes:
                 _prepare(arguments)
             command.run(arguments, report)
-            return report.finished()
+            status = report.finished()
+            sys.stdout.flush()
+            return status
         except BrokenPipeError:
             raise
         except (ValueError, OSError) as error:
             print(f"jaxrock: error: {as_typed(str(error), arguments)}", file=sys.stderr)
+            _drop_output()
             return 2
+
+
+def _drop_output() -> None:
+    """Where the standard output cannot be written, forget what is left of it: Python would complain once more."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError):  # where it is no file there is nothing to drop
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _prepare(arguments: argparse.Namespace) -> None:
@@ -119,3 +129,6 @@ def _prepare(arguments: argparse.Namespace) -> None:
         use_cpu_devices()
     if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
         raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
+    there = next(place for place in (arguments.out, *arguments.out.absolute().parents) if place.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise PermissionError(f"Argument `--out` must be a folder that can be written, but {arguments.out} is not.")

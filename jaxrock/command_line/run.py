@@ -39,7 +39,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     report.title(record.name or "unnamed record")
     size = Entry("width_and_height", "block, width x height", (arguments.width, arguments.height), unit="m",
                  shown=f"{arguments.width:g} x {arguments.height:g}")  # fmt: skip
-    report.table(_entries(size, block, record, model, result))
+    report.table(_entries(size, block, record, model, result, response))
     _write(report, arguments.out, response)
     if arguments.animate:
         _film(report, arguments.out / f"animation.{arguments.animate}", response, block)
@@ -48,7 +48,14 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
             return report.failed(f"these are not results: {rk.Status[status]}")
 
 
-def _entries(size: Entry, block: rk.Block, record: rk.Record, model, result: rk.responses.Outcome) -> list[Entry]:
+def _entries(
+    size: Entry,
+    block: rk.Block,
+    record: rk.Record,
+    model: rk.models.AbstractEquation,
+    result: rk.responses.Outcome,
+    response: rk.responses.Response,
+) -> list[Entry]:
     """Lines of the table."""
     alpha, lost = float(block.alpha), bool(result.overturned)
     ratio, instead = float(result.max_rotation) / alpha, "overturned" if lost else None
@@ -63,7 +70,7 @@ def _entries(size: Entry, block: rk.Block, record: rk.Record, model, result: rk.
         Entry("p", "frequency parameter p", float(block.p), ".4f", "rad/s"),
         Entry("restitution", "restitution", float(block.restitution), ".4f"),
         Entry("uplift_threshold", "uplift threshold", float(model.moments(block).threshold), ".4f", "g"),
-        Entry("impacts", "impacts during the motion", int(result.impact_count)),
+        *_impacts(int(result.impact_count), len(response.impact_times), float(response.duration)),
         Entry("peak_rotation", "peak rotation", unless_lost(result.max_rotation), ".6f", "rad", instead),
         Entry("peak_rotation_over_alpha", "peak rotation / alpha", unless_lost(ratio), ".6f", shown=instead),
         Entry("time_of_peak", "at time", unless_lost(result.time_of_max), ".4f", "s", "-" if lost else None),
@@ -71,6 +78,14 @@ def _entries(size: Entry, block: rk.Block, record: rk.Record, model, result: rk.
         Entry("margin", "margin (0: boundary)", float(result.margin), "+.4f"),
         Entry("overturned", "verdict", lost, shown="OVERTURNS" if lost else "stands"),
     ]
+
+
+def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
+    """The impacts during the motion, and those in the files where these are others."""
+    entries = [Entry("impacts", "impacts during the motion", of_motion)]
+    if of_history != of_motion:
+        entries.append(Entry("impacts_of_history", f"impacts in {duration:g} s of history", of_history))
+    return entries
 
 
 def _write(report: Report, folder: Path, response: rk.responses.Response) -> None:

@@ -26,7 +26,7 @@ def folder() -> Path | None:
     said = os.environ.get("JAXROCK_CACHE", "")
     if said == "off":
         return None
-    return Path(said) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
+    return Path(os.path.expanduser(said)) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
 
 
 def name_of(*parts: object) -> str:

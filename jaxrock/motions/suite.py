@@ -21,7 +21,7 @@ from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peaks_of_motion
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.motions.record import Record, with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
@@ -116,7 +116,7 @@ class Suite(AbstractNamed):
         """One of its motions. Where its number is traced, scenes of all records share their samples.
 
         **Raises:** IndexError for a number without a motion, ValueError for one that is traced, or is no whole number;
-        ValueError for a traced number where motions are of several kinds, or made of records.
+        ValueError for a traced number where motions are of several kinds, or made of records but by a factor.
         """
         if not is_traced(number):
             place = _place(number, len(self))
@@ -132,15 +132,15 @@ class Suite(AbstractNamed):
 
     def _chosen(self, number) -> AbstractMotion:
         """The motion of a traced number."""
-        if all(type(group) is Record and group.samples.shape[-1] > 1 for group in self.groups):
+        if all(_is_record(group.motion if type(group) is Scaled else group) for group in self.groups):
             with _known_stays_so(self.groups):
-                joined = JoinedRecords.of([record for record in self.motions() if isinstance(record, Record)])
+                joined = JoinedRecords.of([_multiplied(motion) for motion in self.motions()])
             return Chosen(joined, number, jnp.ones((), joined.samples.dtype))
         kinds = {jax.tree.structure(group) for group in self.groups}
         if len(kinds) > 1 or any(leaf.is_shared for group in self.groups for leaf in leaves_of(group)):
             raise ValueError(
-                "Motions of a suite must be records, or numbers of one kind of pulse, to be chosen by a traced number: "
-                "take `jaxrock.hazard.suite_outcomes`, or one motion after the other."
+                "Motions of a suite must be records, also times factors, or numbers of one kind of pulse, to be chosen "
+                "by a traced number: take `jaxrock.hazard.suite_outcomes`, or one motion after the other."
             )
         every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *self.groups)
         return one_of_many(every, number)
@@ -164,6 +164,18 @@ def _place(number: Any, count: int) -> int:
     if not -count <= place < count:
         raise IndexError(f"The number of a motion is out of range: {place} of {count} motions.")
     return place % count
+
+
+def _is_record(motion: AbstractMotion) -> bool:
+    return type(motion) is Record and motion.samples.shape[-1] > 1
+
+
+def _multiplied(motion: Any) -> Record:
+    """A record, or one times a factor, as a record with samples of its own."""
+    if isinstance(motion, Record):
+        return motion
+    record = motion.motion
+    return Record(motion.factor * record.samples, record.dt, record.name, record.origin)
 
 
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None):

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxrock.closed_form import sine_pulse, single_lobe
-from jaxrock.plot.style import GREY, RED
+from jaxrock.plot.style import GREY, RED, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(1)
 def safety_regions(
     shape: float, axis: "Axes | None" = None, *, longest: float = 8.0, points: int = 400, legend: bool = True
 ) -> "Axes":
@@ -56,6 +57,7 @@ def safety_regions(
     return axis
 
 
+@figure(1)
 def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ratio: ArrayLike | None = None) -> "Axes":
     """Draw the closed-form curves of overturning under one cycle of a sine over an axis or a map.
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxrock._arguments import arguments
 from jaxrock._checks import Range, scalar, strength
 from jaxrock._parameters import declared
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -18,7 +17,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes, turned
 from jaxrock.plot.responses import acceleration_of
-from jaxrock.plot.style import BLUE, GREY, RED, SAND
+from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +29,7 @@ _PAPER = "#efe3c8"
 _INK: dict[str, Any] = {"color": "black", "linewidth": 0.8}
 
 
-@arguments
+@figure(1)
 def scene(
     block: AnyBlock,
     motion: AbstractMotion | None = None,
@@ -171,8 +170,15 @@ def _symbols(axis: "Axes", body: Body, rotation: float, modelled: bool) -> None:
         _arc(axis, pivot, 0.8 * top, np.pi / 2, upright, r"$\theta$")
     axis.plot(*np.transpose([pivot, centre]), **_INK)
     axis.plot(*centre, "o", color="black", markersize=4)
-    axis.text(*(pivot + 0.62 * (centre - pivot) - [side * 0.5 * gap, 0]), "$R$", ha="center", va="center", fontsize=11)
-    axis.text(*(centre + [0, 0.6 * gap]), "$m$", ha="center", va="center", fontsize=11)
+    axis.text(
+        *(pivot + 0.62 * (centre - pivot) - [side * 0.5 * gap, 0]),
+        "$R$",
+        ha="center",
+        va="center",
+        fontsize=11,
+        color="black",
+    )
+    axis.text(*(centre + [0, 0.6 * gap]), "$m$", ha="center", va="center", fontsize=11, color="black")
     alpha = float(np.arctan2(body.right[0], body.centre[1]))
     _arc(axis, pivot, 0.45 * np.hypot(*body.centre), upright, upright + side * alpha, r"$\alpha$")
 
@@ -204,7 +210,13 @@ def _sides(axis: "Axes", body: Body, rotation: float) -> None:
         axis.plot(*np.transpose([at, centre]), **_INK)
         axis.plot(*np.transpose([at, body.placed(corner + [0, 0.8 * reach], rotation)]), color=GREY, linewidth=0.7,
                   linestyle=":")  # fmt: skip
-        axis.text(*(at + 0.55 * (centre - at) + [side * 0.9 * gap, 0]), f"$R_{number}$", ha="center", fontsize=11)
+        axis.text(
+            *(at + 0.55 * (centre - at) + [side * 0.9 * gap, 0]),
+            f"$R_{number}$",
+            ha="center",
+            fontsize=11,
+            color="black",
+        )
         _arc(axis, at, 0.7 * reach, upright, upright + side * alpha, rf"$\alpha_{number}$")
         axis.text(corner[0] + side * 0.9 * gap, corner[1] - 0.9 * gap, "$O$" if side > 0 else "$O'$", ha="center",
                   va="top", fontsize=11)  # fmt: skip

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 from jaxrock.blocks.rigid import Block
 from jaxrock.inverse.found_record import FoundRecord
 from jaxrock.inverse.history_fit import HistoryFit
-from jaxrock.plot.style import BLUE, GREY, RED
+from jaxrock.plot.style import BLUE, GREY, RED, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(2)
 def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a measured and a fitted history, and what is left between them.
 
@@ -40,6 +41,7 @@ def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" 
     return axes
 
 
+@figure(3)
 def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw a record that was found, the one that was changed, and the change, in time and by frequency.
 

@@ -8,12 +8,13 @@ import numpy as np
 from jaxrock.hazard.fragility import LogNormalFragility
 from jaxrock.hazard.simulation import SimulatedFragility
 from jaxrock.hazard.surfaces import SimulatedSurface, SurfaceFragility
-from jaxrock.plot.style import BLUE, RED, SAND, log_ticks
+from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure, limits_of, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(1)
 def fragility(
     simulated: SimulatedFragility, fit: LogNormalFragility | None = None, axis: "Axes | None" = None
 ) -> "Axes":
@@ -47,6 +48,7 @@ def fragility(
     return log_ticks(axis)
 
 
+@figure(1)
 def fragility_surface(
     simulated: SimulatedSurface,
     fit: SurfaceFragility | None = None,
@@ -70,14 +72,13 @@ def fragility_surface(
         _, axis = plt.subplots(figsize=(5.5, 4), layout="constrained")
     ratio, acceleration = np.asarray(simulated.ratio), np.asarray(simulated.acceleration)
     share = (simulated.lower + simulated.upper) / 2
-    picture = axis.pcolormesh(
-        ratio, acceleration, share, cmap="YlOrBr", vmin=0, vmax=1, shading="nearest", rasterized=True
-    )
+    picture = draw_cells(axis, ratio, acceleration, np.asarray(share), cmap="YlOrBr", vmin=0, vmax=1)
     axis.figure.colorbar(picture, ax=axis, label="probability to topple")
-    lines = axis.contour(ratio, acceleration, share, levels=contours, colors="black", linewidths=1)
-    axis.clabel(lines, fmt=lambda p: f"{100 * p:g} %", fontsize=7)
+    if min(share.shape) > 1:  # a line of cells has no contours
+        lines = axis.contour(ratio, acceleration, share, levels=contours, colors="black", linewidths=1)
+        axis.clabel(lines, fmt=lambda p: f"{100 * p:g} %", fontsize=7)
     if fit is not None:
         for probability in contours:
             axis.plot(ratio, fit.acceleration(probability, ratio), "--", color=BLUE, linewidth=1)
-    axis.set(xlabel="PGV/PGA [s]", ylabel="PGA [g]", ylim=(acceleration[0], acceleration[-1]))
+    axis.set(xlabel="PGV/PGA [s]", ylabel="PGA [g]", ylim=limits_of(acceleration))
     return axis

@@ -7,12 +7,13 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED, log_ticks
+from jaxrock.plot.style import GREY, RED, draw_cells, figure, limits_of, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(1)
 def feasible_region(
     region: FeasibleRegion, estimate: Estimate | None = None, wall: Unexceeded | None = None, axis: "Axes | None" = None
 ) -> "Axes":
@@ -31,10 +32,13 @@ def feasible_region(
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
     rows, columns = (np.asarray(x) for x in region.values)
-    below = np.asarray(region.log_likelihood - region.log_likelihood.max())
-    shade = axis.pcolormesh(columns, rows, np.maximum(below, -20), cmap="Blues", shading="nearest", rasterized=True)
+    up, across = np.argsort(rows), np.argsort(columns)
+    rows, columns = rows[up], columns[across]
+    below = np.asarray(region.log_likelihood - region.log_likelihood.max())[np.ix_(up, across)]
+    shade = draw_cells(axis, columns, rows, np.maximum(below, -20), cmap="Blues")
     axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
-    axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
+    if min(below.shape) > 1:  # a line of cells has no border
+        axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
     if wall is not None:
         axis.plot(wall.durations, wall.amplitude, color=RED, linewidth=1, label="up to here all that stand, stand")
     if estimate is not None and set(region.names) <= set(estimate.names):
@@ -43,7 +47,7 @@ def feasible_region(
         if values.min() > 0:
             scale("log")
     log_ticks(axis)
-    axis.set(xlim=(columns.min(), columns.max()), ylim=(rows.min(), rows.max()))
+    axis.set(xlim=limits_of(columns), ylim=limits_of(rows))
     labels = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
     axis.set(ylabel=labels[0], xlabel=labels[1])
     if wall is not None or estimate is not None:
@@ -51,6 +55,7 @@ def feasible_region(
     return axis
 
 
+@figure(1)
 def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes | None" = None) -> "Axes":
     """Draw where the search of an estimate has been: a line from each start to a dot where it ended.
 

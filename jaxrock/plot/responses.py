@@ -9,7 +9,7 @@ import numpy as np
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.plot.style import BLUE, GREY, RED, SAND
+from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 from jaxrock.responses.history import Response
 
 if TYPE_CHECKING:
@@ -21,6 +21,13 @@ def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
     return np.asarray(motion.acceleration(time))
 
 
+def _ink() -> str:
+    """The colour of text, which is seen on any background."""
+    import matplotlib
+
+    return matplotlib.rcParams["text.color"]
+
+
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
     scene = response.scene
@@ -30,6 +37,7 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
 
 
+@figure(3)
 def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
@@ -53,7 +61,7 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
     impacts = np.asarray(response.impact_times)
     speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
     for axis, curve in zip(axes, (rotation, velocity, acceleration)):
-        axis.plot(time, curve, color=BLUE if axis is not axes[2] else "black", linewidth=0.9)
+        axis.plot(time, curve, color=BLUE if axis is not axes[2] else _ink(), linewidth=0.9)
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
@@ -77,7 +85,7 @@ def _bending_history(response: FlexibleResponse, axes):
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(time, displacement, color=BLUE, linewidth=0.9, label="top")
     axes[1].plot(time, bending, color=SAND, linewidth=0.7, label="of it bending")
-    axes[2].plot(time, acceleration_of(response.scene.ground, time), color="black", linewidth=0.9)
+    axes[2].plot(time, acceleration_of(response.scene.ground, time), color=_ink(), linewidth=0.9)
     labels = (r"rotation of the base $\theta/\alpha$", "displacement [m]", "ground\nacceleration [g]")
     for axis, label in zip(axes, labels):
         axis.axhline(0, color=GREY, linewidth=0.5)
@@ -103,6 +111,7 @@ def _manifold(axis: "Axes", moments: Coefficients, alpha: float) -> None:
         axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
 
 
+@figure(1)
 def phase(response: Response, axis: "Axes | None" = None) -> "Axes":
     """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
 

@@ -7,12 +7,13 @@ import numpy as np
 
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rock import Rock
-from jaxrock.plot.style import BLUE, RED
+from jaxrock.plot.style import BLUE, RED, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@figure(2)
 def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int = 360) -> "Sequence[Axes]":
     """Draw slenderness and frequency parameter of a rock over azimuth, each in a polar plot.
 
@@ -42,6 +43,7 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
     return axes
 
 
+@figure(1)
 def righting(rock: Rock, azimuth: float = 0.0, axis=None):
     """Draw what rights a rock that opens towards an azimuth: the arm of its weight over the opening angle.
 

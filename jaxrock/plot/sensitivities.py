@@ -5,14 +5,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxrock.plot.style import BLUE, RED, SAND
+from jaxrock._checks import one_of
+from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_RESULTS = ("max_rotation", "max_velocity", "margin")
 
+
+@figure(1)
 def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes | None" = None) -> "Axes":
     """Draw the elasticities of one result as bars, the largest on top.
 
@@ -26,6 +30,7 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
     """
     import matplotlib.pyplot as plt
 
+    one_of("result", result, _RESULTS)
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 3), layout="constrained")
     elasticity = np.asarray(getattr(sensitivity, result).elasticity)
@@ -37,6 +42,7 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
     return axis
 
 
+@figure(1)
 def sensitivity_map(
     surface: SensitivityMap,
     parameter: str,
@@ -60,6 +66,8 @@ def sensitivity_map(
     """
     import matplotlib.pyplot as plt
 
+    one_of("result", result, _RESULTS)
+    one_of("parameter", parameter, surface.sensitivity.names)
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
     sensitivity = surface.sensitivity
@@ -69,13 +77,16 @@ def sensitivity_map(
         limit = max(float(np.percentile(np.abs(values[known]), 98)), 1e-12) if known.any() else 1.0
     axis.set_facecolor("#d5d5d5")
     x, y = np.asarray(surface.pulse_duration), np.asarray(surface.uplift_strength)
-    picture = axis.pcolormesh(x, y, values, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="nearest", rasterized=True)
+    rows, columns = np.argsort(y), np.argsort(x)
+    x, y, values = x[columns], y[rows], values[np.ix_(rows, columns)]
+    picture = draw_cells(axis, x, y, values, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.figure.colorbar(picture, ax=axis, label="elasticity")
     axis.set_title(f"{result.replace('_', ' ')} by {parameter.replace('_', ' ')}")
     axis.set(xlabel="pulse duration $p\\,t_d$", ylabel="uplift strength (threshold/amplitude)")
     return axis
 
 
+@figure(1)
 def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) -> "Axes":
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
 
@@ -89,6 +100,11 @@ def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) ->
     """
     import matplotlib.pyplot as plt
 
+    if ends.intensity.ndim != 2 or np.shape(abscissa) != ends.intensity.shape[:1]:
+        raise ValueError(
+            f"Arguments `abscissa` and `ends` must be of as many scenes, along one axis, but have shapes "
+            f"{np.shape(abscissa)} and {ends.intensity.shape[:-1]}."
+        )
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     x = np.broadcast_to(np.asarray(abscissa)[:, None], ends.intensity.shape)

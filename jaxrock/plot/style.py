@@ -1,13 +1,55 @@
-"""Colours that all figures share, curves with gaps, and ticks of logarithmic axes."""
+"""Colours that all figures share, cells of maps, curves with gaps, and ticks of logarithmic axes."""
 
-from typing import TYPE_CHECKING
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
+
+from jaxrock._arguments import arguments
+from jaxrock._checks import shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BLUE, RED, GREY, SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
+
+
+Drawing = TypeVar("Drawing", bound=Callable)
+
+
+def figure(count: int) -> Callable[[Drawing], Drawing]:
+    """Decorate a function that draws into `axis`, or into so many `axes`: all that it is given is checked first.
+
+    **Raises:** ValueError, when it is called, for an argument that is not what is asked for.
+    """
+
+    def decorate(function: Drawing) -> Drawing:
+        checked, signature = arguments(function), inspect.signature(function)
+
+        @functools.wraps(function)
+        def drawing(*args: Any, **kwargs: Any) -> Any:
+            given = signature.bind(*args, **kwargs).arguments
+            if given.get("axis") is not None and not _is_axis(given["axis"]):
+                raise ValueError(f"Argument `axis` must be an axis of matplotlib, but is {shown(given['axis'])}.")
+            if given.get("axes") is not None:
+                _check_axes(given["axes"], count)
+            return checked(*args, **kwargs)
+
+        return cast(Drawing, drawing)
+
+    return decorate
+
+
+def _is_axis(axis: Any) -> bool:
+    return hasattr(axis, "plot") and hasattr(axis, "figure")
+
+
+def _check_axes(axes: Any, count: int) -> None:
+    if not isinstance(axes, (Sequence, np.ndarray)) or len(axes) != count or not all(map(_is_axis, axes)):
+        given = type(axes).__name__ + (f" of {len(axes)}" if hasattr(axes, "__len__") else "")
+        raise ValueError(f"Argument `axes` must be {count} axes of matplotlib, but is {given}.")
 
 
 def log_ticks(axis: "Axes") -> "Axes":
@@ -58,6 +100,17 @@ def cell_edges(places: np.ndarray) -> np.ndarray:
     ends = 2 * places[[0, -1]] - inner[[0, -1]]
     ends = np.where((places[[0, -1]] > 0) & (ends <= 0), places[[0, -1]] / 2, ends)
     return np.concatenate([ends[:1], inner, ends[1:]])
+
+
+def draw_cells(axis: "Axes", across: np.ndarray, up: np.ndarray, values: np.ndarray, **style):
+    """Draw values (up, across) as cells about places that rise, or fall: those of a single one have a width, too."""
+    return axis.pcolormesh(cell_edges(across), cell_edges(up), values, rasterized=True, **style)
+
+
+def limits_of(places: np.ndarray) -> tuple[float, float]:
+    """From where to where an axis shows places that rise: the first and the last, or the cell of a single one."""
+    ends = cell_edges(places) if places.size == 1 else places
+    return float(ends[0]), float(ends[-1])
 
 
 def shade(axis: "Axes", places: np.ndarray, which: np.ndarray, **patch) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, cell_edges, shade
+from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, limits_of, shade
 from jaxrock.studies.borders import Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -21,6 +21,7 @@ _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overt
 _DURATION = "pulse duration $p\\,t_d$"
 
 
+@figure(2)
 def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
     """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
 
@@ -53,8 +54,9 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
         for i, (curve, color) in enumerate(zip(values, colors)):
             label = None if labels is None else f"{float(labels[i]):g}"
             broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
-        if axis.get_yscale() == "linear":
-            axis.set_ylim(bottom=0)
+        axis.update_datalim([(abscissa[0], 0)])  # upward from zero, as long as the axis is not made logarithmic
+        axis.lines[-1].sticky_edges.y.append(0)
+        axis.autoscale_view()
         said = "overturned" if len(values) == 1 else "all overturned"
         shade(axis, abscissa, rows.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
     axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
@@ -70,6 +72,7 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     return axes
 
 
+@figure(1)
 def overturning(
     result: OverturningMap,
     axis: "Axes | None" = None,
@@ -77,6 +80,7 @@ def overturning(
     by_duration: bool = False,
     exact: bool | None = None,
     safe: bool = True,
+    progress: bool | None = None,
 ) -> "Axes":
     """Draw an overturning map: survivors by their peak rotation, overturned without impact, overturned after impacts.
 
@@ -90,6 +94,7 @@ def overturning(
       pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map,
       if they take half a million scenes at most.
     - `safe`: whether survivors are coloured, with a scale beside the axis.
+    - `progress`: whether to draw a progress bar while borders are looked for; None: on a terminal, if it takes long.
 
     **Returns:** the axis.
 
@@ -106,18 +111,17 @@ def overturning(
     y = np.asarray(result.uplift_strength if by_duration else result.intensity)
     rows, columns = np.argsort(y), np.argsort(x)
     x, y, state = x[columns], y[rows], np.asarray(result.state)[np.ix_(rows, columns)]
-    edges = cell_edges(x), cell_edges(y)
     axis.set_facecolor(_SAFE[0])
     if safe:
         shades = LinearSegmentedColormap.from_list("survivors", _SAFE)
         peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation)[np.ix_(rows, columns)], np.nan))
-        picture = axis.pcolormesh(*edges, peaks, cmap=shades, vmin=0, vmax=1, rasterized=True)
+        picture = draw_cells(axis, x, y, peaks, cmap=shades, vmin=0, vmax=1)
         axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
     pixels, found = np.ones(x.size, bool), None
     if exact:
-        found = overturning_borders(result)
+        found = overturning_borders(result, progress=progress)
     elif exact is None and _is_quick(result):
-        found = borders_within(result, _SCENES)
+        found = borders_within(result, _SCENES, progress)
         if found is None:
             _LOG.info("too many islands for exact borders: pixels are drawn (exact=True takes the time)")
     if found is not None:
@@ -126,7 +130,7 @@ def overturning(
             draw_region(axis, region, by_duration)
     lost = np.ma.masked_where((state == 0) | ~pixels, state)
     colors, norm = ListedColormap(_STATES), BoundaryNorm((-1.5, 0.5, 1.5, 2.5), 3)
-    axis.pcolormesh(*edges, lost, cmap=colors, norm=norm, rasterized=True)
+    draw_cells(axis, x, y, lost, cmap=colors, norm=norm)
     if (state == -1).any():
         unknown = np.nonzero(state == -1)
         axis.plot(x[unknown[1]], y[unknown[0]], "kx", markersize=3)
@@ -135,8 +139,7 @@ def overturning(
     shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
     handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
     axis.legend(handles=handles, loc="lower right" if by_duration else "upper left", fontsize=8)
-    xlim, ylim = ((at[0], at[-1]) if at.size > 1 else tuple(ends) for at, ends in zip((x, y), edges))
-    axis.set(xlim=xlim, ylim=ylim)
+    axis.set(xlim=limits_of(x), ylim=limits_of(y))
     axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
     axis.set_ylabel(
         "uplift strength (uplift threshold / peak acceleration)"
@@ -157,8 +160,15 @@ def draw_region(axis: "Axes", region: Region, by_duration: bool = False) -> None
         axis.plot(x, edge, color="black", linewidth=0.5)
 
 
+@figure(1)
 def borders(
-    result: OverturningMap, axis: "Axes | None" = None, *, by_strength: bool = False, scale: float = 1.0, **line: Any
+    result: OverturningMap,
+    axis: "Axes | None" = None,
+    *,
+    by_strength: bool = False,
+    scale: float = 1.0,
+    progress: bool | None = None,
+    **line: Any,
 ) -> "Axes":
     """Draw the borders of an overturning map alone: to lay several over each other.
 
@@ -168,6 +178,7 @@ def borders(
     - `axis`: matplotlib axis; None makes a figure.
     - `by_strength`: uplift strength, one over the intensity, upward in place of the intensity.
     - `scale`: factor on what is drawn upward.
+    - `progress`: as in `overturning`.
     - `line`: colour, style, width and label, as matplotlib names them.
 
     **Returns:** the axis.
@@ -181,13 +192,15 @@ def borders(
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     label = line.pop("label", None)
     ends = [edge(np.asarray(result.intensity)) for edge in (np.min, np.max)]
-    for region in overturning_borders(result).regions:
+    for region in overturning_borders(result, progress=progress).regions:
         for edge in (region.lower, region.upper):
             inside = (edge > ends[0] * (1 + 1e-12)) & (edge < ends[1] * (1 - 1e-12))
             if inside.any():  # not the edge of the map
                 shown = scale * np.where(inside, 1 / edge if by_strength else edge, np.nan)
                 axis.plot(region.frequency_ratio, shown, label=label, **line)
                 label = None
+    axis.set_xlabel(r"frequency ratio $\omega/p$")
+    axis.set_ylabel(("uplift strength" if by_strength else "intensity") + ("" if scale == 1 else f" times {scale:g}"))
     return axis
 
 

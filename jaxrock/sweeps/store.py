@@ -40,7 +40,7 @@ def local(argument: str, path: Any) -> Path:
             f"Argument `{argument}` must be a path of a file system, but is {told!r}. Object stores cannot rename, on "
             "which it depends that nothing is lost: write to a disk, and copy what is finished."
         )
-    return Path(told)
+    return Path(os.path.expanduser(told))
 
 
 class Store:

@@ -196,7 +196,13 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
             f"{array.dtype}."
         )
     array = native(array)
-    return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
+    found = array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
+    if array.dtype.kind in "iu" and (found != array).any():
+        raise ValueError(
+            f"Argument `{name}` must be whole numbers of the precision of the session ({found.dtype}), but has "
+            f"{array[found != array][0]}: enable double precision, or give them as floats."
+        )
+    return found
 
 
 def surface(
