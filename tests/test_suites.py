@@ -121,6 +121,45 @@ def test_every_verdict_under_rectangular_pulses():
         grid.at(2.0)
 
 
+def test_rocks_of_two_sides_both_ways_round():
+    """Slender sides topple above the wall of theirs, to which a rectangular pulse throws them, if no impact follows."""
+    rock = rk.blocks.draw_blocks(
+        rk.blocks.AsymmetricBlock(0.15, 0.25, 2.0, restitution=(0.2, 0.2)), 4, alpha=0.1, p=0.1, seed=4
+    )
+    motions = [rk.RectangularPulse(np.ones(5), DURATIONS)]
+    levels = np.geomspace(0.1, 2.0, 16)
+    quick = {"model": rk.Linear(), "engine": rk.Series(order=6)}
+    found = rk.hazard.simulated_fragility(rock, motions, levels, facing="both", **quick)
+    wall = np.concatenate(
+        [
+            np.asarray(alpha) / np.asarray(WALL(np.asarray(p) * DURATIONS[:, None], -np.inf))
+            for alpha, p in ((rock.alpha2, rock.p2), (rock.alpha1, rock.p1))  # a push to the right lifts it to the left
+        ],
+        axis=1,
+    )
+    np.testing.assert_array_equal(found.verdict, levels[:, None] > wall[:, None, :])
+    alone = rk.hazard.simulated_fragility(rock, motions, levels, **quick)
+    np.testing.assert_array_equal(alone.verdict, found.verdict[..., :4])
+    grid = rk.hazard.simulated_surface(rock, [rk.RectangularPulse], levels, DURATIONS, facing="both", **quick)
+    np.testing.assert_array_equal(grid.verdict[0], np.swapaxes(found.verdict, 0, 1))
+
+
+def test_draws_of_two_sides():
+    """Both are drawn by one factor, about what the restitution follows; ratios that are given stay."""
+    rock = rk.blocks.AsymmetricBlock(0.15, 0.25, 2.0, 0.7)
+    many = rk.blocks.draw_blocks(rock, 2000, alpha=0.1, p=0.05, seed=1)
+    np.testing.assert_allclose(many.alpha2 / many.alpha1, 0.25 / 0.15, rtol=1e-14)
+    assert np.std(np.log(many.p1)) == pytest.approx(0.05, rel=0.05)
+    place = 17
+    one = rk.blocks.AsymmetricBlock(many.alpha1[place], many.alpha2[place], many.p1[place], 0.7)
+    drawn = jax.tree.map(lambda x: x[place], many)
+    np.testing.assert_allclose([drawn.p2, drawn.restitution1], [one.p2, one.restitution1], rtol=1e-14)
+    kept = rk.blocks.draw_blocks(rk.blocks.AsymmetricBlock(0.1, 0.2, 2.0, restitution=(0.9, 0.8)), 3, alpha=0.1)
+    np.testing.assert_array_equal(kept.restitution2, [0.8] * 3)
+    with pytest.raises(ValueError, match="`restitution` must be 0 for an AsymmetricBlock"):
+        rk.blocks.draw_blocks(rock, 3, restitution=0.1)
+
+
 def test_draws_are_what_they_say():
     block = rk.Block(0.2, 2.0, 0.95)
     many = rk.blocks.draw_blocks(block, 20000, alpha=0.1, p=0.05, restitution=0.05, seed=1)
@@ -389,8 +428,8 @@ def test_motions_of_one_name_are_numbered():
             "`pulses` must make motions of amplitude and period, but .*ExponentialPulse.* does not: missing .*'shape'",
         ),
         (
-            lambda: rk.hazard.simulated_fragility(rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0), [RECORD], [0.1, 0.2]),
-            "but is an AsymmetricBlock",
+            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], facing="back"),
+            "`facing` must be",
         ),
         (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
         (lambda: rk.motions.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),

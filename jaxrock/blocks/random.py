@@ -1,11 +1,11 @@
 """Blocks whose parameters are uncertain, as random draws."""
 
-from typing import Annotated
+from typing import Annotated, Any, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import not_negative, positive, scalar
@@ -20,50 +20,92 @@ def _deviation(name: str, value: ArrayLike) -> float:
     return float(scalar(name, not_negative(name, value)))
 
 
+@overload
+def draw_blocks(
+    block: Block, draws: int, *, alpha: float = ..., p: float = ..., restitution: float = ..., seed: int = ...
+) -> Block: ...
+
+
+@overload
+def draw_blocks(
+    block: AsymmetricBlock, draws: int, *, alpha: float = ..., p: float = ..., restitution: float = ..., seed: int = ...
+) -> AsymmetricBlock: ...
+
+
 @arguments
 def draw_blocks(
-    block: Block,
+    block: Block | AsymmetricBlock,
     draws: Annotated[int, at_least(1, 10**7)],
     *,
     alpha: Annotated[float, _deviation] = 0.0,
     p: Annotated[float, _deviation] = 0.0,
     restitution: Annotated[float, _deviation] = 0.0,
     seed: Annotated[int, at_least(0, 2**32 - 1)] = 0,
-) -> Block:
+) -> Block | AsymmetricBlock:
     """Blocks whose parameters are uncertain, as random draws.
 
     **Arguments:**
 
     - `block`: medians of slenderness and frequency parameter, mean of the restitution.
     - `draws`: how many.
-    - `alpha`, `p`: standard deviations of their logarithms [-], 0 or more.
+    - `alpha`, `p`: standard deviations of their logarithms [-], 0 or more; both sides of an `AsymmetricBlock` are drawn
+      by the same factor.
     - `restitution`: standard deviation [-] of a normal distribution that is cut off at 0 and 1; at 0 restitution
-      stays, and follows alpha if it is Housner's.
+      stays, and follows alpha if it is Housner's, or told by angular momentum. It is 0 for an `AsymmetricBlock`.
     - `seed`: of the random numbers.
 
-    **Returns:** a `Block` with parameters of shape (draws,).
+    **Returns:** a block of the same kind with parameters of shape (draws,).
 
     **Raises:** ValueError for arguments outside their ranges.
     """
     check_single(block=block)
+    keys = jax.random.split(jax.random.key(seed), 3)
+    alphas, ps = (jnp.exp(by * jax.random.normal(key, (draws,))) for key, by in zip(keys, (alpha, p)))
+    try:
+        if isinstance(block, AsymmetricBlock):
+            return _drawn_sides(block, alphas, ps, restitution)
+        return _drawn(block, alphas, ps, restitution, keys[2])
+    except _NoBlock as error:
+        names = " and ".join(f"`{name}`" for name, deviation in (("alpha", alpha), ("p", p)) if deviation > 0)
+        said = f"let all {draws} draws be blocks, but one is none ({str(error).rstrip('.')})"
+        raise ValueError(f"The standard deviation {names} must {said}. Lower it, or draw less stocky blocks.") from None
+
+
+class _NoBlock(ValueError):
+    """Some draw is outside of its range."""
+
+
+def _made(kind: type, *parameters) -> Any:
+    try:
+        return kind(*parameters)
+    except ValueError as error:
+        raise _NoBlock(str(error)) from None
+
+
+def _drawn(block: Block, alpha: Array, p: Array, restitution: float, key: Array) -> Block:
+    """Blocks whose slenderness and frequency parameter are times these factors."""
     if restitution != 0 and block.law.depends_on_speed:
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution depends on the speed.")
     if restitution != 0 and tells_sides(block.law, block.corners):
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution tells its sides apart.")
-    keys = jax.random.split(jax.random.key(seed), 3)
-    normal = [jax.random.normal(key, (draws,)) for key in keys[:2]]
-    alphas, ps = block.alpha * jnp.exp(alpha * normal[0]), block.p * jnp.exp(p * normal[1])
     if restitution == 0:
-        law = jax.tree.map(lambda x: jnp.broadcast_to(x, (draws,)), block.law)
+        law = _each(block.law, alpha.shape)
     else:
         ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
-        law = block.restitution + restitution * jax.random.truncated_normal(keys[2], *ends, (draws,))
-    try:
-        return Block(alphas, ps, law)
-    except ValueError as error:
-        names = " and ".join(f"`{name}`" for name, deviation in (("alpha", alpha), ("p", p)) if deviation > 0)
-        said = f"let all {draws} draws be blocks, but one is none ({str(error).rstrip('.')})"
-        raise ValueError(f"The standard deviation {names} must {said}. Lower it, or draw less stocky blocks.") from None
+        law = block.restitution + restitution * jax.random.truncated_normal(key, *ends, alpha.shape)
+    return _made(Block, alpha * block.alpha, p * block.p, law)
+
+
+def _drawn_sides(block: AsymmetricBlock, alpha: Array, p: Array, restitution: float) -> AsymmetricBlock:
+    if restitution != 0:
+        raise ValueError("Argument `restitution` must be 0 for an AsymmetricBlock, whose sides have each its own.")
+    inertia, radius, law = _each((block.inertia_ratio, block.given_radius_ratio, block.law), alpha.shape)
+    angles = alpha * block.alpha1, alpha * block.alpha2
+    return _made(AsymmetricBlock, *angles, p * block.p1, inertia, radius, law)
+
+
+def _each(tree: Any, shape: tuple[int, ...]) -> Any:
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), tree)
 
 
 def _tolerances(name: str, value) -> tuple[float, float]:

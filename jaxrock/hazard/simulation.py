@@ -6,6 +6,7 @@ without a verdict bounds the probability from both sides.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -13,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int8
 
-from jaxrock._arguments import arguments
+from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, checked, one_of
 from jaxrock._tables import AbstractTable, Column
+from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
@@ -33,7 +35,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite, repeated
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
+from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, as_draws, both_ways, scenes, stacked
 
 
 def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
@@ -215,11 +217,12 @@ def _clustered(fit: FragilityFit, levels, toppled, draws):
 
 @arguments
 def simulated_fragility(
-    block: Block,
+    block: Block | AsymmetricBlock,
     motions: Suite | Sequence[AbstractMotion],
     levels: Values,
     model: AbstractEquation = Housner(),
     *,
+    facing: Annotated[str, word_of(*FACINGS)] = "one",
     measure: str | Callable[[AbstractMotion], float] = "PGA",
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -228,9 +231,12 @@ def simulated_fragility(
 
     **Arguments:**
 
-    - `block`: a `Block`; with parameters of shape (draws,) uncertain, such as `draw_blocks` makes.
+    - `block`: a `Block` or `AsymmetricBlock`; with parameters of shape (draws,) uncertain, such as `draw_blocks` and
+      `draw_rocks` make.
     - `motions`: a `Suite`, or what makes one, of motions that differ.
     - `levels`: (levels,) of the measure, positive and rising; two or more.
+    - `facing`: "one": as it stands; "both": also turned round, as draws after those that are not, where nobody knows
+      which way the motion comes.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
     - `measure`: what the levels are: "PGA" [g], "PGV" [m/s], "PGD" [m], "IA" (Arias) or "CAV" [m/s], "SA(0.5)" [g] or
       "SV(0.5)" [m/s] at a period [s]; or a function of a motion that grows as a power of its scale, such as
@@ -256,9 +262,9 @@ def simulated_fragility(
     factors = _factors(levels, strength, power)
     strongest = factors * np.asarray(suite.peak_acceleration)[:, None]
     checked("levels", strongest.max(axis=0), "keep all motions at 1e9 g or below", lambda x: x <= 1e9)
-    verdict = scenes(stacked(block), suite, factors, model, engine, progress).verdict
+    found = scenes(stacked(block), suite, both_ways(factors, facing), model, engine, progress)
     peaks = suite.peak_acceleration, suite.peak_velocity
-    return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power)
+    return SimulatedFragility(levels, as_draws(found.verdict, facing), *peaks, suite.names, kind.name, strength, power)
 
 
 def _factors(levels, strength, power: float) -> np.ndarray:

@@ -18,7 +18,6 @@ from jaxrock._checks import Values, checked, positive, shown, size
 from jaxrock._parameters import leaves_of
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
@@ -26,9 +25,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import Measure, measure_of, scaled_strengths
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite, repeated
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, scenes, stacked
-
-_FACINGS = {"one": (1,), "both": (1, -1)}
+from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, is_symmetric, scenes, stacked
 
 
 class SuiteOutcomes(AbstractTable):
@@ -147,7 +144,7 @@ def suite_outcomes(
     scale: Values = 1.0,
     model: AbstractEquation = Housner(),
     *,
-    facing: Annotated[str, word_of(*_FACINGS)] = "one",
+    facing: Annotated[str, word_of(*FACINGS)] = "one",
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SuiteOutcomes:
@@ -178,8 +175,8 @@ def suite_outcomes(
         warnings.warn(f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.", stacklevel=3)
     strongest = float(np.max(suite.peak_acceleration))
     checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
-    blocks, ways = stacked(block), _FACINGS[facing]
-    symmetric = isinstance(block, Block) and not tells_sides(block.law, block.corners)
+    blocks, ways = stacked(block), FACINGS[facing]
+    symmetric = is_symmetric(block)
     factors = np.concatenate([way * scales for way in (ways[:1] if symmetric else ways)])
     found = scenes(blocks, suite, factors, model, engine, progress)
     draws = jax.tree.leaves(blocks)[0].shape[0]

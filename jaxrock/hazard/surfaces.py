@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact, Int8
 
-from jaxrock._arguments import arguments, list_of
+from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import (
     Values,
     check_shapes,
@@ -51,7 +51,7 @@ from jaxrock.motions.motion import AbstractMotion, Scaled
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, stacked
+from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, as_draws, both_ways, stacked
 from jaxrock.sweeps.sweep import surface
 
 
@@ -261,12 +261,13 @@ class SimulatedSurface(eqx.Module):
 
 @arguments
 def simulated_surface(
-    block: Block,
+    block: Block | AsymmetricBlock,
     pulses: Annotated[Sequence[Callable[[ArrayLike, ArrayLike], AbstractMotion]], list_of(callable, "functions")],
     acceleration: Values,
     ratio: Values,
     model: AbstractEquation = Housner(),
     *,
+    facing: Annotated[str, word_of(*FACINGS)] = "one",
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> SimulatedSurface:
@@ -274,7 +275,7 @@ def simulated_surface(
 
     **Arguments:**
 
-    - `block`: a `Block`; with parameters of shape (draws,) uncertain, such as `draw_blocks` makes.
+    - `block`, `facing`: as in `simulated_fragility`.
     - `pulses`: make motions of amplitude [g] and period or duration [s], to which their peaks are proportional: of the
       first the acceleration, of both the velocity. All have one weight.
     - `acceleration`: (rows,) peak accelerations [g], positive and rising.
@@ -297,8 +298,9 @@ def simulated_surface(
         # One motion of amplitude 1 g for every ratio, scaled to every acceleration.
         period = ratio * GRAVITY * peak / speed
         group = jax.vmap(lambda t, pulse=pulse: pulse(jnp.ones_like(t), t))(period)
-        factors = np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size))
-        parts.append(_verdicts(blocks, group, factors, model, engine, progress).swapaxes(0, 1))
+        factors = both_ways(np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size)), facing)
+        verdict = _verdicts(blocks, group, factors, model, engine, progress)
+        parts.append(as_draws(verdict, facing).swapaxes(0, 1))
     return SimulatedSurface(acceleration, ratio, np.stack(parts))
 
 

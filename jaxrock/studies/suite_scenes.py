@@ -14,6 +14,7 @@ from jaxrock._checks import placed
 from jaxrock._parameters import one_of_many
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import Scaled
@@ -24,6 +25,7 @@ from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 
 STOOD, TOPPLED, UNDECIDED = 0, 1, -1
+FACINGS = {"one": (1,), "both": (1, -1)}  # signs of the motion
 
 
 class Scenes(NamedTuple):
@@ -46,6 +48,23 @@ def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
     if len(shape) > 1:
         raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
     return jax.tree.map(lambda x: placed(np.broadcast_to(np.asarray(x), shape)), block)
+
+
+def is_symmetric(block: Block | AsymmetricBlock) -> bool:
+    """Whether a block that is turned round is its own mirror image."""
+    return isinstance(block, Block) and not tells_sides(block.law, block.corners)
+
+
+def both_ways(factors: np.ndarray, facing: str) -> np.ndarray:
+    """Factors (motions, levels) as they are, and with the other sign after them, where blocks are turned round."""
+    return np.concatenate([way * factors for way in FACINGS[facing]], axis=1)
+
+
+def as_draws(verdict: np.ndarray, facing: str) -> np.ndarray:
+    """Verdicts (motions, levels, draws) under factors of `both_ways`: blocks that are turned round are more draws."""
+    motions, rows, draws = verdict.shape
+    ways = len(FACINGS[facing])
+    return verdict.reshape(motions, ways, -1, draws).swapaxes(1, 2).reshape(motions, rows // ways, ways * draws)
 
 
 def scenes(
