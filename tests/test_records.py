@@ -1,5 +1,7 @@
 """Readers of accelerograms: every variant of the formats, and every way in which a file can be wrong."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -202,6 +204,7 @@ def test_v2(file, content):
     assert record.dt == 0.01
 
 
+@pytest.mark.filterwarnings("ignore:.*holds an acceleration of")
 def test_v2_values_that_touch_are_split_by_width(file):
     values = np.array([-12345.678, -23456.789, 123456.789, 1.5])
     record = read_record(file(channel(values=values)))
@@ -347,6 +350,15 @@ def test_titles_hold_blanks_beside_tabs_and_blanks(file, separator, title):
 def test_unit_of_times_counts_beside_a_title_without_a_unit(file, title):
     record = read_record(file(f"{title}\n{PAIRS.replace(',', ' ')}"), unit="g")
     np.testing.assert_allclose(record.dt, 1e-3 * read_record(file(PAIRS, "usual.txt"), unit="g").dt, rtol=1e-12)
+
+
+def test_a_mark_of_a_gap_and_a_wrong_unit_are_warned_of(file):
+    """Samples beyond all that was ever recorded."""
+    with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 999 g, more than .* is its unit g"):
+        read_record(file("0.1\n-999\n0.2\n"), dt=0.01, unit="g")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_record(file("100\n-999\n200\n"), dt=0.01, unit="cm/s2")
 
 
 def test_a_title_of_one_column_states_its_unit(file):
