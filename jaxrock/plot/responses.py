@@ -112,7 +112,7 @@ def _manifold(axis: "Axes", moments: Coefficients, alpha: float) -> None:
 
 
 @figure(1)
-def phase(response: Response, axis: "Axes | None" = None) -> "Axes":
+def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> "Axes":
     """Draw the orbit in the phase plane, with the stable manifold of the upright saddles.
 
     **Arguments:**
