@@ -67,7 +67,7 @@ def parameter(
     **Returns:** a field for an Equinox module. A value outside of its range raises ValueError where an object is made;
     of traced ones nothing is asked.
     """
-    if isinstance(range, str):
+    if not isinstance(range, Range):
         range = RANGES[one_of("range", range, tuple(RANGES))]
     return eqx.field(metadata={"parameter": Parameter(unit, range, symbol, axes, follows, is_free, argument, is_whole)})
 
@@ -104,8 +104,12 @@ def check_declared(owner: eqx.Module) -> None:
         return
     for name, known in declared(kind).items():
         value = getattr(owner, name)
-        if value is not None and not is_traced(value):
-            known.range(known.argument or name, value)
+        if value is None or is_traced(value):
+            continue
+        called = known.argument or name
+        known.range(called, value)
+        if isinstance(value, (list, tuple)):
+            raise ValueError(f"Argument `{called}` must be a number or an array, as of `numpy.asarray`, but is a list.")
 
 
 if TYPE_CHECKING:

@@ -209,6 +209,20 @@ def test_forces_are_those_of_the_response_and_its_block():
             rk.responses.contact_forces(response, rk.Block(0.2, 2.0))
 
 
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()])
+def test_forces_are_refused_of_a_block_whose_other_side_is_another(model):
+    own = rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0)
+    response = rk.simulate(own, rk.SinePulse(0.4, 0.6), model, engine=rk.Series(order=8), samples=2)
+    assert rk.responses.contact_forces(response, own).keeps_contact
+    turned, wider = rk.blocks.AsymmetricBlock(0.25, 0.2, 2.0), rk.blocks.AsymmetricBlock(0.2, 0.3, 2.0)
+    for other in (turned, wider, rk.Block(0.2, 2.0, rk.restitution.PerSide(0.9, 0.8))):
+        with pytest.raises(ValueError, match="must be that of the response, whose sides uplift at"):
+            rk.responses.contact_forces(response, other)
+    alike = rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.4, 0.6), model, engine=rk.Series(order=8), samples=2)
+    with pytest.raises(ValueError, match="tells 0 sides apart, but is a Block whose .* tells 2 sides apart"):
+        rk.responses.contact_forces(alike, rk.Block(0.2, 2.0, rk.restitution.PerSide(0.9, 0.8)))
+
+
 @needs_references
 def test_housner_friction():
     """A rectangle needs 3 tan(alpha)/(4 + tan^2(alpha)) at an impact; one that never moves, the motion's peak."""

@@ -1,10 +1,13 @@
 """Fits to histories of asymmetric blocks, against free rocking integrated by SciPy."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
+from jaxrock.inverse.history_scene import FittedScene
+from jaxrock.studies.parameters import declarations, named, rebuilt
 
 TRUTH = {"alpha1": 0.20, "alpha2": 0.32, "p1": 2.5, "restitution1": 0.88, "restitution2": 0.92, "initial": 0.13}
 KAPPA = 0.72  # m R1^2/I1
@@ -60,3 +63,30 @@ def test_names_are_those_of_the_block():
     block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5)
     with pytest.raises(ValueError, match="be different names out of alpha1, alpha2, p1"):
         rk.inverse.fit_history(TIME, np.cos(TIME), block, parameters=("alpha", "p"))
+
+
+@pytest.mark.parametrize(
+    "law, names",
+    [
+        (None, ["restitution"]),
+        (rk.restitution.PerSide(0.9, 0.8), ["restitution.first", "restitution.second"]),
+        (rk.restitution.SpeedDependent(0.9, 0.8, 0.3), [f"restitution.{x}" for x in ("gentle", "violent", "scale")]),
+    ],
+)
+def test_what_is_fitted_of_itself_are_the_parameters_of_the_law(law, names):
+    scene = FittedScene.of(rk.Block(0.2, 2.5, law), None, rk.Housner(), None, None, np.cos(TIME), None)
+    assert scene.names == ("alpha", "p", *names, "initial")
+
+
+def test_one_number_is_the_restitution_of_both_sides():
+    """Of an asymmetric block, too: by name, with its range, and as what is fitted of itself."""
+    law, motion = rk.restitution.Constant(0.9), rk.SinePulse(0.4, 0.6)
+    block = rk.blocks.AsymmetricBlock(0.2, 0.3, 2.5, restitution=law)
+    values = named(block, motion)
+    assert values["restitution"] == 0.9 and {"restitution1", "restitution2"}.isdisjoint(values)
+    assert declarations(block, motion)["restitution"].range.high == 1
+    again, _ = rebuilt(block, motion, values | {"restitution": 0.8})
+    assert float(again.restitution1) == float(again.restitution2) == 0.8
+    assert jax.tree.structure(again.law) == jax.tree.structure(block.law)
+    scene = FittedScene.of(block, None, rk.Housner(), None, None, np.cos(TIME), None)
+    assert scene.names == ("alpha1", "alpha2", "p1", "restitution", "initial")

@@ -486,6 +486,11 @@ def test_pushover_has_ranges():
         for rotation in (1.6, -0.1):
             with pytest.raises(ValueError, match=r"Argument `rotation` must be in \[0, pi/2\), but is"):
                 ask(rotation, 0.2)
+    for ask in (pushover.force, pushover.energy):  # a force beyond would have the wrong sign, and a work too
+        for rotation in (1.6, -0.1):
+            with pytest.raises(ValueError, match=r"Argument `rotation` must be in \[0, pi/2\], but is"):
+                ask(rotation, 0.2)
+    assert float(pushover.force(np.pi / 2, 0.2)) == pytest.approx(-1 / np.tan(0.2))
     with pytest.raises(ValueError, match="Argument `impacts` must be 0 or more"):
         pushover.amplitude_after(-5, 0.9, 0.5)
 

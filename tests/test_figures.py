@@ -181,6 +181,19 @@ def test_a_map_of_one_row_or_column_is_drawn():
         plt.close(axis.figure)
 
 
+@pytest.mark.filterwarnings("error")
+def test_places_that_are_there_twice_have_one_cell():
+    """Of two alike neither would have a width, and all would be the colour of the safe."""
+    result = rk.overturning_map([2.0, 2.0], [4.0, 3.0, 4.0], alpha=0.2, progress=False)
+    axis = rk.plot.overturning(result, exact=False)
+    drawn = axis.collections[-1]
+    np.testing.assert_array_equal(np.ma.filled(drawn.get_array(), 0), np.asarray(result.state)[[1, 0], :1])
+    assert (np.asarray(result.state) > 0).all()
+    assert np.ptp(drawn.get_coordinates()[..., 0]) > 0.1 and np.ptp(axis.get_xlim()) > 0.1
+    plt.close(axis.figure)
+    rk.plot.overturning(result, exact=True)
+
+
 def test_sizes_that_overturn_alone_are_shaded():
     """A spectrum's overturned sizes each have a cell, half way to their neighbours."""
     spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), np.linspace(0.5, 8, 200), progress=False)

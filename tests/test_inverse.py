@@ -502,6 +502,8 @@ def refused(folder, header, line, message):
         ("alpha_deg,p_rad_per_s,observed,inertia_ratio", "`inertia_ratio`, which is for rocks whose sides differ"),
         ("alpha_deg,alpha_rad,p_rad_per_s,observed", "must have one of the columns alpha_rad, alpha_deg"),
         ("alpha_deg,observed", "must have one of the columns p_rad_per_s"),
+        ("alpha_deg,p_rad_per_s,half_diagonal_m,observed", "radius1_m, and only one"),
+        ("alpha_deg\tp_rad_per_s\tobserved", "by commas, not by tabs"),
         ("width,height_m,observed", "a column `width`; the nearest that is known: width_m"),
         ("alpha_deg,p_rad_per_s,observed,xyz", "a column `xyz`; known are alpha1_deg, .*width_m_sd"),
     ],

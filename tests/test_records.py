@@ -1,5 +1,7 @@
 """Readers of accelerograms: every variant of the formats, and every way in which a file can be wrong."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -202,6 +204,7 @@ def test_v2(file, content):
     assert record.dt == 0.01
 
 
+@pytest.mark.filterwarnings("ignore:.*holds an acceleration of")
 def test_v2_values_that_touch_are_split_by_width(file):
     values = np.array([-12345.678, -23456.789, 123456.789, 1.5])
     record = read_record(file(channel(values=values)))
@@ -324,7 +327,51 @@ def test_unit_of_a_column_is_in_its_title(file, title, per_g):
         read_record(path, unit="m/s2" if per_g != 9.80665 else "g")
 
 
-@pytest.mark.parametrize("title", ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a"])
+@pytest.mark.parametrize(
+    "separator, title",
+    [
+        ("\t", "t [ms]\tacceleration of the table [cm/s2]"),
+        ("\t", "t (ms)\ta (Gal)\t"),
+        ("\t", "t [ms], a [cm/s2]"),
+        (" ", "Time (ms)  Acc (cm/s/s)"),
+        (" ", "t [ms] ground acceleration [cm/s2]"),
+    ],
+)
+def test_titles_hold_blanks_beside_tabs_and_blanks(file, separator, title):
+    path = file(f"{title}\n{PAIRS.replace(',', separator)}")
+    record = read_record(path)
+    np.testing.assert_allclose(record.samples, SAMPLES / 980.665)
+    np.testing.assert_allclose(record.dt, 1e-3 * read_record(file(PAIRS, "usual.txt"), unit="g").dt, rtol=1e-12)
+    with pytest.raises(ValueError, match="Argument `unit` must agree with file"):
+        read_record(path, unit="g")
+
+
+@pytest.mark.parametrize("title", ["t (ms)\ta", "t (ms) a"])
+def test_unit_of_times_counts_beside_a_title_without_a_unit(file, title):
+    record = read_record(file(f"{title}\n{PAIRS.replace(',', ' ')}"), unit="g")
+    np.testing.assert_allclose(record.dt, 1e-3 * read_record(file(PAIRS, "usual.txt"), unit="g").dt, rtol=1e-12)
+
+
+def test_a_mark_of_a_gap_and_a_wrong_unit_are_warned_of(file):
+    """Samples beyond all that was ever recorded."""
+    with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 999 g, more than .* is its unit g"):
+        read_record(file("0.1\n-999\n0.2\n"), dt=0.01, unit="g")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_record(file("100\n-999\n200\n"), dt=0.01, unit="cm/s2")
+
+
+def test_a_title_of_one_column_states_its_unit(file):
+    path = file("Ground acceleration (cm/s2)\n" + "".join(f"{a!r}\n" for a in SAMPLES.tolist()))
+    np.testing.assert_allclose(read_record(path, dt=0.02).samples, SAMPLES / 980.665)
+    with pytest.raises(ValueError, match="Argument `unit` must agree with file"):
+        read_record(path, dt=0.02, unit="g")
+
+
+@pytest.mark.parametrize(
+    "title",
+    ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a", "Sta A (NS) motion (corrected)"],
+)
 def test_other_titles_state_no_unit(file, title):
     path = file(f"{title}\n{PAIRS}")
     with pytest.raises(ValueError, match="which states none"):

@@ -81,6 +81,10 @@ def test_what_is_declared_has_its_range():
         Ramps(1.0, corners, -0.7)
     with pytest.raises(ValueError, match=r"Argument `strength` must be in \[0, 1\], but is 1.5"):
         Softer(np.array([0.5, 1.5]))
+    with pytest.raises(ValueError, match="Argument `strength` must be a number or an array, as of `numpy.asarray`"):
+        Softer([0.5, 0.6])
+    with pytest.raises(ValueError, match=r"Argument `range` must be one of 'positive', .*, but is \(0, 1\)"):
+        rk.parameter("-", (0, 1))
     made = jax.vmap(lambda step: Ramps(1.0, corners, step))(jnp.array([0.2, -0.2]))
     assert made.step.shape == (2,)
 

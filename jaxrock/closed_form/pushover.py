@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, checked, finite, not_negative, one_of, share
+from jaxrock._checks import acute, checked, not_negative, one_of, share
 from jaxrock.transforms.elementwise import elementwise
 
 __all__ = [
@@ -33,7 +33,13 @@ def _leaning(name, value):
     return checked(name, value, "be in [0, pi/2)", lambda x: (x >= 0) & (x < jnp.pi / 2))
 
 
-_elementwise = elementwise(alpha=acute, rotation=finite, amplitude=_below_one, restitution=share, impacts=not_negative)
+def _up_to_flat(name, value):
+    return checked(name, value, "be in [0, pi/2]", lambda x: (x >= 0) & (x <= jnp.pi / 2))
+
+
+_elementwise = elementwise(
+    alpha=acute, rotation=_up_to_flat, amplitude=_below_one, restitution=share, impacts=not_negative
+)
 _of_springs = elementwise(alpha=acute, rotation=_leaning)
 
 
@@ -46,7 +52,9 @@ def force(rotation: Real, alpha: Real) -> Result:
 
     **Arguments:**
 
-    - `rotation`: [rad], positive. `alpha`: slenderness angle [rad], in (0, pi/2).
+    - `rotation`: [rad], in [0, pi/2], where the block lies flat. `alpha`: slenderness angle [rad], in (0, pi/2).
+
+    **Raises:** ValueError for arguments outside their ranges.
 
     **Source:** Diamantopoulos & Fragiadakis (2017), equation 16: tan(alpha - rotation).
     """
@@ -113,7 +121,13 @@ def overturning_moment_ratio(rotation: Real, alpha: Real) -> Result:
 
 @_elementwise
 def energy(rotation: Real, alpha: Real) -> Result:
-    """Work over m g R that brings the block from rest to a rotation [rad].
+    """Work over m g R that brings the block from rest to a rotation.
+
+    **Arguments:**
+
+    - `rotation`: [rad], in [0, pi/2], where the block lies flat. `alpha`: slenderness angle [rad], in (0, pi/2).
+
+    **Raises:** ValueError for arguments outside their ranges.
 
     **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 4.12 corrected:
     cos(alpha - rotation) - cos(alpha).

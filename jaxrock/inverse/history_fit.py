@@ -148,7 +148,8 @@ def fit_history(
     - `block`, `motion`: where to start, and what is not fitted; a motion of None rests (free rocking).
     - `model`: as in `outcome`.
     - `parameters`: names of what is fitted: "alpha", "p", "restitution" (of an asymmetric block "alpha1", "alpha2",
-      "p1", "inertia_ratio", "radius_ratio", "restitution1", "restitution2"); those of the motion ("amplitude" [g] also
+      "p1", "inertia_ratio", "radius_ratio", "restitution1", "restitution2"; of a law of restitution with parameters
+      these, as "restitution.gentle"); those of the motion ("amplitude" [g] also
       of a record, whose peak it is); "initial" [rad] and "velocity" [rad/s] at time 0; and of the measurement its
       "delay" [s] behind the motion (before it, the block is as it was at time 0) and its "offset" [rad]. None: angles,
       frequency parameter and restitutions of the block, and "initial".

@@ -27,10 +27,7 @@ from jaxrock.studies.parameters import declarations, named, rebuilt
 
 _OF_MEASUREMENT = ("initial", "velocity", "delay", "offset")
 
-_USUAL: dict[type, tuple[str, ...]] = {
-    Block: ("alpha", "p", "restitution", "initial"),
-    AsymmetricBlock: ("alpha1", "alpha2", "p1", "restitution1", "restitution2", "initial"),
-}
+_SHAPE: dict[type, tuple[str, ...]] = {Block: ("alpha", "p"), AsymmetricBlock: ("alpha1", "alpha2", "p1")}
 
 
 class FittedScene(eqx.Module):
@@ -48,11 +45,12 @@ class FittedScene(eqx.Module):
         """Check the names, and fill in what was left open."""
         still = RectangularPulse(0.0, 1.0)
         check_single(block=block, motion=still if motion is None else motion)
-        names, free = tuple(_USUAL[type(block)] if parameters is None else parameters), motion is None
-        motion = still if free else motion
+        free, motion = motion is None, still if motion is None else motion
         if not free and not float(peak_bound(motion)) > 0:
             raise ValueError("Argument `motion` must move the ground; None is free rocking.")
         allowed = [name for name in named(block, motion) if not (free and name in ("amplitude", "duration"))]
+        of_law = [name for name in allowed if name.startswith("restitution")]
+        names = (*_SHAPE[type(block)], *of_law, "initial") if parameters is None else tuple(parameters)
         allowed += _OF_MEASUREMENT
         unknown = [name for name in names if name not in allowed]
         if unknown or not names or len(set(names)) < len(names):

@@ -143,8 +143,9 @@ def _check_comments(file: str, lines: list[str], first: int, header: list[str]) 
 
 
 def _check_header(file: str, header: list[str]) -> None:
-    if len(header) == 1 and ";" in header[0]:
-        raise file_error(file, "must separate its fields by commas, not by semicolons.")
+    for mark, kind in {";": "semicolons", "\t": "tabs"}.items():
+        if len(header) == 1 and mark in header[0]:
+            raise file_error(file, f"must separate its fields by commas, not by {kind}.")
     unknown = [name for name in header if name not in _COLUMNS]
     if unknown:
         near = difflib.get_close_matches(unknown[0], sorted(_COLUMNS), n=3, cutoff=0.5)
@@ -165,7 +166,7 @@ def _check_shapes(file: str, header: set[str]) -> None:
     """Each measure in one way, and of two sides both."""
     for way in _WAYS:
         if len(header.intersection(way)) != 1:
-            raise file_error(file, f"must have one of the columns {', '.join(way)}.")
+            raise file_error(file, f"must have one of the columns {', '.join(way)}, and only one.")
     if header.issuperset(("rotation_rad", "rotation_deg")):
         raise file_error(file, "must have one of the columns rotation_rad, rotation_deg, and not both.")
     for pair in _PAIRS:

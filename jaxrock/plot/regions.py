@@ -7,7 +7,7 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED, draw_cells, figure, limits_of, log_ticks
+from jaxrock.plot.style import GREY, RED, draw_cells, figure, in_order, limits_of, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,9 +31,7 @@ def feasible_region(
 
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    rows, columns = (np.asarray(x) for x in region.values)
-    up, across = np.argsort(rows), np.argsort(columns)
-    rows, columns = rows[up], columns[across]
+    (rows, up), (columns, across) = map(in_order, region.values)
     below = np.asarray(region.log_likelihood - region.log_likelihood.max())[np.ix_(up, across)]
     shade = draw_cells(axis, columns, rows, np.maximum(below, -20), cmap="Blues")
     axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")

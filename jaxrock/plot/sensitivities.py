@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxrock._checks import one_of
-from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure
+from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure, in_order
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
 
@@ -77,8 +77,8 @@ def sensitivity_map(
         limit = max(float(np.percentile(np.abs(values[known]), 98)), 1e-12) if known.any() else 1.0
     axis.set_facecolor("#d5d5d5")
     x, y = np.asarray(surface.pulse_duration), np.asarray(surface.uplift_strength)
-    rows, columns = np.argsort(y), np.argsort(x)
-    x, y, values = x[columns], y[rows], values[np.ix_(rows, columns)]
+    (x, columns), (y, rows) = in_order(x), in_order(y)
+    values = values[np.ix_(rows, columns)]
     picture = draw_cells(axis, x, y, values, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.figure.colorbar(picture, ax=axis, label="elasticity")
     axis.set_title(f"{result.replace('_', ' ')} by {parameter.replace('_', ' ')}")

@@ -102,6 +102,11 @@ def cell_edges(places: np.ndarray) -> np.ndarray:
     return np.concatenate([ends[:1], inner, ends[1:]])
 
 
+def in_order(places) -> tuple[np.ndarray, np.ndarray]:
+    """Places as they rise, each once, and where they were: of two that are alike neither would have a cell."""
+    return np.unique(np.asarray(places), return_index=True)
+
+
 def draw_cells(axis: "Axes", across: np.ndarray, up: np.ndarray, values: np.ndarray, **style):
     """Draw values (up, across) as cells about places that rise, or fall: those of a single one have a width, too."""
     return axis.pcolormesh(cell_edges(across), cell_edges(up), values, rasterized=True, **style)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, limits_of, shade
+from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, shade
 from jaxrock.studies.borders import Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -109,8 +109,8 @@ def overturning(
         _, axis = plt.subplots(figsize=(7, 5), layout="constrained")
     x = np.asarray(result.pulse_duration if by_duration else result.frequency_ratio)
     y = np.asarray(result.uplift_strength if by_duration else result.intensity)
-    rows, columns = np.argsort(y), np.argsort(x)
-    x, y, state = x[columns], y[rows], np.asarray(result.state)[np.ix_(rows, columns)]
+    (x, columns), (y, rows) = in_order(x), in_order(y)
+    state = np.asarray(result.state)[np.ix_(rows, columns)]
     axis.set_facecolor(_SAFE[0])
     if safe:
         shades = LinearSegmentedColormap.from_list("survivors", _SAFE)

@@ -86,21 +86,32 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
 
 def _check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
     """Raise ValueError where a block is known not to be that of a scene."""
-    if is_traced((scene.p, scene.alpha, block)):
+    if is_traced((scene, block)):
         return
     if isinstance(block, Block):
-        fits = scene.far is None or tells_sides(block.law, block.corners)
-        angles, rate = [block.alpha], block.p
+        angles, rate, differ = [block.alpha] * 2, block.p, tells_sides(block.law, block.corners)
     else:
-        angles, rate, fits = [block.alpha1, block.alpha2], block.p1, scene.far is not None
-    own, given = np.array([scene.alpha, scene.p]), np.array([np.min(angles), rate])
-    alike = np.allclose(own, given, rtol=1e-5 if own.dtype.itemsize < 8 else 1e-9, atol=0, equal_nan=True)
-    if not (alike and fits):
-        told = "alpha and p are {:.6g} rad and {:.6g} rad/s".format
-        raise ValueError(
-            f"Argument `block` must be that of the response, whose {told(*own)}, but is a {type(block).__name__} whose "
-            f"{told(*given)}."
-        )
+        angles, rate, differ = [block.alpha1, block.alpha2], block.p1, True
+    rtol = 1e-5 if np.asarray(scene.alpha).dtype.itemsize < 8 else 1e-9
+    for told, own, given in (
+        ("alpha and p are {:.6g} rad and {:.6g} rad/s", [scene.alpha, scene.p], [np.min(angles), rate]),
+        ("sides uplift at {:.6g} and {:.6g} g", *_uplifts(scene, angles, rtol)),
+        ("law of restitution or shape tells {:d} sides apart", [2 * (scene.far is not None)], [2 * differ]),
+    ):
+        if not np.allclose(own, given, rtol=rtol, atol=0, equal_nan=True):
+            raise ValueError(
+                f"Argument `block` must be that of the response, whose {told.format(*own)}, but is a "
+                f"{type(block).__name__} whose {told.format(*given)}."
+            )
+
+
+def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.ndarray]:
+    """Accelerations that uplift a scene's block, and one of these angles, to either side [g]."""
+    own = np.array([moments.threshold for moments in scene.both_moments])
+    for threshold in (np.tan, np.asarray):  # of nonlinear models, and of linear ones
+        if np.isclose(np.min(own), threshold(scene.alpha), rtol=rtol, atol=0):
+            return own, threshold(np.array(angles))
+    return own, own  # another model: it cannot be told
 
 
 @jax.jit

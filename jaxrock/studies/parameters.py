@@ -124,8 +124,9 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
         return {}
     if not isinstance(block, AsymmetricBlock) and tells_sides(block.law, block.corners):
         return {}
-    two_sided = isinstance(block, AsymmetricBlock) and not isinstance(block.law, Constant)
-    names = ("restitution1", "restitution2") if two_sided else ("restitution",)
+    if isinstance(block.law, Constant):
+        return {"restitution": block.law.value}
+    names = ("restitution1", "restitution2") if isinstance(block, AsymmetricBlock) else ("restitution",)
     return {name: getattr(block, name) for name in names}
 
 

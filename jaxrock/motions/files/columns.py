@@ -13,6 +13,7 @@ from jaxrock.motions.files.titles import Titles
 _COMMA = r"[-+]?\d+(?:,\d+)?(?:[EeDd][-+]?\d+)?"
 _DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d){_COMMA}(?:[;\s]+{_COMMA})+[;\s]*")
 _FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
+_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS = re.compile(r"(?<=[\])])\s+"), re.compile(r"\s+(?![\[(])")
 
 
 class Columns(AbstractFormat):
@@ -63,8 +64,16 @@ class Columns(AbstractFormat):
 def _titles(lines: list[str], first: int, width: int) -> Titles:
     """What is written above the `first` line of numbers, if it has a title for each column."""
     number = next((k for k in range(first, 0, -1) if lines[k - 1].strip()), 0)
-    fields = _fields(lines[number - 1].lstrip("# ")) if number else []
-    return Titles(number, fields if len(fields) == width else [])
+    parted = _parted(lines[number - 1].lstrip("# ")) if number else []
+    return Titles(number, next((fields for fields in parted if len(fields) == width), []))
+
+
+def _parted(line: str) -> list[list[str]]:
+    """A line of titles in fields, in all ways in which it may be meant: titles hold blanks, and units in brackets."""
+    line = line.strip()
+    tabs = [[field.strip() for field in line.split("\t")]] if "\t" in line else []
+    by_brackets = [mark.split(line) for mark in (_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS)]
+    return [*tabs, _fields(line), *(fields for fields in by_brackets if Titles(0, fields).state_units)]
 
 
 def _fields(line: str) -> list[str]:

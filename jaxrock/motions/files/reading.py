@@ -6,9 +6,11 @@ and where a header announces a count, a unit or a time step, contradictions rais
 
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least, path_of, word_of
@@ -39,6 +41,7 @@ _WITH_HEADERS = (
 )
 
 _HEADER = 400  # lines in which headers of fixed places end
+_MOST = 20.0  # [g]; the largest that was ever recorded is a fifth of it
 _WORDS = re.compile(r"[A-CF-Za-cf-z]")
 
 _COLUMNS = Columns(_WITH_HEADERS)
@@ -76,7 +79,7 @@ def read_record(
       V1, V2: the channel (None: the first). The others hold one record.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
-    the file says of it. Its first sample is at time 0, whatever the times in the file.
+    the file says of it. Its first sample is at time 0, whatever the times in the file. It warns of samples beyond 20 g.
 
     **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is
     empty, binary or damaged; ValueError for an argument that is missing, not allowed, of no use for
@@ -91,6 +94,10 @@ def read_record(
 
 def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
     samples = found.samples / PER_G[found.unit]
+    largest = np.abs(samples).max()
+    if largest > _MOST:
+        told = f"File `{path.name}` holds an acceleration of {largest:.4g} g, more than was ever recorded"
+        warnings.warn(f"{told}: is its unit {found.unit}, and does no such number mark a gap?", stacklevel=4)
     origin = found.origin._replace(format=kind.name, unit=found.unit, file=path.name)
     return Record(samples, found.dt, found.title or path.stem, origin)
 

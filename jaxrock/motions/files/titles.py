@@ -40,6 +40,11 @@ class Titles(NamedTuple):
         written = self._in_brackets(column)
         return written if is_unit(written) or _OTHER_UNIT.fullmatch(written) else ""
 
+    @property
+    def state_units(self) -> bool:
+        """Whether there is a unit in brackets behind the first."""
+        return bool(self.unit_of(0)) or self._in_brackets(0).lower().rstrip(".") in _SECONDS
+
     def seconds(self, name: str, numbers: np.ndarray) -> float | None:
         """What the numbers of the first column are in [s]; None where they count samples. ValueError, if they are
         said to be something else."""
