@@ -56,7 +56,8 @@ class Trajectory(eqx.Module):
         index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
         elapsed = where(time <= self.duration, time, self.duration) - self.times[index]
-        is_followed = node.done | (index < self.times.size - 1) | (elapsed <= 0)
+        following = where(index < self.times.size - 1, self.times[index + 1], jnp.inf)
+        is_followed = node.done | jnp.isfinite(following) | (elapsed <= 0)
         return node, where(is_followed, elapsed, jnp.nan)
 
     def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
