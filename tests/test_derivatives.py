@@ -174,6 +174,22 @@ def test_along_the_steps_reverse_is_forward(kind, factor):
     assert np.any(forward != 0) and (kind, factor) != ("linear", 2.0) or np.all(forward != 0)  # a clearance, too
 
 
+def test_all_samples_where_a_tape_is_longer_than_that_of_a_history():
+    """A block that hops on and on until it is thrown down, after more steps than a history keeps: beside forward mode
+    along the scale of the record."""
+    samples = jnp.full(70, 0.002).at[60:63].set(jnp.array([-0.31, 0.35, 0.35]))
+    block, start = rk.Block(0.3, 8.0, restitution=0.999), (0.03, 0.0)
+
+    def margin(motion):
+        return rk.outcome(block, motion, initial=start).margin
+
+    record = rk.Record(samples, 1.0)
+    assert rk.simulate(block, record, initial=start, samples=2).status == rk.Status.step_budget_exhausted
+    slopes = jax.grad(lambda samples: margin(rk.Record(samples, 1.0)))(samples)
+    along = jax.grad(lambda scale: margin(scale * record))(1.0)
+    assert float(slopes @ samples) == pytest.approx(float(along), rel=1e-8) != 0
+
+
 def test_by_more_numbers_than_machine_code_takes_at_once(caplog):
     """Eleven: a few directions at a time, in machine code; each beside its own."""
     caplog.set_level("DEBUG", "jaxrock")

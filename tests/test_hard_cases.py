@@ -228,11 +228,12 @@ def test_elastic_impacts_never_end():
     assert again.status == rk.Status.step_budget_exhausted
 
 
-def test_a_history_ends_where_its_steps_are_used_up():
-    """What was followed is there, and beyond it are no numbers."""
+@pytest.mark.parametrize("steps", [40, 43])
+def test_a_history_ends_where_its_steps_are_used_up(steps):
+    """What was followed is there, and beyond it are no numbers; whether it ends with a stride of steps, or within."""
     scene = rk.Block(0.2, 2.0, 1.0), rk.RectangularPulse(0.0, 1.0)
     whole = rk.simulate(*scene, initial=(0.1, 0.0), duration=100.0)
-    cut = rk.simulate(*scene, initial=(0.1, 0.0), duration=100.0, engine=rk.Series(max_steps=40))
+    cut = rk.simulate(*scene, initial=(0.1, 0.0), duration=100.0, engine=rk.Series(max_steps=steps))
     assert cut.status == rk.Status.step_budget_exhausted and whole.status == rk.Status.successful
     last = float(np.max(cut.impact_times))
     assert 3 < last < 30

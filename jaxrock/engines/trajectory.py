@@ -56,7 +56,8 @@ class Trajectory(eqx.Module):
         index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
         node = jax.tree.map(lambda x: x[index], self.nodes)
         elapsed = where(time <= self.duration, time, self.duration) - self.times[index]
-        is_followed = node.done | (index < self.times.size - 1) | (elapsed <= 0)
+        following = where(index < self.times.size - 1, self.times[index + 1], jnp.inf)
+        is_followed = node.done | jnp.isfinite(following) | (elapsed <= 0)
         return node, where(is_followed, elapsed, jnp.nan)
 
     def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
@@ -84,24 +85,23 @@ def _in_order(happened, order, values) -> tuple[tuple, Int[Array, ""]]:
 _STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
 
 
-def states_of(stepper: Any, state: PyTree) -> tuple[PyTree, PyTree]:
-    """Follow a block to the end: the last state, and every state by its number of steps; after the last
-    it may stand again, or zeros."""
+def states_of(stepper: Any, state: PyTree, budget: int) -> tuple[PyTree, PyTree]:
+    """Follow a block to the end, or for so many steps: the last state, and every state by its number of steps; after
+    the last it may stand again, or zeros."""
     engine = stepper.engine
-    budget = engine.budget(stepper.scene, history=True)
     if not engine.in_lanes:
         return followed(stepper.advance, state, budget, engine.loop)
     many = differentiable(_stride_of, name="stride", results=_rows, in_lanes=True, derivatives="in a direction")
-    return _in_strides(lambda s: many((stepper, s)), state, budget, engine.loop, _STRIDE)
+    return _in_strides(lambda s: many((stepper, s, jnp.int32(budget))), state, budget, engine.loop, _STRIDE)
 
 
 def _stride_of(given) -> tuple[PyTree, PyTree]:
-    stepper, state = given
-    return _stride(stepper.advance, state, stepper.engine.budget(stepper.scene, history=True), _STRIDE)
+    stepper, state, budget = given
+    return _stride(stepper.advance, state, budget, _STRIDE)
 
 
 def _rows(given) -> tuple[PyTree, PyTree]:
-    _, state = given
+    _, state, _ = given
     return state, jax.tree.map(lambda x: jax.ShapeDtypeStruct((_STRIDE, *x.shape), x.dtype), state)
 
 
@@ -139,11 +139,11 @@ def _in_strides(stride: Callable, state: PyTree, budget: int, loop: Callable, le
     return state, nodes
 
 
-def _unfinished(state: PyTree, budget: int) -> Bool[Array, ""]:
+def _unfinished(state: PyTree, budget: int | Int[Array, ""]) -> Bool[Array, ""]:
     return ~state.done & (state.steps < budget)
 
 
-def _stride(advance: Callable, state: PyTree, budget: int, length: int) -> tuple[PyTree, PyTree]:
+def _stride(advance: Callable, state: PyTree, budget: int | Int[Array, ""], length: int) -> tuple[PyTree, PyTree]:
     """The state after so many steps, and after each of them; one that is done, or has taken `budget` steps, waits."""
 
     def step(state):

@@ -302,7 +302,8 @@ def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
     stop = stop.astype(scene.p.dtype)
     stepper = engine.stepper(scene, stop, history=True, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    state, nodes = stepper.on_tape(state) if taped else states_of(stepper, state)
+    budget = engine.budget(scene, history=True)
+    state, nodes = stepper.on_tape(state, budget) if taped else states_of(stepper, state, budget)
     return state, nodes, _concluded(stepper, state, taped)
 
 

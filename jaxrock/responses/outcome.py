@@ -212,12 +212,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, None, history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    if taped:
-        # A tape holds all steps, as a history does.
-        state, _ = stepper.on_tape(state)
-    else:
-        state = _to_the_end(stepper, state)
-    return conclude(stepper, state)
+    return conclude(stepper, stepper.end_on_tape(state) if taped else _to_the_end(stepper, state))
 
 
 def _to_the_end(stepper: AbstractStepper, state: State) -> State:

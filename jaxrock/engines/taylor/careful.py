@@ -30,7 +30,7 @@ from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
 from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
 from jaxrock.engines.taylor.policy import POLICY, exact
-from jaxrock.engines.taylor.tape import on_tape
+from jaxrock.engines.taylor.tape import end_on_tape, on_tape
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import Angle
 from jaxrock.motions.shaking import Shaking
@@ -144,9 +144,13 @@ class TaylorStepper(AbstractStepper):
         rocked = self.on(state.side)._rock(state, shaking, unit, ~resting)
         return checked(self, state, jax.tree.map(lambda a, b: where(resting, a, b), waited, rocked))
 
-    def on_tape(self, state: State) -> tuple[State, State]:
+    def on_tape(self, state: State, budget: int) -> tuple[State, State]:
         """Follow a block so that reverse mode goes through: as `states_of`."""
-        return on_tape(self, state)
+        return on_tape(self, state, budget)
+
+    def end_on_tape(self, state: State) -> State:
+        """The last state alone, within the budget of an outcome."""
+        return end_on_tape(self, state)
 
     def finish(self, state: State) -> State:
         """The free stage by energy."""

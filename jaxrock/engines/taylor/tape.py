@@ -87,11 +87,24 @@ class _Slopes(NamedTuple):
     passed: list
 
 
-def on_tape(stepper: Stepper, state: State) -> tuple[State, State]:
+def end_on_tape(stepper: Stepper, state: State) -> State:
+    """Follow a block: the last state, as that of `on_tape`."""
+    engine, scene = stepper.engine, stepper.scene
+    most, usual = (engine.budget(scene, history) for history in (False, True))
+    last, _ = on_tape(stepper, state, min(usual, most))
+    if most <= usual:
+        return last
+    # Steps of outcomes may be many more than those of histories: room for so many would take most blocks ten times as
+    # long as all else.
+    longer = jax.checkpoint(lambda stepper, state: on_tape(stepper, state, most)[0])
+    return jax.lax.cond(last.done, lambda: last, lambda: longer(stepper, state))
+
+
+def on_tape(stepper: Stepper, state: State, budget: int) -> tuple[State, State]:
     """Follow a block: the last state, and those before every step, as `states_of` tells them; with derivatives of which
     reverse mode takes the product with very many numbers."""
     still, start = fixed((replace(stepper, taped=False), state))
-    last, nodes = fixed(states_of(still, start))
+    last, nodes = fixed(states_of(still, start, budget))
     ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
     by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps
     ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
