@@ -287,7 +287,8 @@ class _Pieces(NamedTuple):
 
 def _shortest_scales(parts: tuple[_Pieces, ...]) -> Inexact[Array, " finer"] | None:
     """The scales of motions at once."""
-    found = [part.spread(part.motion.scales, jnp.inf) for part in parts if part.motion.scales is not None]
+    scales = [(part, part.motion.scales) for part in parts]  # each once: sums of sums would take twice as long each
+    found = [part.spread(values, jnp.inf) for part, values in scales if values is not None]
     return functools.reduce(jnp.minimum, found) if found else None
 
 
@@ -299,7 +300,8 @@ def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar
 
     if not any(map(is_shifted, jax.tree.leaves(parts, is_leaf=is_shifted))):
         return None
-    return sum((part.lateness for part in parts if part.lateness is not None), jnp.finfo(knots.dtype).eps * knots[-1])
+    found = [part.lateness for part in parts]
+    return sum((late for late in found if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
 
 class Summed(AbstractMotion):
