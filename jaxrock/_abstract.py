@@ -30,6 +30,12 @@ def typed_like(operands: Sequence, shapes: Sequence[tuple[tuple[int, ...], Any]]
     return [of(*each) for each in shapes]
 
 
+def summed_like(value: Any, aval: Any) -> Any:
+    """A value of a transpose, summed over the axes of a mesh along which what it is of does not differ."""
+    axes = _varying(jax.typeof(value)) - _varying(aval)
+    return jax.lax.psum(value, tuple(axes)) if axes else value
+
+
 def without_mesh(context):
     """A context of lowering whose operands have types that tell nothing of a mesh."""
     return context.replace(avals_in=[jax.core.ShapedArray(x.shape, x.dtype) for x in context.avals_in])

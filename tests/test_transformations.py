@@ -138,6 +138,20 @@ def test_slopes(way, function, slopes):
     np.testing.assert_allclose(SLOPES[way](function), slopes, rtol=2e-10)
 
 
+def test_slopes_by_all_samples_within_shard_map():
+    """Of blocks that are dealt to devices, by a record which all of them share: the sum of what each tells."""
+    samples, alpha = 0.3 * jnp.sin(0.3 * jnp.arange(70)), jnp.linspace(0.2, 0.3, 4)
+
+    def velocities(samples, alpha):
+        record = rk.Record(samples, 0.02)
+        return jax.vmap(lambda a: rk.outcome(rk.Block(a, 2.0), record, **QUICK).max_velocity)(alpha)
+
+    whole, every = PartitionSpec(), PartitionSpec("scenes")
+    each = jax.shard_map(velocities, mesh=mesh(), in_specs=(whole, every), out_specs=every)
+    slopes, there = (jax.jit(jax.grad(lambda s, f=f: f(s, alpha).sum()))(samples) for f in (velocities, each))
+    np.testing.assert_allclose(there, slopes, rtol=1e-12)
+
+
 def step_of(function):
     """Of differences; values of columns move by 1e-10 where the compiler rounds otherwise."""
     return 1e-4 if function is column else 1e-6

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxrock._abstract import typed_like
+from jaxrock._abstract import summed_like, typed_like
 from jaxrock.transforms.forward_mode import (
     columns_of,
     directions_of,
@@ -216,7 +216,7 @@ def _transposed(weights, *leaves, recipe, own, size):
     flags = *own[:count], *[size is not None] * len(weights)
     found = scenes_p.bind(*leaves[:count], *weights, recipe=pulled_back(base, moves), own=flags, size=size)
     summed = [x if size is None or mine else x.sum(axis=0) for x, mine in zip(found, own[count:])]
-    return [*[None] * count, *summed]
+    return [*[None] * count, *(summed_like(x, leaf.aval) for x, leaf in zip(summed, leaves[count:]))]
 
 
 ad.primitive_transposes[scenes_p] = _transposed
