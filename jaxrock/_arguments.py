@@ -121,6 +121,8 @@ def _is_own(hint: Any) -> bool:
     return isinstance(hint, type) and hint.__module__.split(".")[0] in ("jaxrock", "diffrax")
 
 
+# What is nearly right, and how it is made right.
+_NEAR = {("Record", "Scaled"): " (`jaxrock.processing.scaled(record, factor)` is a Record)"}
 _IN_WORDS = {"AbstractEquation": "an equation of motion, such as Housner()"}
 
 
@@ -137,7 +139,8 @@ def _called(kind: type) -> str:
 def _kind(name: str, value: Any, kinds: tuple[type, ...], allowed: str) -> Any:
     if isinstance(value, kinds):
         return value
-    raise ValueError(f"Argument `{name}` must {allowed}, but is {shown(value)}.")
+    near = (way for kind in kinds for way in [_NEAR.get((kind.__name__, type(value).__name__))] if way)
+    raise ValueError(f"Argument `{name}` must {allowed}, but is {shown(value)}{next(near, '')}.")
 
 
 def _callable(name: str, value: Any) -> Callable:

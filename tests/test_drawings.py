@@ -164,6 +164,13 @@ def test_the_shape_of_an_asymmetric_block_must_be_given():
     started(rk.plot.animate(response, ROCK))
 
 
+def test_another_block_is_not_drawn(response):
+    with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose alpha and p are"):
+        rk.plot.animate(response, rk.Block(0.3, 2.0))
+    with pytest.raises(ValueError, match="which is rigid, but is a FlexibleBlock"):
+        rk.plot.animate(response, COLUMN)
+
+
 @pytest.mark.parametrize("kind", ["gif", "html"])
 def test_films_are_written(kind, response, tmp_path):
     film = rk.plot.animate(response, fps=2, speed=3.0)

@@ -413,6 +413,8 @@ def test_motions_of_one_name_are_numbered():
     found = rk.motions.Suite([RECORD, 2 * RECORD, rk.SinePulse(0.3, 0.8), named, 0.5 * named])
     assert found.names == ("Record", "Scaled", "SinePulse", "station 1", "station 2")
     assert rk.motions.Suite([RECORD, RECORD]).names == ("Record 1", "Record 2")
+    both = rk.motions.Suite([rk.motions.Components(RECORD, RECORD)] * 2, azimuth=[0.0, 1.0])
+    assert len(set(both.names)) == 4 and len(set(both.sources)) == 2
 
 
 @pytest.mark.parametrize(
@@ -433,6 +435,8 @@ def test_motions_of_one_name_are_numbered():
         ),
         (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
         (lambda: rk.motions.Suite([RECORD], ["a", "b"]), "`names` must name 1 motions, but has 2 names"),
+        (lambda: rk.motions.Suite([RECORD, RECORD], ["a", "a"]), "differ from motion to motion, but has 'a' twice"),
+        (lambda: rk.processing.tapered(2.0 * RECORD, 1.0), r"a Scaled \(`jaxrock.processing.scaled\(record, factor\)`"),
         (
             lambda: rk.motions.Suite([rk.Record([0.0, 0.0, 0.0], 0.4, "quiet")]),
             "`motions` must move the ground, but 'quiet' does not",

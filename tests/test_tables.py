@@ -110,6 +110,10 @@ TABLES = {
         rk.hazard.SimulatedFragility, levels=jnp.array([0.1, 0.2]), verdict=np.ones((3, 2, 5), np.int8),
         peak_acceleration=jnp.ones(3), peak_velocity=jnp.ones(3), names=("a", "b", "c"), measure="PGA",
     ),
+    "azimuths": made(
+        rk.studies.AzimuthOutcomes, azimuth=np.arange(3.0), scale=np.array([1.0, 2.0]),
+        verdict=np.zeros((3, 2), np.int8), rotation=np.ones((3, 2)), margin=np.ones((3, 2)),
+    ),
     "fragility": made(
         rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=jnp.eye(2),
         log_likelihood=ONE, highest_survived=ONE, lowest_toppled=ONE, p_value=ONE,

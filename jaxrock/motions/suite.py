@@ -58,8 +58,8 @@ class Suite(AbstractNamed):
 
     Within `jax.jit`, `jax.vmap` and derivatives motions may depend on what is traced.
 
-    **Raises:** ValueError if there are no motions, or names in another number; for a motion that does not move; for
-    components without azimuths, and azimuths without components.
+    **Raises:** ValueError if there are no motions, or names in another number, or one twice; for a motion that does not
+    move; for components without azimuths, and azimuths without components.
     """
 
     __repr__ = described
@@ -86,6 +86,9 @@ class Suite(AbstractNamed):
 
     def _set(self, motions: Sequence, names: Sequence[str] | None, azimuth: Values | None) -> None:
         self.azimuth, self.turns, sources = None, 1, None
+        twice = [name for name, count in Counter(names or ()).items() if count > 1]
+        if twice:
+            raise ValueError(f"Argument `names` must differ from motion to motion, but has {twice[0]!r} twice.")
         if azimuth is not None or any(isinstance(each, Components) for each in motions):
             records = len(motions)
             motions, names, sources, self.azimuth = _turned(motions, names, azimuth)
@@ -186,13 +189,13 @@ def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | No
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
     own = [each.first.name or f"record {number + 1}" for number, each in enumerate(motions)]
-    names = own if names is None else names
+    names = _numbered(own) if names is None else names
     if len(names) != len(motions):
         raise ValueError(f"Argument `names` must name {len(motions)} motions, but has {len(names)} names.")
     turned = [each.along(angle) for each in motions for angle in angles]
     titles = [f"{name}, {np.degrees(angle):.4g} deg" for name in names for angle in angles]
     sources = tuple(name for name in names for _ in angles)
-    return turned, titles, sources, np.tile(angles, len(motions))
+    return turned, _numbered(titles), sources, np.tile(angles, len(motions))
 
 
 def _ensemble(motion: AbstractMotion) -> AbstractMotion:

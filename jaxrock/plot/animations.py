@@ -11,6 +11,7 @@ import numpy as np
 from jaxrock._arguments import arguments, at_least, path_of
 from jaxrock._checks import Values, scalar, size
 from jaxrock.blocks.edge import Edge
+from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.equation import AbstractEquation
@@ -21,6 +22,7 @@ from jaxrock.plot.drawings import draw, draw_ground
 from jaxrock.plot.responses import acceleration_of
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
+from jaxrock.responses.own_block import check_own
 from jaxrock.status import Status
 
 if TYPE_CHECKING:
@@ -53,7 +55,8 @@ def animate(
     **Returns:** a `matplotlib.animation.FuncAnimation`. `save_animation` writes it; in a notebook
     `IPython.display.HTML(film.to_jshtml())` shows it.
 
-    **Raises:** ValueError for arguments outside their ranges, or a response of many scenes.
+    **Raises:** ValueError for arguments outside their ranges, a response of many scenes, or another block than that of
+    the response.
     """
     from matplotlib.animation import FuncAnimation
 
@@ -81,7 +84,10 @@ def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> Any
     response.trajectory.check_single()
     if isinstance(response, FlexibleResponse):
         return response.scene.block
+    if isinstance(block, FlexibleBlock):
+        raise ValueError("Argument `block` must be that of the response, which is rigid, but is a FlexibleBlock.")
     if block is not None:
+        check_own(response.scene, block)
         return block
     if response.scene.far is not None:
         raise ValueError("Argument `block` must be given for the response of an asymmetric block: its shape is drawn.")

@@ -6,16 +6,15 @@ Every plane is followed by itself, with the rock's section and the record's comp
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, direction, placed, scalar, shown, size
-from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock._progress import Progress
+from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.blocks.rock import Rock
@@ -29,15 +28,13 @@ from jaxrock.responses.current_model import current_model
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, stacked
 
 
-class AzimuthOutcomes(eqx.Module):
-    """What becomes of a rock in every vertical plane.
+class AzimuthOutcomes(AbstractTable):
+    """What becomes of a rock in every vertical plane; a table.
 
     - `azimuth`: (azimuths,) of the planes, in the rock's axes [rad]; `scale`: (scales,) of the record.
     - `blocks`: the rock in them, with parameters of shape (azimuths,).
     - `verdict`, `rotation`, `margin`: (azimuths, scales), as in `SuiteOutcomes`.
     """
-
-    __repr__ = described
 
     azimuth: Float[np.ndarray, " azimuths"]
     scale: Float[np.ndarray, " scales"]
@@ -45,6 +42,12 @@ class AzimuthOutcomes(eqx.Module):
     verdict: Int8[np.ndarray, "azimuths scales"]
     rotation: Float[np.ndarray, "azimuths scales"]
     margin: Float[np.ndarray, "azimuths scales"]
+
+    @property
+    def _columns(self):
+        axes = {"azimuth": Column(("azimuth",), self.azimuth, "rad"), "scale": Column(("scale",), self.scale)}
+        results = {"verdict": self.verdict, "rotation_over_alpha": self.rotation, "margin": self.margin}
+        return axes | {name: Column((*axes,), values) for name, values in results.items()}
 
     @property
     def toppled(self) -> Int8[np.ndarray, " scales"]:
