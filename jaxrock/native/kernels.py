@@ -16,7 +16,7 @@ from jaxrock.native.emitter import SMALL, Emitter, flat, like
 from jaxrock.native.lists import Memory, boxed, unboxed
 from jaxrock.native.operations import Unsupported
 
-_I8, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
+_I1, _I8, _I32, _I64 = (ir.IntType(bits) for bits in (1, 8, 32, 64))
 
 
 def kind_of(variable: Any) -> np.dtype:
@@ -207,7 +207,7 @@ class Refilled:
         e.before.append(b.block)
         b.branch(outer)
         b.position_at_end(outer)
-        self._each_lane(self._exchange)
+        self._each_of(f.load(self.ready, _I64(0)), self._exchange)
         active = f.load(self.active, _I64(0))
         b.cbranch(e.any(active), run, end)
         b.position_at_end(run)
@@ -276,12 +276,23 @@ class Refilled:
         b.cbranch(b.icmp_signed("<", following, _I64(self.e.lanes) if count is None else count), head, after)
         b.position_at_end(after)
 
-    def _exchange(self, lane) -> None:
-        """Store what a lane has found that is ready, and load its next scene."""
-        with self.b.if_then(self.b.icmp_signed("!=", self.b.load(self.b.gep(self.ready, [lane])), _I8(0))):
-            self._exchanged(lane)
+    def _each_of(self, mask, function, first=_I64(0)) -> None:
+        """`function(slot)` of those that are set, from the slot of the first lane on."""
+        b = self.b
+        flags = b.zext(b.bitcast(mask, ir.IntType(self.e.lanes)), _I64)
+        before, head, inside, after = b.block, *(b.append_basic_block(name) for name in ("set", "lane", "lanes"))
+        b.branch(head)
+        b.position_at_end(head)
+        left = b.phi(_I64)
+        b.cbranch(b.icmp_signed("!=", left, _I64(0)), inside, after)
+        b.position_at_end(inside)
+        function(b.add(first, b.cttz(left, ir.Constant(_I1, 1))))
+        left.add_incoming(flags, before)
+        left.add_incoming(b.and_(left, b.sub(left, _I64(1))), b.block)
+        b.branch(head)
+        b.position_at_end(after)
 
-    def _exchanged(self, lane) -> None:
+    def _exchange(self, lane) -> None:
         """Store what a lane has found, and load its next scene; where there is none, the last, for nothing."""
         b, count = self.b, self.f.count
         scene, active = b.gep(self.scene, [lane]), b.gep(self.active, [lane])

@@ -186,7 +186,7 @@ class _Parted(Refilled):
         b, e, f = self.b, self.e, self.f
         group = b.load(self.group)
         first = b.mul(group, _I64(e.lanes))
-        self._each_lane(self._exchange, first)
+        self._each_of(f.load(self.ready, first), self._exchange, first)
         with b.if_then(b.icmp_signed(">=", b.load_atomic(f.next, "monotonic", 8), f.count)):
             self._each_lane(self._closed_up, first)
             b.store(b.add(b.sdiv(b.load(self.top), _I64(e.lanes)), _I64(1)), self.groups)
@@ -255,18 +255,13 @@ class _Parted(Refilled):
         """Put down the lanes of each case in its list; all of them."""
         b = self.b
         for mask, places, count in zip(masks, self.lists, self.counts, strict=True):
-            flags = b.bitcast(mask, ir.IntType(self.e.lanes))
 
-            def put(slot, flags=flags, places=places, count=count):
-                lane = b.trunc(b.sub(slot, first), flags.type)
-                set_ = b.trunc(b.lshr(flags, lane), ir.IntType(1))
-                with b.if_then(set_):
-                    number = b.load(count)
-                    b.store(slot, b.gep(places, [number]))
-                    b.store(b.add(number, _I64(1)), count)
+            def put(slot, places=places, count=count):
+                number = b.load(count)
+                b.store(slot, b.gep(places, [number]))
+                b.store(b.add(number, _I64(1)), count)
 
-            with b.if_then(self.e.any(mask)):
-                self._each_lane(put, first)
+            self._each_of(mask, put, first)
         total = masks[0]
         for mask in masks[1:]:
             total = b.or_(total, mask)
