@@ -23,10 +23,13 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
     - `replace`: whether it takes the place of a file that is there.
     - `lasting`: whether it has reached the disk before it is renamed, so that it outlives a loss of power.
 
-    **Raises:** FileExistsError where somebody else was faster, unless it replaces; IsADirectoryError.
+    **Raises:** FileExistsError where somebody else was faster, unless it replaces; IsADirectoryError; FileNotFoundError
+    where there is no folder for it.
     """
     if not path.name:  # the root, or where one is
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not path.parent.exists():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
     aside = path.with_name(f".{path.name[:64]}.{uuid.uuid4().hex}.partial")
     try:
         yield aside

@@ -50,6 +50,20 @@ def test_what_is_undecided_bounds():
     np.testing.assert_array_equal(found.weakest, [AZIMUTH[0]] * 3)
 
 
+def test_suites_of_components_shake_upward_too():
+    three = rk.motions.Components(EAST, NORTH, UP)
+    block, angles = rk.blocks.AsymmetricBlock(0.2, 0.24, 3.0), [0.0, 1.0]
+    around = rk.studies.azimuth_outcomes(lambda azimuth: block, three, angles, SCALE, **QUICK)
+    suites = rk.motions.Suite([three], azimuth=angles), rk.motions.Suite([three], azimuth=angles, vertical=False)
+    with_it, without = (rk.hazard.suite_outcomes(block, suite, SCALE, **QUICK) for suite in suites)
+    np.testing.assert_array_equal(with_it.margin[:, :, 0, 0], around.margin)
+    level = rk.studies.azimuth_outcomes(lambda azimuth: block, three, angles, SCALE, vertical=False, **QUICK)
+    np.testing.assert_array_equal(without.margin[:, :, 0, 0], level.margin)
+    assert np.abs(with_it.margin - without.margin).max() > 0.01
+    assert suites[0].names == suites[1].names
+    np.testing.assert_allclose(suites[0].peak_velocity, suites[1].peak_velocity, rtol=1e-14)
+
+
 def test_half_a_turn_is_a_mirror(found):
     """Planes are followed by themselves; half a turn on, the two sides of a rock change places."""
     turned = rk.studies.azimuth_outcomes(oval, PAIR, AZIMUTH[:3], SCALE, orientation=0.2, **QUICK)

@@ -137,6 +137,26 @@ def test_average_spectral_acceleration():
     assert average == pytest.approx(each.prod() ** (1 / 3), rel=1e-12)
 
 
+@pytest.mark.parametrize("duration", [0.4, 1.3])
+def test_mean_period_of_a_rectangle(duration):
+    def power(f):
+        return (np.sin(np.pi * f * duration) / f) ** 2
+
+    below = quad(power, 0.25, 20, limit=500)[0]
+    above = quad(lambda f: power(f) / f, 0.25, 20, limit=500)[0]
+    assert rk.intensity.mean_period(rk.RectangularPulse(0.3, duration)) == pytest.approx(above / below, rel=1e-4)
+
+
+def test_one_motion_has_one_mean_period():
+    """However it is written: later, with a vertical part, at a shorter step, times a factor."""
+    random = np.random.default_rng(2).normal(size=158)
+    record = rk.Record(np.convolve(random, np.ones(8) / 8, "valid")[:150] * np.sin(np.pi * np.arange(150) / 149), 0.02)
+    alike = (record.shifted(0.0), record.shifted(1.2345), record.with_vertical(record), -2.0 * record)
+    for motion in (*alike, rk.processing.resampled(record, 0.002)):
+        assert rk.intensity.mean_period(motion) == pytest.approx(rk.intensity.mean_period(record), rel=1e-6)
+    assert rk.intensity.arias(record.shifted(1.2345)) == pytest.approx(rk.intensity.arias(record), rel=1e-12)
+
+
 def test_mean_period_of_a_long_sine():
     record = rk.Record(np.sin(2 * np.pi * np.arange(40_000) * 0.005 / 0.5), 0.005)
     assert rk.intensity.mean_period(record) == pytest.approx(0.5, rel=3e-3)

@@ -96,9 +96,14 @@ def test_a_rounded_base_is_bounded_and_said():
     np.testing.assert_allclose(rock.section(0.0, "wide").right, edge, rtol=1e-9)
     assert float(wide.alpha1) == pytest.approx(np.arctan2(edge[0], rock.centre[2] - edge[1]), rel=1e-9)
     assert float(narrow.alpha1) < 0.5 * float(wide.alpha1)
+    still = rk.Record([0.001, 0.0], 0.01)
+    pair, quick = rk.motions.Components(still, still), {"progress": False, "engine": rk.Series(order=6)}
+    with pytest.warns(UserWarning, match="The base is rounded: the rock is taken to rock about the outermost points"):
+        rk.studies.azimuth_outcomes(rock, pair, [0.0, np.pi / 2], **quick)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rk.blocks.AsymmetricBlock.from_mesh(rock, np.pi / 2)  # along the cylinder it is flat
+        rk.studies.azimuth_outcomes(rock, pair, [np.pi / 2], **quick)
 
 
 @pytest.mark.parametrize("rotation", np.linspace(0.0, 0.9, 7))

@@ -311,6 +311,13 @@ def test_components_are_known_by_what_they_say(file, order):
         np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
 
 
+def test_a_component_that_says_it_points_downward_is_warned_of(file):
+    paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", "DWN"))]
+    with pytest.warns(UserWarning, match="vertical component says 'DWN', and is taken as it stands, positive upward"):
+        found = rk.motions.read_components(paths)
+    np.testing.assert_array_equal(found.vertical.samples, found.first.samples)
+
+
 def test_two_components_and_columns_of_one_file(file):
     assert rk.motions.read_components([file(component("N-S"), "a"), file(component("E-W"), "b")]).vertical is None
     text = "".join(f"{0.02 * k:.2f},{x!r},{2 * x!r},{3 * x!r}\n" for k, x in enumerate(SAMPLES.tolist()))

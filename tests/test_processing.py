@@ -37,6 +37,16 @@ def test_noise_of_a_displacement_needs_the_filter():
     assert np.abs(smooth.samples - SMOOTH.samples).max() < 2e-3
 
 
+@pytest.mark.parametrize("corner", [5.0, 10.0, 25.0])
+@pytest.mark.parametrize("hertz", [0.5, 1.5])
+def test_the_filter_of_a_displacement_leaves_its_beginning(corner, hertz):
+    """The ground moves at once; what is slower than the corner passes."""
+    place = 0.02 * (1 - np.cos(2 * np.pi * hertz * TIME))
+    raw, smooth = (do.from_displacement(place, DT, corner=each) for each in (None, corner))
+    passes = 1 / (1 + (hertz / corner) ** 8)
+    np.testing.assert_allclose(smooth.samples[:-100], passes * raw.samples[:-100], atol=2e-3 * raw.samples.max())
+
+
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_drift_of_the_velocity_is_taken_off(degree):
     drift = sum(0.01 * (TIME / 10) ** k for k in range(degree))

@@ -29,6 +29,14 @@ def test_what_both_sensors_agree_on_stays(step):
     np.testing.assert_allclose(found.samples[:-100], GROUND.samples[:-100], atol=1e-3 if step == 10 else 2e-5)
 
 
+@pytest.mark.parametrize("begin, end", [(0, 2001), (800, 1100), (900, 931)])
+def test_what_both_agree_on_stays_at_both_ends(begin, end):
+    """Also where the ground moves at once, and when the sensors are switched off."""
+    part = rk.Record(GROUND.samples[begin:end], DT)
+    found = rk.processing.fused(part, straight(part).displacement, DT, corner=0.5)
+    np.testing.assert_allclose(found.samples, part.samples, atol=1e-5)
+
+
 def test_two_bad_sensors_make_a_good_one():
     """The accelerometer drifts, the displacement is noisy: together they know the ground's displacement."""
     drifting = rk.Record(GROUND.samples + 0.003 * np.cos(0.2 * TIME) + 0.002, DT)

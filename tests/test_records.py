@@ -53,6 +53,7 @@ AT2 = TITLES + UNIT + COUNTS + BODY
         pytest.param(AT2.replace(COUNTS, "  7  5.0E-3  NPTS DT\n"), id="numbers first, no comma"),
         pytest.param(UNIT.join(["LOMA PRIETA 10/18/89, WAHO, 090\n", COUNTS + BODY]), id="3 header lines"),
         pytest.param("A NOTE\n\n" + AT2, id="6 header lines"),
+        pytest.param(AT2.replace(".00500 SEC", "5.0 MSEC"), id="milliseconds"),
         pytest.param(TITLES + UNIT + COUNTS + "FILTERED\n\n" + BODY, id="text after the counts"),
         pytest.param(AT2.replace("\n", "\r\n"), id="CRLF"),
         pytest.param(AT2.replace("\n", "\r"), id="CR"),
@@ -111,6 +112,8 @@ def test_at2_in_other_units(file, unit, per_g):
         pytest.param(AT2.replace("IN UNITS OF G", ""), "`unit` must be given for file `motion.txt`", id="no unit"),
         pytest.param(AT2.replace(".00500", "0.000"), "time step of 0 s, which is not positive", id="zero dt"),
         pytest.param(AT2.replace(".00500", "-.005"), "time step of -0.005 s", id="negative dt"),
+        pytest.param(AT2.replace(" SEC", " SEC, DT= .01"), "line 4 states time steps of 0.005 and 0.01 s", id="two dt"),
+        pytest.param(AT2 + AT2, "line 10 announces samples once more: one record to a file", id="two records"),
         pytest.param(
             AT2 + "1.0 garbled\n", "line 7 should hold samples, but is '1.0 garbled'", id="garbled after the last"
         ),

@@ -43,6 +43,14 @@ def test_every_scene_is_one_of_its_own(found):
             assert found.margin[m, s, f, b] == pytest.approx(float(alone.margin), rel=1e-7)
 
 
+def test_up_stays_up_where_a_rock_is_turned_round():
+    motion = RECORDS[1].with_vertical(rk.Record(-0.15 * np.abs(RECORDS[2].samples), RECORDS[2].dt))
+    found = rk.hazard.suite_outcomes(ROCKS, [motion], SCALE, facing="both", progress=False, **QUICK)
+    turned = rk.hazard.suite_outcomes(ROCKS.mirrored, [motion], SCALE, facing="both", progress=False, **QUICK)
+    np.testing.assert_allclose(found.margin[:, :, 1], turned.margin[:, :, 0], rtol=1e-9)
+    np.testing.assert_allclose(found.margin[:, :, 0], turned.margin[:, :, 1], rtol=1e-9)
+
+
 def test_turning_round_a_symmetric_block_changes_nothing():
     found = rk.hazard.suite_outcomes(rk.Block(0.2, 2.5), RECORDS[:2], facing="both", progress=False, **QUICK)
     assert found.verdict.shape == (2, 1, 2, 1)

@@ -47,7 +47,8 @@ from jaxrock.hazard.simulation import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
-from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
@@ -337,6 +338,6 @@ def _verdicts(
 
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
-    result = outcome(one_of_many(blocks, draw), Scaled(one_of_many(group, index), factor), model, engine=engine)
+    result = outcome(one_of_many(blocks, draw), felt(one_of_many(group, index), factor), model, engine=engine)
     verdict = jnp.where(result.overturned, TOPPLED, STOOD)
     return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -40,6 +40,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
@@ -273,7 +274,7 @@ def _of_strength(motion: AbstractMotion, logarithm: Real, way: Real) -> Abstract
     """
     if isinstance(motion, AbstractPulse):
         motion = eqx.tree_at(lambda pulse: pulse.amplitude, motion, jnp.sign(motion.amplitude))
-    return motion * (way * jnp.exp(logarithm - _log_strength(motion)))
+    return felt(motion, way * jnp.exp(logarithm - _log_strength(motion)))
 
 
 class _Scene(eqx.Module):

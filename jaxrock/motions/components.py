@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
@@ -16,8 +17,10 @@ from jaxrock._described import described
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import read_record
 from jaxrock.motions.files.traces import record_of_trace
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record
 
+_DOWN = re.compile(r"\W*D(OW|W)N\W*", re.IGNORECASE)
 _VERTICAL = re.compile(r"\W*(U(P|D|-D|P-DOWN|P/DOWN)?|D(OW|W)N|V(ER\w*)?|..?Z|Z)\W*", re.IGNORECASE)
 
 
@@ -75,6 +78,11 @@ class Components(eqx.Module):
         name = "" if not self.first.name else f"{self.first.name}, turned"
         return Record(samples, self.first.dt, name, self.first.origin._replace(component=""))
 
+    def in_plane(self, angle: ArrayLike, vertical: bool) -> AbstractMotion:
+        """What shakes a block in one vertical plane: `along`, with the `vertical` component if that is wanted."""
+        horizontal = self.along(angle)
+        return horizontal.with_vertical(self.vertical) if vertical and self.vertical is not None else horizontal
+
 
 def is_vertical(record: Record) -> bool:
     """Whether a record says that it is the vertical component."""
@@ -125,6 +133,12 @@ def _together(name: str, records: list[Record]) -> Components:
         said = [records[k].origin.component for k in upward]
         raise ValueError(f"Argument `{name}` must hold two horizontal components, but {said} are vertical.")
     vertical = records.pop(upward[0] if upward else 2) if len(records) == 3 else None
+    if vertical is not None and _DOWN.fullmatch(vertical.origin.component):
+        warnings.warn(
+            f"The vertical component says {vertical.origin.component!r}, and is taken as it stands, positive upward: "
+            "if its numbers are positive downward, take `Components(first, second, processing.scaled(vertical, -1))`.",
+            stacklevel=4,
+        )
     first, second = records
     return Components(first, second, vertical)
 

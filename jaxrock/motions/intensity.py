@@ -15,7 +15,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, checked, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, Shifted
 from jaxrock.motions.oscillator import peaks_of_oscillator
 from jaxrock.motions.record import Record, with_room
 from jaxrock.motions.straight import Straight, straight
@@ -37,6 +37,7 @@ _PARTS = 256  # of every smooth piece, where there are few
 _NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
 _FEW = 32
 _LONG = 100  # samples of a record that is more than a pulse
+_APART, _SHORT, _MOST = 5e-3, 2.5e-4, 1 << 20  # Fourier amplitudes [Hz]; steps of time for them [s], and how many
 
 
 @arguments
@@ -264,26 +265,35 @@ def mean_period(motion: AbstractMotion) -> float:
 
     **Arguments:** as `peak_displacement`; a record that is longer than its motion says no more.
 
-    **Returns:** sum(C^2/f)/sum(C^2) over 0.25 to 20 Hz, frequencies 0.0125 Hz apart or less.
+    **Returns:** the integral of C^2/f over that of C^2 from 0.25 to 20 Hz, C the Fourier amplitude of the motion (of a
+    record: of the straight lines between samples).
 
     **Raises:** ValueError for a motion without any amplitude there.
 
-    **Source:** Rathje, Abrahamson & Bray (1998).
+    **Source:** Rathje, Abrahamson & Bray (1998), whose sums over frequencies are these integrals.
     """
+    while isinstance(motion, Shifted):  # as it was before, and in no finer steps
+        motion = motion.motion
     lines = straight(motion)
-    if lines.length.size == 0:
+    lasting = lines.length[lines.length > 0]
+    if lasting.size == 0:
         raise ValueError("Argument `motion` must last, but ends where it begins.")
-    step = lines.length.min()
-    time = step * np.arange(int(np.floor(lines.times[-1] / step * (1 + 1e-12))) + 1)
+    end = lines.times[-1]
+    step = max(lasting.min(), min(_SHORT, end / 1000), end / _MOST)
+    time = step * np.arange(int(np.floor(end / step * (1 + 1e-12))) + 1)
     knots = np.stack([lines.times[:-1], lines.times[1:] - 1e-9 * step], axis=1).ravel()
-    samples = np.interp(time, knots, np.stack([lines.begin, lines.end], axis=1).ravel())
-    count = 1 << int(np.ceil(np.log2(max(samples.size, 80 / step))))
-    power = np.abs(np.fft.rfft(samples, count)) ** 2
-    frequency = np.fft.rfftfreq(count, step)
-    inside = (frequency >= 0.25) & (frequency <= 20)
-    if not power[inside].sum() > 0:
+    values = np.stack([lines.begin, lines.end], axis=1).ravel()
+    # At a jump the mean of both sides, so that it comes neither too early nor too late.
+    samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
+    count = 1 << int(np.ceil(np.log2(max(2 * samples.size, 1 / (_APART * step)))))
+    grid = np.fft.rfftfreq(count, step)
+    frequency = np.concatenate([[0.25], grid[(grid > 0.25) & (grid < 20)], [20.0]])
+    # Of straight lines between the samples.
+    power = np.interp(frequency, grid, np.abs(np.fft.rfft(samples, count) * np.sinc(grid * step) ** 2) ** 2, right=0.0)
+    total = np.trapezoid(power, frequency)
+    if not total > 0:
         raise ValueError("Argument `motion` must move between 0.25 and 20 Hz, but does not.")
-    return float((power[inside] / frequency[inside]).sum() / power[inside].sum())
+    return float(np.trapezoid(power / frequency, frequency) / total)
 
 
 @arguments

@@ -4,6 +4,7 @@ baseline, taper, filter, resample, cut, scale. Known records only: NumPy and Sci
 Every function gives a new `Record` that keeps the name and the origin.
 """
 
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Annotated
 
@@ -41,22 +42,48 @@ def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Recor
     return Record(samples, record.dt if dt is None else dt, record.name, record.origin)
 
 
-def _smoothed(values: np.ndarray, dt: float, corner: float | None, order: int) -> np.ndarray:
-    """After a low-pass without delay; where the ground is at either end it stays."""
-    return values if corner is None else _butterworth(values, dt, None, corner, order, True, "edge")
+def _smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, beyond: Callable) -> np.ndarray:
+    """After a low-pass without delay; `beyond(values, room)`: with so many more at either end."""
+    return values if corner is None else _butterworth(values, dt, None, corner, order, True, beyond)
 
 
-def _butterworth(values, dt, low, high, order, zero_phase, beyond="constant") -> np.ndarray:
+def _at_rest(values: np.ndarray, room: int) -> np.ndarray:
+    """Rest before and after."""
+    return np.pad(values, room)
+
+
+# What a ground at rest at first does, mirrored in time before it begins, and turned about its end after it. A mirror
+# image keeps the velocity at zero under a filter without delay; if the ground only rested before, it would jump.
+
+
+def _of_displacement(values: np.ndarray, room: int) -> np.ndarray:
+    last = values.size - 1
+    turns, place = np.divmod(np.abs(np.arange(-room, values.size + room)), 2 * last)
+    turned = 2 * values[-1] - values[np.minimum(2 * last - place, last)]
+    found = np.where(place <= last, values[np.minimum(place, last)], turned)
+    return np.where(turns % 2 == 0, found, 2 * values[-1] - found)
+
+
+def _of_velocity(values: np.ndarray, room: int) -> np.ndarray:
+    return np.pad(values, room, "reflect", reflect_type="odd")
+
+
+def _of_acceleration(values: np.ndarray, room: int) -> np.ndarray:
+    """The second derivative of `_of_displacement`."""
+    return _of_displacement(np.append(values[:-1], 0.0), room)
+
+
+def _butterworth(values, dt, low, high, order, zero_phase, beyond: Callable = _at_rest) -> np.ndarray:
     edges = [edge for edge in (low, high) if edge is not None]
     kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
     sections = scipy.signal.butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / dt, output="sos")
     if not zero_phase:
         return scipy.signal.sosfilt(sections, values)
-    room = int(min(values.size - 1, np.ceil(3 * order / (min(edges) * dt))))
-    longer = np.pad(values, room, beyond)  # by default the ground rests before and after
-    return scipy.signal.sosfiltfilt(sections, longer, padtype=None)[room : room + values.size]
+    room = int(min(max(_ROOM * values.size, 100_000), np.ceil(3 * order / (min(edges) * dt))))
+    return scipy.signal.sosfiltfilt(sections, beyond(values, room), padtype=None)[room : room + values.size]
 
 
+_ROOM = 8  # in lengths of what is filtered: beyond either end no more, unless that is little
 _LOWEST = 1e-6  # corner over sampling rate: of lower ones coefficients of filters lose their digits, and at last all
 
 
@@ -101,7 +128,8 @@ def from_displacement(
     - `dt`: time between samples [s], positive.
     - `unit`: of the displacement: "m", "cm" or "mm".
     - `corner`: of a Butterworth low-pass of this `order`, run forwards and backwards before it is differentiated [Hz];
-      None: no filter, and noise grows with the square of the frequency.
+      None: no filter, and noise grows with the square of the frequency. Where the ground still moves at the end the
+      acceleration fades over the last 1/corner.
     - `name`: of the record.
 
     **Returns:** a `Record`: the second derivative of the cubic spline through the samples, which is at rest at first
@@ -110,7 +138,7 @@ def from_displacement(
     **Raises:** ValueError for arguments outside their ranges.
     """
     values, dt = _series("displacement", displacement, dt, unit)
-    values = _smoothed(values - values[0], dt, _corner("corner", corner, dt), order)
+    values = _smoothed(values - values[0], dt, _corner("corner", corner, dt), order, _of_displacement)
     return Record(_spline(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
 
 
@@ -144,7 +172,7 @@ def from_velocity(
     **Raises:** ValueError for arguments outside their ranges.
     """
     values, dt = _series("velocity", velocity, dt, unit)
-    values = _smoothed(values, dt, _corner("corner", corner, dt), order)
+    values = _smoothed(values, dt, _corner("corner", corner, dt), order, _of_velocity)
     spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
     return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
 
@@ -183,9 +211,13 @@ def fused(
     values, dt = _series("displacement", displacement, dt, unit)
     corner = _corner("corner", corner, max(step, dt))
     count = min(samples.size, int(np.floor((values.size - 1) * dt / step * (1 + 1e-12))) + 1)
-    slow = _spline(_smoothed(values - values[0], dt, corner, order), dt)(step * np.arange(count), 2) / GRAVITY
+    # Both end there, so that what lies beyond is the same of both.
+    last = max(4, int(np.ceil((count - 1) * step / dt * (1 - 1e-12))) + 1)
+    samples, values = samples[:count], values[:last] - values[0]
+    smooth = _spline(_smoothed(values, dt, corner, order, _of_displacement), dt)
+    slow = smooth(step * np.arange(count), 2) / GRAVITY
     # Filtered before it is differentiated, at its own rate: fast noise would come back as slow.
-    return _like(record, samples[:count] - _smoothed(samples, step, corner, order)[:count] + slow)
+    return _like(record, samples - _smoothed(samples, step, corner, order, _of_acceleration) + slow)
 
 
 @arguments

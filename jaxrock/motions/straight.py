@@ -10,7 +10,7 @@ import numpy as np
 from jaxrock._checks import is_traced
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
-from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.record import Record
 
 _PARTS = 16384  # of a motion of few smooth pieces
@@ -57,6 +57,16 @@ def straight(motion: AbstractMotion) -> Straight:
     if isinstance(motion, Scaled):
         inner, factor = straight(motion.motion), float(motion.factor)
         return Straight(factor * inner.begin, factor * inner.end, inner.length)
+    if isinstance(motion, WithVertical):
+        return straight(motion.horizontal)
+    if isinstance(motion, Shifted):
+        inner, quiet, delay = straight(motion.motion), np.zeros(1), float(motion.delay)
+        lengths = np.concatenate([[delay], inner.length])
+        return (
+            inner
+            if delay == 0
+            else Straight(np.concatenate([quiet, inner.begin]), np.concatenate([quiet, inner.end]), lengths)
+        )
     lengths = np.asarray(motion.lengths, float)
     # Pieces of no length, at the room of longer records, say nothing.
     pieces = np.flatnonzero(lengths > 0)

@@ -21,7 +21,7 @@ from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.intensity import peaks_of_motion
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
-from jaxrock.motions.motion import AbstractMotion, Scaled
+from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.record import Record, with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
@@ -49,6 +49,7 @@ class Suite(AbstractNamed):
     - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
     - `azimuth`: (azimuths,) of components [rad], within 2 pi, from the first one towards the second: in which vertical
       planes a block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
+    - `vertical`: whether the vertical component of components shakes a block, too, if there is one.
 
     `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
     all scenes share the samples of all records.
@@ -78,20 +79,22 @@ class Suite(AbstractNamed):
         motions: Annotated[Sequence[AbstractMotion | Components], list_of(_is_motion, "motions")],
         names: Annotated[Sequence[str] | None, list_of(str, "words")] = None,
         azimuth: Values | None = None,
+        *,
+        vertical: bool = True,
     ):
         if not motions:
             raise ValueError("Argument `motions` must hold at least one motion, but is empty.")
         with _known_stays_so((motions, azimuth)):
-            self._set(motions, names, azimuth)
+            self._set(motions, names, azimuth, vertical)
 
-    def _set(self, motions: Sequence, names: Sequence[str] | None, azimuth: Values | None) -> None:
+    def _set(self, motions: Sequence, names: Sequence[str] | None, azimuth: Values | None, vertical: bool) -> None:
         self.azimuth, self.turns, sources = None, 1, None
         twice = [name for name, count in Counter(names or ()).items() if count > 1]
         if twice:
             raise ValueError(f"Argument `names` must differ from motion to motion, but has {twice[0]!r} twice.")
         if azimuth is not None or any(isinstance(each, Components) for each in motions):
             records = len(motions)
-            motions, names, sources, self.azimuth = _turned(motions, names, azimuth)
+            motions, names, sources, self.azimuth = _turned(motions, names, azimuth, vertical)
             self.turns = len(motions) // records
         self.groups = tuple(map(_ensemble, motions))
         own = [name for motion, group in zip(motions, self.groups) for name in _names(motion, size_of(group))]
@@ -181,7 +184,7 @@ def _multiplied(motion: Any) -> Record:
     return Record(motion.factor * record.samples, record.dt, record.name, record.origin)
 
 
-def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None):
+def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None, vertical: bool):
     """Components at all azimuths: motions, their names, the names of their records, and the azimuth of each."""
     if azimuth is None or not all(isinstance(each, Components) for each in motions):
         raise ValueError("Arguments `motions` and `azimuth` must be given for components alone, all of them.")
@@ -192,7 +195,7 @@ def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | No
     names = _numbered(own) if names is None else names
     if len(names) != len(motions):
         raise ValueError(f"Argument `names` must name {len(motions)} motions, but has {len(names)} names.")
-    turned = [each.along(angle) for each in motions for angle in angles]
+    turned = [each.in_plane(angle, vertical) for each in motions for angle in angles]
     titles = [f"{name}, {np.degrees(angle):.4g} deg" for name in names for angle in angles]
     sources = tuple(name for name in names for _ in angles)
     return turned, _numbered(titles), sources, np.tile(angles, len(motions))
@@ -217,8 +220,8 @@ def size_of(group: AbstractMotion) -> int:
 
 def _names(motion: AbstractMotion, size: int) -> list[str]:
     inner = motion
-    while not getattr(inner, "name", "") and hasattr(inner, "motion"):
-        inner = inner.motion  # of one that is scaled, say
+    while not getattr(inner, "name", "") and isinstance(inner, Scaled | Shifted | WithVertical):
+        inner = inner.horizontal if isinstance(inner, WithVertical) else inner.motion
     name = getattr(inner, "name", "") or type(motion).__name__
     return [name] if size == 1 else [f"{name} {k + 1}" for k in range(size)]
 

@@ -4,6 +4,7 @@ Every plane is followed by itself, with the rock's section and the record's comp
 (twisting, rolling along an edge, sliding) is not modelled.
 """
 
+import warnings
 from collections.abc import Callable
 
 import jax
@@ -22,7 +23,6 @@ from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.components import Components
-from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import with_room
 from jaxrock.responses.current_model import current_model
 from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, stacked
@@ -91,6 +91,8 @@ def azimuth_outcomes(
     **Returns:** an `AzimuthOutcomes`: `weakest` is the direction to which a rock is turned for the planar bound, and
     `components.along(weakest - orientation)` the record there.
 
+    It warns of a rock whose base is rounded in some plane.
+
     **Raises:** ValueError for arguments outside their ranges, and for a function that gives no block, or blocks of two
     kinds.
     """
@@ -108,9 +110,7 @@ def azimuth_outcomes(
     known = jax.tree.map(np.asarray, blocks)
     bar, found = Progress(angles.size * scales.size, "azimuths", progress), []
     for index, angle in enumerate(angles):
-        motion: AbstractMotion = components.along(angle - first)
-        if vertical and components.vertical is not None:
-            motion = motion.with_vertical(components.vertical)
+        motion = components.in_plane(angle - first, vertical)
         lanes = placed(jax.tree.map(lambda x, at=index: np.full(scales.shape, x[at]), known))
         found.append(of_motion(with_room(motion), lanes, placed(scales), model, engine))
         bar.add(scales.size)
@@ -120,6 +120,12 @@ def azimuth_outcomes(
 
 def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBlock:
     """The rock in all planes, its parameters of shape (azimuths,)."""
+    if isinstance(rock, Rock) and any(any(rock.section(float(angle)).rolls) for angle in angles):
+        warnings.warn(
+            "The base is rounded: the rock is taken to rock about the outermost points of the ground it stands on, as "
+            "`Rock.section` has it by default. A function of the azimuth can take another block.",
+            stacklevel=4,
+        )
     found = [_in_plane(rock, float(angle)) for angle in angles]
     for block in found:
         if not isinstance(block, Block | AsymmetricBlock):

@@ -17,15 +17,15 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.models.equation import AbstractEquation
-from jaxrock.motions.motion import Scaled
 from jaxrock.motions.record import with_room
 from jaxrock.motions.suite import Suite
+from jaxrock.motions.turned import felt
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
 
 STOOD, TOPPLED, UNDECIDED = 0, 1, -1
-FACINGS = {"one": (1,), "both": (1, -1)}  # signs of the motion
+FACINGS = {"one": (1,), "both": (1, -1)}  # signs of the horizontal motion
 
 
 class Scenes(NamedTuple):
@@ -92,7 +92,7 @@ def of_motion(motion, blocks, factors, model, engine) -> Scenes:
 
     def one(lane, factor):
         block = one_of_many(blocks, lane)
-        result = outcome(block, Scaled(motion, factor), model, engine=engine)
+        result = outcome(block, felt(motion, factor), model, engine=engine)
         alpha = jnp.minimum(block.alpha1, block.alpha2) if isinstance(block, AsymmetricBlock) else block.alpha
         good = result.status == Status.successful
         verdict = jnp.where(good, jnp.where(result.overturned, TOPPLED, STOOD), UNDECIDED).astype(jnp.int8)

@@ -13,11 +13,12 @@ from jaxrock.motions.files.parsing import (
     plain_numbers,
     to_float,
 )
+from jaxrock.motions.files.titles import SECONDS
 from jaxrock.motions.record import Origin
 
 _UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)", re.IGNORECASE)
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
-_STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})", re.IGNORECASE)
+_STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})\s*([A-Zµμ]*)", re.IGNORECASE)
 _BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
 
 _MANY = 50  # lines that tell how numbers are printed
@@ -41,6 +42,12 @@ class AT2(AbstractFormat):
         if last is None:
             raise file_error(name, "no header line states NPTS and DT, as an AT2 file must.")
         count, step = _counts(lines[last])
+        steps = _steps(lines[last])
+        if len(set(steps)) > 1:
+            raise file_error(name, f"line {last + 1} states time steps of {steps[0]:g} and {steps[1]:g} s.")
+        again = [number for number in range(last + 1, len(lines)) if "NPTS" in lines[number].upper()]
+        if again:
+            raise file_error(name, f"line {again[0] + 1} announces samples once more: one record to a file.")
         dt = agreed_step(name, dt, step)
         at = next((number for number in range(last + 1) if _UNIT.search(lines[number])), None)
         unit = agreed_unit(name, (at or 0) + 1, unit, "" if at is None else _UNIT.search(lines[at])[1])
@@ -60,11 +67,16 @@ def _origin(title: str) -> Origin:
 
 def _counts(line: str) -> tuple[int, float] | None:
     """The number of samples and the time step in a header line [s]."""
-    count, step = _COUNT.search(line), _STEP.search(line)
-    if count and step:
-        return int(count[1]), to_float(step[1])
+    count, steps = _COUNT.search(line), _steps(line)
+    if count and steps:
+        return int(count[1]), steps[0]
     before = _BEFORE.match(line)
     return (int(before[1]), to_float(before[2])) if before else None
+
+
+def _steps(line: str) -> list[float]:
+    """All time steps that a line states [s]."""
+    return [to_float(number) * SECONDS.get(unit.lower(), 1.0) for number, unit in _STEP.findall(line)]
 
 
 def _printed(lines: list[str]) -> list[str]:

@@ -19,7 +19,7 @@ _OTHER_UNIT = re.compile(
     r"|[kcmµμ]?m|in(ch(es)?)?|ft|feet|[mµμ]?v(olts?)?|counts?",
     re.IGNORECASE,
 )
-_SECONDS = (
+SECONDS = (
     dict.fromkeys(["s", "sec", "secs", "second", "seconds"], 1.0)
     | dict.fromkeys(["ms", "msec", "millisecond", "milliseconds"], 1e-3)
     | dict.fromkeys(["us", "µs", "μs", "usec", "microsecond", "microseconds"], 1e-6)
@@ -43,7 +43,7 @@ class Titles(NamedTuple):
     @property
     def state_units(self) -> bool:
         """Whether there is a unit in brackets behind the first."""
-        return bool(self.unit_of(0)) or self._in_brackets(0).lower().rstrip(".") in _SECONDS
+        return bool(self.unit_of(0)) or self._in_brackets(0).lower().rstrip(".") in SECONDS
 
     def seconds(self, name: str, numbers: np.ndarray) -> float | None:
         """What the numbers of the first column are in [s]; None where they count samples. ValueError, if they are
@@ -52,11 +52,11 @@ class Titles(NamedTuple):
             return 1.0
         title, written = self.fields[0], self._in_brackets(0)
         word = _BRACKETS.sub("", title).strip(" .").lower()
-        if word in _SPECTRUM or written and written.lower().rstrip(".") not in _SECONDS:
+        if word in _SPECTRUM or written and written.lower().rstrip(".") not in SECONDS:
             said = f"line {self.line} titles column 0 {title!r}"
             raise file_error(name, f"{said}, but before accelerations there must be times in s, ms, us or min.")
         if written:
-            return _SECONDS[written.lower().rstrip(".")]
+            return SECONDS[written.lower().rstrip(".")]
         # A column without a title is how tables with a numbered row are written.
         counts = word in _COUNTS or not word and (np.diff(numbers) == 1).all()
         return None if counts else 1.0

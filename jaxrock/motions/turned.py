@@ -1,0 +1,60 @@
+"""Motions as a block feels them that may be turned round: mirrored, but for what the ground does vertically."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact
+
+from jaxrock._checks import factor
+from jaxrock._parameters import parameter
+from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
+from jaxrock.motions.shaking import Envelope
+
+
+def felt(motion: AbstractMotion, times: Scalar) -> AbstractMotion:
+    """A motion `times` as strong; if that is negative, as a block feels it that is turned round."""
+    if motion.vertical_bounds is None:
+        return Scaled(motion, times)
+    return Scaled(Turned(motion, jnp.where(times < 0, -1.0, 1.0)), jnp.abs(times))
+
+
+class Turned(AbstractMotion):
+    """A motion whose horizontal acceleration is mirrored where `way` is -1."""
+
+    motion: AbstractMotion
+    way: Inexact[Array, "..."] = parameter("-", factor, is_free=False)
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        return self.motion.knots
+
+    @property
+    def lengths(self) -> Inexact[Array, " pieces"]:
+        return self.motion.lengths
+
+    def length(self, piece: Piece) -> Scalar:
+        return self.motion.length(piece)
+
+    @property
+    def lateness(self) -> Scalar | None:
+        return self.motion.lateness
+
+    @property
+    def scales(self) -> Inexact[Array, " pieces"] | None:
+        return self.motion.scales
+
+    @property
+    def bounds(self) -> Inexact[Array, " pieces"]:
+        return self.motion.bounds
+
+    @property
+    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
+        return self.motion.vertical_bounds
+
+    @property
+    def envelope(self) -> Envelope:
+        return self.motion.envelope
+
+    def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
+        return [self.way * u for u in self.motion.series(piece, local, unit, order)]
+
+    def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
+        return self.motion.vertical_series(piece, local, unit, order)
