@@ -173,6 +173,23 @@ def test_probabilities_are_shares_of_verdicts():
     assert np.sqrt(np.mean((found - shares)[unsure] ** 2)) < 0.05
 
 
+def test_up_stays_up_in_the_unexceeded_motion():
+    """Of rocks that stand the other way round, and of their mirror images."""
+
+    def motion(amplitude, duration):
+        return rk.SinePulse(amplitude, duration).with_vertical(rk.SinePulse(0.6 * amplitude, 0.7 * duration))
+
+    blocks = rk.blocks.AsymmetricBlock(ALPHA, 1.35 * ALPHA, P, 0.7)
+    found = [
+        rk.inverse.unexceeded_motion(
+            rk.inverse.Observations.asymmetric(each, ["survived"] * 12, facing=np.full(12, way), **KNOWN),
+            motion, [0.6], model=rk.Linear(), engine=rk.Series(order=6), progress=False,
+        ).by_rock
+        for each, way in ((blocks, -1), (blocks.mirrored, 1))
+    ]  # fmt: skip
+    np.testing.assert_allclose(*found, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_unexceeded_motions_of_two_sides():
     """Of a rock that may stand either way round the larger one; and up to it the rock does stand, that way."""

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -20,6 +21,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
+from jaxrock.motions.turned import felt
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.spectra import axis
 
@@ -171,14 +173,19 @@ def unexceeded_motion(
     return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))
 
 
-def _motions(motion: Callable, amplitude: Array, duration: Array) -> AbstractMotion:
-    """Those of all amplitudes and durations in one, which share samples of a record."""
-    one = eqx.filter_eval_shape(motion, amplitude[0], duration[0])
+def _motions(motion: Callable, ways: Array, duration: Array) -> AbstractMotion:
+    """Those of amplitude 1, one way or (-1) the other, and of all durations in one, which share samples of a record."""
+    one = eqx.filter_eval_shape(motion, ways[0], duration[0])
     if not isinstance(one, AbstractMotion):
         raise ValueError(f"Argument `motion` must make a motion of amplitude and duration, but makes {shown(one)}.")
-    axes = jax.tree.map(lambda own: None if own else 0, shared(one))
+    is_level = eqx.filter_eval_shape(lambda *x: motion(*x).vertical_bounds, ways[0], duration[0]) is None
+
+    def turned(way, duration):
+        return motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
+
+    axes = jax.tree.map(lambda own: None if own else 0, shared(eqx.filter_eval_shape(turned, ways[0], duration[0])))
     try:
-        return jax.vmap(motion, out_axes=axes)(amplitude, duration)
+        return jax.vmap(turned, out_axes=axes)(ways, duration)
     except ValueError as error:
         if "out_axes" not in str(error):
             raise
