@@ -401,3 +401,66 @@ def test_programs_of_ones_own_equation_call_back_to_nothing():
     scene = BLOCK, rk.SinePulse(0.3, 1.0), current_model(model, BLOCK)
     text = _outcome.lower(*scene, (jnp.zeros(()), jnp.zeros(())), rk.Diffrax()).as_text()
     assert "callback" not in text
+
+
+class Leaning(rk.models.AbstractEquation):
+    """A column on a spring about its corner, for rotations that are not large: a constant and a line."""
+
+    stiffness: jax.Array = rk.parameter("-")
+
+    def moments(self, block):
+        terms = rk.models.Terms(constant=jnp.sin(block.alpha), line=self.stiffness - jnp.cos(block.alpha))
+        return rk.models.Coefficients(terms, arm_terms=rk.models.Terms(constant=jnp.cos(block.alpha)))
+
+
+@pytest.mark.parametrize("amplitude", [1.30, 1.33, 1.5])
+def test_a_block_falls_flat_before_a_balance_beyond(amplitude):
+    """Its balance is at 2.48 rad: on its way there it lies on its side, in the free stage, too."""
+    block, model = rk.Block(0.2, 2.0, 0.9), Leaning(jnp.asarray(0.9))
+    pulse = rk.SinePulse(amplitude, 1.5)
+    found, judge = (rk.outcome(block, pulse, model, engine=each) for each in (rk.Series(), rk.Diffrax(rtol=1e-10)))
+    assert bool(found.overturned) == bool(judge.overturned) == (amplitude > 1.31)
+    np.testing.assert_allclose(found.margin, judge.margin, rtol=1e-6)
+    np.testing.assert_allclose(found.max_rotation, judge.max_rotation, rtol=1e-7)
+
+
+def test_the_end_where_a_block_comes_to_lie_flat():
+    """By energy: a block that is thrown from rest lies flat if its speed carries it there, and is not lost before."""
+    block, model = rk.Block(0.2, 2.0, 0.9), Leaning(jnp.asarray(0.9))
+    slope = np.cos(0.2) - 0.9
+    speed = np.sqrt(2 * (np.sin(0.2) * np.pi / 2 - slope * np.pi**2 / 8))  # of the energy at pi/2, over p
+    still = rk.RectangularPulse(0.0, 1e-3)
+    for share, falls in ((1 - 1e-9, False), (1 + 1e-9, True)):
+        found = rk.outcome(block, still, model, initial=(0.0, share * speed * 2.0))
+        assert found.status == rk.Status.successful and bool(found.overturned) == falls
+    assert rk.outcome(block, still, model, initial=(0.0, speed * 2.0)).status == rk.Status.undecided
+
+
+def test_a_moment_that_never_vanishes_is_for_diffrax():
+    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.5, 0.9)
+    with pytest.raises(ValueError, match="restoring moment of `model` must fall to zero at some rotation"):
+        rk.outcome(block, pulse, Leaning(jnp.asarray(1.0)))
+    found = rk.outcome(block, pulse, Leaning(jnp.asarray(1.0)), engine=rk.Diffrax(rtol=1e-10))
+    np.testing.assert_allclose(found.max_rotation, 0.2044127, rtol=1e-6)  # by SciPy's DOP853
+
+
+@pytest.mark.slow
+def test_what_no_help_is_needed_for_comes_back():
+    """The arm is negative far out, where the push that helps is the one that drove before; by SciPy's DOP853."""
+    model = rk.models.Equation(
+        restoring=lambda x, b: jnp.sin(b.alpha) + 1.5 * x, arm=lambda x, b: jnp.cos(b.alpha - x), falls_flat=False
+    )
+    found = rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(6.0, 1.6), model)
+    assert not found.overturned
+    np.testing.assert_allclose(found.max_rotation, 2.66638, rtol=1e-5)
+
+
+def test_a_law_says_that_it_depends_on_the_speed():
+    class Quiet(rk.restitution.AbstractRestitution):
+        depends_on_speed = False
+
+        def ratio(self, corners, speed):
+            return 0.9 - 0.3 * speed
+
+    with pytest.raises(ValueError, match="ratio of a Quiet depends on the speed of the impact, so its property"):
+        Quiet()

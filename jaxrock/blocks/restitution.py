@@ -68,6 +68,15 @@ class AbstractRestitution(Owner):
 
     def __check_init__(self):
         check_declared(self)
+        is_ours = type(self).__module__.partition(".")[0] == __name__.partition(".")[0]
+        if is_ours or self.depends_on_speed or is_traced(self):
+            return
+        slow, fast = (self.ratio(Corners(*jnp.array([0.2, 0.2, 1.0])), jnp.asarray(speed)) for speed in (0.1, 0.7))
+        if not is_traced((slow, fast)) and np.any(np.asarray(slow) != np.asarray(fast)):
+            raise ValueError(
+                f"The ratio of a {type(self).__name__} depends on the speed of the impact, so its property "
+                "`depends_on_speed` must be True."
+            )
 
     @abc.abstractmethod
     def ratio(self, corners: Corners, speed: Real) -> Real:

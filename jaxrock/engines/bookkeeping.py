@@ -45,7 +45,7 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
     """
     moments = stepper.scene.moments
     ceiling, weight = stepper.scene.outlook.most_helpful(state.piece)
-    hold = -moments.acceleration(angle, state.velocity, ceiling, weight)
+    hold = moments.held(angle, state.velocity, ceiling, weight)
     needed = where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
     certain = state.velocity - needed > stepper.doubt * state.spread.error_of(1.0, 1.0)
     return state.beyond & (state.velocity >= 0) & certain

@@ -126,7 +126,9 @@ class Visit(NamedTuple):
     reset: Reset  # that impact
 
 
-def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar) -> FreeStage:
+def free_stage(
+    visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar, falls_flat: bool = False
+) -> FreeStage:
     """Follow an unforced block to its end.
 
     **Arguments:**
@@ -138,12 +140,13 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
     - `velocity`: its derivative with respect to p t [rad], positive outward.
     - `moving`: whether the block rocks at all; if not, nothing comes.
     - `known`: the largest opening angle so far [rad]: the time of a peak that is lower is not computed.
+    - `falls_flat`: whether it overturns at pi/2, if a saddle lies beyond.
 
     **Returns:** a `FreeStage`.
 
     **Source:** the energy argument of Housner (1963); D&D (2012), 4.12 corrected.
     """
-    present = _present(visits[0].moments, opening, velocity, moving, comes_back=len(visits) > 2)
+    present = _present(visits[0].moments, opening, velocity, moving, falls_flat, comes_back=len(visits) > 2)
     outward, share, lost, impacts = velocity > 0, jnp.ones_like(opening), present.lost, jnp.zeros_like(opening, int)
     arrival, found = present.arrival, [present]
     shares = [share]
@@ -153,7 +156,7 @@ def free_stage(visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, mov
         ratio = reset.ratio(arrival)
         rebound = ratio * arrival
         share = share * jnp.abs(ratio * reset.slope(arrival))  # of a change of the energy
-        stay = _after_impact(visit.moments, rebound, happens)
+        stay = _after_impact(visit.moments, rebound, happens, falls_flat)
         lost, impacts = lost | stay.lost, where(stay.lost, i, impacts)
         arrival = rebound
         found.append(stay)
@@ -208,7 +211,7 @@ class _Stay(NamedTuple):
     lost: Flag  # it falls on this side
     safe: Flag  # it moves there and comes back
     decides: Flag  # whether it falls here is decided by its energy
-    deficit: Scalar  # 2 (energy of the saddle - energy)
+    deficit: Scalar  # 2 (energy at which it falls - energy)
     peak: Scalar  # highest opening angle; zero if it only comes back
     steepness: Scalar  # -2 (change of energy with the peak)
     closeness: Scalar
@@ -242,13 +245,26 @@ def _steepness(moments: Coefficients, peak: Scalar) -> Scalar:
     return 2 * jnp.abs(moments.restoring(Angle.of(peak)))
 
 
-def _present(moments: Coefficients, opening: Scalar, velocity: Scalar, moving: Flag, comes_back: bool) -> _Stay:
+def _flat(moments: Coefficients, falls_flat: bool) -> tuple[Scalar | float, Flag | bool]:
+    """What a block that lies flat lacks of the energy of a saddle beyond, as a `deficit`; and whether it is beyond."""
+    if not falls_flat:
+        return 0.0, False
+    saddle = moments.saddle
+    level = moments.manifold(jnp.full_like(saddle, jnp.pi / 2)) ** 2 / moments.stiffness
+    return where(saddle > jnp.pi / 2, level, 0.0), saddle > jnp.pi / 2
+
+
+def _present(
+    moments: Coefficients, opening: Scalar, velocity: Scalar, moving: Flag, falls_flat: bool, comes_back: bool
+) -> _Stay:
     """The stay on the side where the block is when the motion ends; `comes_back`: whether it matters when it does."""
+    level, flat = _flat(moments, falls_flat)
     rate = jnp.sqrt(moments.stiffness)
     gap, speed = moments.saddle - opening, velocity / rate
     manifold, base = moments.manifold(opening) / rate, moments.manifold(jnp.zeros_like(opening)) / rate
     deficit = (manifold - speed) * (manifold + speed)
-    lost, outward = moving & (speed > manifold), speed > 0
+    outward = speed > 0
+    lost = moving & ((speed > manifold) | (flat & outward & (deficit < level)))
     safe = moving & ~lost
     arrival = jnp.sqrt(jnp.maximum(base**2 - deficit, 0.0))
     rises, falls = safe & outward, safe & ~outward
@@ -273,11 +289,12 @@ def _present(moments: Coefficients, opening: Scalar, velocity: Scalar, moving: F
     lost_closeness = where(gap > 0, crossing, beyond)
     safe_closeness = where(outward, turning, where(past_inward, crossing, jnp.inf))
     peak = _peak_of(moments, where(rises, deficit, base**2))
+    lost_closeness = where(flat, jnp.inf, lost_closeness)
     return _Stay(
         lost=lost,
         safe=safe,
         decides=moving & (outward | past_inward),
-        deficit=deficit * moments.stiffness,
+        deficit=(deficit - level) * moments.stiffness,
         peak=where(rises, peak, 0.0),
         steepness=_steepness(moments, peak),
         closeness=where(lost, lost_closeness, where(safe, safe_closeness, jnp.inf)),
@@ -286,12 +303,13 @@ def _present(moments: Coefficients, opening: Scalar, velocity: Scalar, moving: F
     )
 
 
-def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag) -> _Stay:
+def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag, falls_flat: bool) -> _Stay:
     """The stay on a side on which the block comes to stand with a velocity; if it happens at all."""
+    level, flat = _flat(moments, falls_flat)
     rate = jnp.sqrt(moments.stiffness)
     base, speed = moments.manifold(jnp.zeros_like(rebound)) / rate, rebound / rate
     deficit = (base - speed) * (base + speed)
-    lost = happens & (speed > base)
+    lost = happens & ((speed > base) | (flat & (deficit < level)))
     safe = happens & ~lost
 
     def times(since):
@@ -300,12 +318,12 @@ def _after_impact(moments: Coefficients, rebound: Scalar, happens: Flag) -> _Sta
 
     peak = _peak_of(moments, where(safe, deficit, base**2))
     turning = _turning_closeness(moments, jnp.abs(deficit))
-    crossing = -deficit * _weight(moments)
+    crossing = where(flat, jnp.inf, -deficit * _weight(moments))
     return _Stay(
         lost=lost,
         safe=safe,
         decides=happens,
-        deficit=deficit * moments.stiffness,
+        deficit=(deficit - level) * moments.stiffness,
         peak=peak,
         steepness=_steepness(moments, peak),
         closeness=where(lost, crossing, where(safe, turning, jnp.inf)),

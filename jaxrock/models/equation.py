@@ -92,6 +92,10 @@ class AbstractMoments(eqx.Module):
         forcing at the angle, positive.
         """
 
+    def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """The largest acceleration inward under a forcing of this size or less [g]."""
+        return -self.acceleration(angle, velocity, push, weight)
+
     def work(self, opening: Scalar) -> Scalar:
         """Work of the weight up to an opening angle, over m g R: half the squared speed on the ground after a free fall
         from there."""

@@ -182,6 +182,11 @@ class FunctionMoments(AbstractMoments):
         one = jnp.ones_like(self.saddle)
         return one if self.factor is None else self.factor * one
 
+    def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """As for any moments; far from rest the arm may be negative."""
+        one, other = (-self.acceleration(angle, velocity, way * push, weight) for way in (1, -1))
+        return jnp.maximum(one, other)
+
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; infinite, because nothing is known of the function beyond this angle."""
         return jnp.full_like(hold, jnp.inf)

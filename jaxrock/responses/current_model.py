@@ -12,6 +12,8 @@ from jaxrock._checks import is_traced, marked, put_down
 from jaxrock._guard import guarded
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
+from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.engines.taylor.careful import Series
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions
@@ -46,15 +48,17 @@ def current_model(model: AbstractEquation, block: Block | AsymmetricBlock, *scen
     return jax.tree.map(current, model, is_leaf=_is_functions)
 
 
-def standing(block: Block | AsymmetricBlock, model: AbstractEquation, throw: bool = True) -> Block | AsymmetricBlock:
+def standing(
+    block: Block | AsymmetricBlock, model: AbstractEquation, engine: AbstractEngine, throw: bool = True
+) -> Block | AsymmetricBlock:
     """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one, or
-    balances on a spring.
+    balances on a spring, or by a model of the user's own that `engine` solves by its balance.
 
     Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
     """
     if isinstance(model, Spring):
         return _balanced(block, model, throw)
-    if not isinstance(model, Equation):
+    if not isinstance(model, Equation) and (_is_ours(model) or not isinstance(engine, Series)):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
         # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
@@ -77,8 +81,21 @@ def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Bl
     return block
 
 
-def _faults(model: Equation, block: Block | Side) -> dict[str, Bool[Array, ""]]:
-    return {message: jnp.any(applies) for message, applies in model.faults(block).items()}
+def _is_ours(model: AbstractEquation) -> bool:
+    return type(model).__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def _faults(model: AbstractEquation, block: Block | Side) -> dict[str, Bool[Array, ""]]:
+    if isinstance(model, Equation):
+        return {message: jnp.any(applies) for message, applies in model.faults(block).items()}
+    saddle = model.moments(block).saddle
+    return {_NO_BALANCE: ~jnp.all((saddle > 0) & (saddle < jnp.inf))}
+
+
+_NO_BALANCE = (
+    "The restoring moment of `model` must fall to zero at some rotation, where the block balances; one that does not "
+    "is for `Diffrax()`."
+)
 
 
 _compiled_faults = jax.jit(_faults)

@@ -238,7 +238,7 @@ def simulate(
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model, motion)
-    block, start = standing(block, model, throw), start_of(initial, throw)
+    block, start = standing(block, model, engine, throw), start_of(initial, throw)
     summary, path = _simulate(block, padded(motion), model, start, duration, engine)
     time, rotation, velocity = _equally_spaced(path, samples)
     response = Response(time, rotation, velocity, summary, path)

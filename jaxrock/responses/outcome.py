@@ -148,7 +148,7 @@ def outcome(
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
     block, motion = in_real_numbers(block, motion)
-    block, start = standing(block, model, throw), start_of(initial, throw)
+    block, start = standing(block, model, engine, throw), start_of(initial, throw)
     in_place = isinstance(engine, Series) and is_in_place(motion)
     result = _outcome(block, motion if in_place else padded(motion), model, start, engine)
     return result if throw else marked_result(result, (block, motion, model, start))

@@ -35,7 +35,8 @@ def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], 
         middle = sides[0].mean(axis=0)
         values = (middle, *at(middle, index))
         complete[index[np.isnan(values[1])]] = False
-        sides, depth, single, more = halved(np, sides, values, depth)
+        with np.errstate(invalid="ignore"):  # the margin of a block that fell flat before its saddle is infinite
+            sides, depth, single, more = halved(np, sides, values, depth)
         index = np.tile(index, 2)
         kept.append((index[single], *(x[:, single] for x in sides)))
         sides, index, depth = [x[:, more] for x in sides], index[more], depth[more]
@@ -81,7 +82,8 @@ def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndar
         open_ = is_wide(np, sides)
         if not open_.any():
             break
-        trial = next_point(np, sides, count)[open_]
+        with np.errstate(invalid="ignore"):
+            trial = next_point(np, sides, count)[open_]
         values = (trial, *at(trial, index[open_]))
         onto = ((values[1] < 0) == (sides[1][1, open_] < 0)).astype(int)
         for array, new in zip(sides, values):

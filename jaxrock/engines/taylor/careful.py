@@ -164,10 +164,10 @@ class TaylorStepper(AbstractStepper):
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
             # In reverse mode what is not taken (roots of zero) would spoil what is.
-            stage = differentiable(lambda start: free_stage(*start))(start)
+            stage = differentiable(lambda start: free_stage(*start, falls_flat=scene.falls_flat))(start)
         else:
             none = FreeStage.none(state.opening)
-            stage = jax.lax.cond(moving, lambda: free_stage(*start), lambda: none)
+            stage = jax.lax.cond(moving, lambda: free_stage(*start, falls_flat=scene.falls_flat), lambda: none)
         # A loss after one more impact is a new excursion; otherwise this one may have been closer before.
         beyond = where(stage.impacts > 0, stage.closeness, jnp.minimum(state.closeness_beyond, stage.closeness))
         higher = surpasses(stage.peak, state.peak)
