@@ -127,7 +127,7 @@ class Visit(NamedTuple):
 
 
 def free_stage(
-    visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar, falls_flat: bool = False
+    visits: tuple[Visit, ...], opening: Scalar, velocity: Scalar, moving, known: Scalar, *, falls_flat: bool = False
 ) -> FreeStage:
     """Follow an unforced block to its end.
 
