@@ -387,9 +387,10 @@ def test_what_is_no_smooth_linear_equation_raises():
     for dry in (lambda x, v, block: 1e-6 * jnp.sign(v), lambda x, v, block: 0.02 * jnp.sign(v)):
         with pytest.raises(ValueError, match="The dissipation must not jump"):
             rk.outcome(BLOCK, rk.SinePulse(0.5, 1.0), equation(dry))
-    with pytest.raises(ValueError, match="must be linear in the push"):
-        model = rk.models.Equation(acceleration=lambda x, v, push, block: x - block.alpha - push**3)
-        rk.outcome(BLOCK, rk.SinePulse(0.5, 1.0), model)
+    for bent in (lambda x, push: push**3, lambda x, push: push + 5 * x * push**2):  # at rest, and beyond
+        model = rk.models.Equation(acceleration=lambda x, v, push, block, f=bent: x - block.alpha - f(x, push))
+        with pytest.raises(ValueError, match="must be linear in the push"):
+            rk.outcome(BLOCK, rk.SinePulse(0.5, 1.0), model)
     for smooth in (lambda x, v, block: 0.02 * jnp.tanh(v / 1e-3), lambda x, v, block: 5.0 * v + jnp.abs(v) * v):
         assert not any(equation(smooth).faults(BLOCK).values())
 

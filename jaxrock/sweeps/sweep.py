@@ -262,6 +262,8 @@ def compute(
     """
     run = Runner(function, plan.axes, scene, math.prod(plan.block))
     own, count = process()
+    if store is None and count == 1 and plan.block == plan.shape:
+        return _at_once(run, plan, label, progress, columns), 0
     done = _there(store) if store else np.zeros(math.prod(plan.blocks), bool)
     left = np.flatnonzero(~done).tolist()
     mine = left[own::count]
@@ -269,9 +271,7 @@ def compute(
     if store and resumed and own == 0 and progress is not False:
         print(f"{label}: {resumed:,} of {math.prod(plan.shape):,} points come from {store.path}", file=sys.stderr)
     bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
-    is_whole = not store and mine == [0] and plan.block == plan.shape  # nothing to put together
-    kept = not store and not is_whole
-    results = [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes] if kept else []
+    results = [] if store else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
     for number in mine:
         place = plan.place(number)
@@ -280,8 +280,6 @@ def compute(
         leaves = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in leaves]
         if store:
             _write(store, number, leaves)
-        elif is_whole:
-            results = leaves
         else:
             for leaf, part in zip(results, leaves):
                 leaf[place] = part
@@ -292,6 +290,13 @@ def compute(
     if store and not load:
         return None, resumed
     return jax.tree.unflatten(run.tree, store.read() if store else results), resumed
+
+
+def _at_once(run: Runner, plan: Plan, label: str, progress: bool | None, columns: bool):
+    """The same of a grid that is one block, where there is one process and nothing is kept."""
+    bar = Progress(math.prod(plan.shape), label, progress)
+    leaves = run(plan.points(0), bar.add, tiles(plan.shape, columns))
+    return jax.tree.unflatten(run.tree, [leaf.reshape(*plan.shape, *leaf.shape[1:]) for leaf in leaves])
 
 
 def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:
