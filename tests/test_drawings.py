@@ -164,6 +164,14 @@ def test_the_shape_of_an_asymmetric_block_must_be_given():
     started(rk.plot.animate(response, ROCK))
 
 
+def test_each_side_has_its_own_threshold_and_saddle():
+    response = rk.simulate(rk.blocks.AsymmetricBlock(0.15, 0.3, 2.5), PULSE, rk.Linear(), duration=1.0)
+    lines = rk.plot.history(response)[2].lines
+    assert {round(line.get_ydata()[0], 9) for line in lines if len(line.get_ydata()) == 2} == {0, -0.15, 0.3}
+    points = [line.get_xdata()[0] for line in rk.plot.phase(response).lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(points, [1.0, -2.0])
+
+
 def test_another_block_is_not_drawn(response):
     with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose alpha and p are"):
         rk.plot.animate(response, rk.Block(0.3, 2.0))

@@ -83,6 +83,17 @@ HISTORIES = {
 }  # fmt: skip
 
 
+def test_no_verdict_is_given_while_the_ground_shakes():
+    """A base that is far beyond its balance; the ground, which still shakes a little, might bring it back."""
+    block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3)
+    motion = rk.RectangularPulse(0.6, 0.9) + rk.SinePulse(0.01, 3.0)
+    for duration in (0.5, 0.8):
+        found = rk.outcome(block, motion, duration=duration)
+        assert found.status == rk.Status.undecided and found.margin < 0 and found.energy > 10
+    found = rk.outcome(block, motion, duration=4.0)
+    assert found.status == rk.Status.successful and found.overturned and found.margin < 0
+
+
 @pytest.mark.parametrize(
     "case", [pytest.param(k, marks=pytest.mark.slow) if k != "tall, undamped" else k for k in HISTORIES]
 )

@@ -311,6 +311,16 @@ def test_components_are_known_by_what_they_say(file, order):
         np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
 
 
+@pytest.mark.parametrize("comma", [",", ""])
+def test_components_that_began_at_other_times_as_cosmos_tells_it(file, comma):
+    def text(seconds):
+        return COSMOS.replace("\n", f"\nRcrd start time:12/20/2021{comma} 20:13:{seconds} UTC (Q= 5)\n", 1)
+
+    assert rk.read_record(file(text("10.750"))).origin.start == "12/20/2021 20:13:10.750"
+    with pytest.raises(ValueError, match="must begin at one time"):
+        rk.motions.read_components([file(text("10.750"), "a.V2c"), file(text("20.750"), "b.V2c")])
+
+
 def test_a_component_that_says_it_points_downward_is_warned_of(file):
     paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", "DWN"))]
     with pytest.warns(UserWarning, match="vertical component says 'DWN', and is taken as it stands, positive upward"):

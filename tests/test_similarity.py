@@ -244,3 +244,14 @@ def test_names_of_orientations():
         orientations.combined("x", "w")
     with pytest.raises(ValueError, match="Argument `name` must be one of 'rotation', 'alpha'"):
         orientations.product(mass=1)
+
+
+def test_a_block_that_cannot_have_the_groups_is_refused():
+    groups = similarity.groups_of(rk.Block(0.3, 2.0, 0.85), rk.SinePulse(0.5, 0.8))
+    with pytest.raises(ValueError, match="`block` must have the restitution of the groups, 0.85, but has 0.5"):
+        similarity.motion(groups, rk.Block(0.3, 3.0, 0.5), rk.SinePulse)
+    with pytest.raises(ValueError, match="`block` must have the cosine of alpha of the groups"):
+        similarity.motion(groups, rk.Block(0.2, 3.0, 0.85), rk.SinePulse)
+    others = similarity.groups_of(rk.Block(0.3, 2.0, 0.85), rk.ExponentialPulse(0.5, 0.8, shape=1.0))
+    with pytest.raises(ValueError, match=r"`form` must have the parameters \['shape'\] of the groups"):
+        similarity.motion(others, rk.Block(0.3, 2.0, 0.85), rk.SinePulse)

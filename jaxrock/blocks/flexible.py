@@ -155,7 +155,10 @@ class FlexibleBlock(Owner):
 
     @property
     def first_period(self) -> Real:
-        """First period of the clamped continuous column [s].
+        """First period of the clamped continuous column of the block's height [s].
+
+        The masses stand on one of the length 2R (`length`), whose periods (`frequencies`) are (2R/height)^(3/2) times
+        as long.
 
         **Source:** Diamantopoulos & Fragiadakis (2017), equation 23: 12.38 sqrt(density/modulus) h/tan(alpha), h half
         the height, with 12.38 = 8 sqrt(3) pi/1.87510^2.

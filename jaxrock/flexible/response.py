@@ -104,7 +104,7 @@ class FlexibleResponse(AbstractTable):
 
     @property
     def overturned(self) -> Bool[Array, "..."]:
-        """The verdict, which looks beyond the duration."""
+        """The verdict, which looks beyond a duration that covers the motion."""
         return self.outcome.overturned
 
     @property

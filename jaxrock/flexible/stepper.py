@@ -56,12 +56,13 @@ class FlexibleOutcome(AbstractTable):
     - `max_displacement`: largest |displacement| of the top relative to the ground [m]; infinite if it overturned.
     - `max_bending`: largest part of it that is bending [m]; infinite if the block overturned.
     - `impact_count`: impacts within the duration.
-    - `overturned`: the verdict, which looks beyond the duration.
+    - `overturned`: the verdict, which looks beyond a duration that covers the motion.
     - `margin`: signed distance to overturning [-], by the rocking part of the motion (its unstable mode and the one
       that mirrors it, without vibrations): 1 if the base has not turned, positive if the block survives, zero where
       it comes to balance, negative if it overturns. Of rigid and undamped rocking it is (1 - peak/balance)^2.
     - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself.
-    - `status`: a `Status`; `undecided` if, at the end, the energy suffices to overturn but the block is not lost.
+    - `status`: a `Status`; `undecided` if, at the end, the energy suffices to overturn but the block is not lost, which
+      it is not known to be while the ground shakes.
     """
 
     max_rotation: Scalar
@@ -283,17 +284,17 @@ class FlexibleScene(eqx.Module):
 
     def conclude(self, state: FlexibleState) -> FlexibleOutcome:
         """What came of it, from the state at the end."""
-        lost = state.fallen | self._never_returns(state)
+        gone = state.fallen | self._never_returns(state)
+        lost = state.fallen | (gone & (self.time(state) >= self.knots[-1]))  # the ground may bring it back
         total = sum(self.energy(state.motion)) / self.summit
-        quiet = self.time(state) >= self.knots[-1]
-        status = Status.where(lost | (total < 1) | ~quiet, state.status, Status.undecided)
+        status = Status.where(lost | (total < 1), state.status, Status.undecided)
         status = Status.where(state.status == Status.successful, status, state.status)
         status = Status.where(state.done, status, Status.step_budget_exhausted)
         length = jnp.cos(self.numbers.alpha) * self.block.length
         largest = jnp.maximum(*jnp.split(state.maxima, 2)) * jnp.stack([jnp.ones_like(length), length, length])
         largest = jnp.where(lost, jnp.inf, largest)
         rotation, displacement, bending = largest
-        margin = self._margin(state, lost, quiet)
+        margin = self._margin(state, gone)
         return FlexibleOutcome(rotation, displacement, bending, state.impacts, lost, margin, total, status)
 
     def _amplitudes(self, state: FlexibleState) -> Complex[Array, " modes"]:
@@ -307,19 +308,18 @@ class FlexibleScene(eqx.Module):
         growing = rates == jnp.max(rates)
         outward = side * jnp.sum(jnp.where(growing, amplitudes.real, 0.0))
         others = jnp.sum(jnp.where(growing, 0.0, jnp.abs(amplitudes)))
-        quiet = self.time(state) >= self.knots[-1]
-        return quiet & (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
+        return (side != 0) & (outward > 0) & (self.numbers.balance + outward > others)
 
-    def _margin(self, state: FlexibleState, lost: Bool[Array, ""], quiet: Bool[Array, ""]) -> Scalar:
-        """The closeness that was, and, where the ground rests, that of the swing in which the base is."""
+    def _margin(self, state: FlexibleState, gone: Bool[Array, ""]) -> Scalar:
+        """The closeness that was, and that of the swing in which the base is, if the ground rests from now on."""
         grows, decays = mirrored(self.rocking)
         outward, inward = (state.side * self._amplitudes(state).real[k] for k in (grows, decays))
         rates = (self.rocking.rates[grows].real, -self.rocking.rates[decays].real)
-        ahead = jnp.where(quiet & (state.side != 0), still_to_come(outward, inward, *rates), jnp.inf)
+        ahead = jnp.where(state.side != 0, still_to_come(outward, inward, *rates), jnp.inf)
         ahead /= self.numbers.balance**2
         beyond = jnp.where(outward + inward > 0, jnp.minimum(state.closeness_beyond, ahead), ahead)
         fallen = jnp.where(state.fallen, state.closeness_beyond, beyond)
-        return jnp.where(lost, -fallen, jnp.minimum(state.closeness, ahead))
+        return jnp.where(gone, -fallen, jnp.minimum(state.closeness, ahead))
 
 
 def _maxima(rows, maxima, x):

@@ -47,7 +47,8 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
       bending, take the place of the velocity.
     - `axes`: three matplotlib axes; None makes a figure.
 
-    **Returns:** the three axes.
+    **Returns:** the three axes. Of an asymmetric block alpha is the smaller slenderness angle, and each way has its own
+    threshold.
     """
     import matplotlib.pyplot as plt
 
@@ -65,9 +66,9 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
-    threshold = float(scene.moments.threshold)
-    for sign in (-1, 1):
-        axes[2].axhline(sign * threshold, color=SAND, linewidth=0.9, label="uplift threshold" if sign > 0 else None)
+    for side, moments in zip((1, -1), scene.both_moments):  # positive acceleration lifts it to side -1
+        label = "uplift threshold" if side > 0 else None
+        axes[2].axhline(-side * float(moments.threshold), color=SAND, linewidth=0.9, label=label)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
     axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     axes[2].set_ylabel("ground\nacceleration [g]")
@@ -101,14 +102,13 @@ def _manifolds(moments: Coefficients, opening):
     return jax.vmap(moments.manifold)(opening)
 
 
-def _manifold(axis: "Axes", moments: Coefficients, alpha: float) -> None:
-    """The stable manifolds of both upright saddles, and the unstable ones, dotted."""
-    opening = np.linspace(0, 2, 101)
+def _manifold(axis: "Axes", moments: Coefficients, side: int, alpha: float) -> None:
+    """The stable manifold of the upright saddle of a side, and the unstable one, dotted."""
+    opening = np.linspace(0, 2 * max(1.0, float(moments.saddle) / alpha), 101)
     manifold = np.asarray(_manifolds(moments, opening * alpha)) / alpha
-    for side in (1, -1):
-        label = "stable manifold" if side > 0 else None
-        axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
-        axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
+    label = "stable manifold" if side > 0 else None
+    axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
+    axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
 
 
 @figure(1)
@@ -140,10 +140,10 @@ def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> 
     # The line breaks at impacts: the velocity jumps there.
     crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
     axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=BLUE, linewidth=0.8)
-    if isinstance(scene.moments, Coefficients):  # of functions no manifold is known
-        _manifold(axis, scene.moments, alpha)
-    for side in (1, -1):
-        axis.plot([side * float(scene.moments.saddle) / alpha], [0], "o", color=RED, markersize=4)
+    for side, moments in zip((1, -1), scene.both_moments):
+        if isinstance(moments, Coefficients):  # of functions no manifold is known
+            _manifold(axis, moments, side, alpha)
+        axis.plot([side * float(moments.saddle) / alpha], [0], "o", color=RED, markersize=4)
     axis.axvline(0, color=GREY, linewidth=0.5)
     reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
     axis.set_xlim(-reach, reach)

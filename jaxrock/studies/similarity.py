@@ -15,10 +15,11 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, not_nan, one_of, positive, share, size
+from jaxrock._checks import as_real, is_traced, not_nan, one_of, positive, share, size
 from jaxrock._described import described
 from jaxrock._parameters import declared
 from jaxrock.blocks.restitution import tells_sides
@@ -171,13 +172,24 @@ def motion(groups: Groups, block: Block, form: Callable):
 
     **Arguments:**
 
-    - `groups`: `Groups`; if of rigid blocks, with the cosine of `block.alpha`.
-    - `block`: a `Block` of any size.
+    - `groups`: `Groups`.
+    - `block`: a `Block` of any size, of their restitution, and if they are of rigid blocks, of their alpha.
     - `form`: makes a motion from peak [g] and period or duration [s], such as `SinePulse`; a pulse, where the groups
       have others of its parameters.
 
     **Returns:** what `form` makes.
+
+    **Raises:** ValueError for a block that is known not to have these groups under any motion, and for a pulse without
+    their other parameters.
     """
+    own = {"restitution": (groups.restitution, block.restitution)}
+    if groups.cos_alpha is not None:
+        own["cosine of alpha"] = (groups.cos_alpha, jnp.cos(block.alpha))
+    for name, (wanted, found) in own.items():
+        if not is_traced((wanted, found)) and not np.allclose(wanted, found, rtol=1e-6, atol=1e-6):
+            raise ValueError(f"Argument `block` must have the {name} of the groups, {wanted}, but has {found}.")
+    if groups.others and not groups.others.keys() <= _parts(form)[1].keys():
+        raise ValueError(f"Argument `form` must have the parameters {[*groups.others]} of the groups, but has not.")
     threshold = block.alpha if groups.cos_alpha is None else jnp.tan(block.alpha)
     are_times = _parts(form)[1] if groups.others else {}
     others = {name: value / block.p if are_times[name] else value for name, value in groups.others.items()}

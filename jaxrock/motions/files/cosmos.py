@@ -107,4 +107,5 @@ def _origin(lines: list[str]) -> Origin:
     channel = after(r"<SCNL>\s*(\S+)")
     if component.lower() in ("", "other") and channel.count(".") >= 1:
         component = channel.split(".")[1]
-    return Origin(event, station, component, after(r"Rcrd start time:\s*([\d/]+\s+[\d:.]+)"), code)
+    start = after(r"Rcrd start time:\s*([\d/]+,?\s+[\d:.]+)").replace(",", "")
+    return Origin(event, station, component, start, code)
