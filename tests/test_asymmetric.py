@@ -326,3 +326,12 @@ def test_bad_input(name):
     make, message = BAD[name]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_forces_of_a_block_that_knows_its_inertia():
+    block = rk.Block.from_radius(0.25, 1.5, inertia_ratio=0.5)
+    response = rk.simulate(block, rk.SinePulse(0.5, 0.6), engine=rk.Series(order=8), samples=200)
+    own, same, rectangle = (
+        rk.responses.contact_forces(response, block, *given).largest_friction for given in ((), (0.5,), (0.75,))
+    )
+    assert own == same != rectangle

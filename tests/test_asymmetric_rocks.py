@@ -234,3 +234,14 @@ def test_the_command_for_rocks_with_two_sides(tmp_path, capsys):
     assert lines[0] == "name,alpha1_rad,alpha2_rad,p1_rad_per_s,p2_rad_per_s,observed,probability"
     np.testing.assert_allclose(float(lines[1].split(",")[4]), p2[0], rtol=1e-5)
     assert len((tmp_path / "unexceeded.csv").read_text().splitlines()) == 7
+
+
+def test_a_given_restitution_is_that_of_both_sides():
+    one, pair = (rk.blocks.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P, 0.7, None, law) for law in (
+        rk.restitution.Constant(0.4), (np.full(12, 0.4), np.full(12, 0.4))))  # fmt: skip
+    found, same = (rk.inverse.Observations.asymmetric(each, WORDS, facing=FACING, **KNOWN) for each in (one, pair))
+    np.testing.assert_allclose(found.restitution, 0.4, rtol=1e-12)
+    np.testing.assert_allclose(found.other.restitution_ratio, same.other.restitution_ratio)
+    by_speed = rk.blocks.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P, 0.7, None, rk.restitution.SpeedDependent(0.9, 0.5, 1.0))
+    with pytest.raises(ValueError, match="`blocks` must have a restitution that does not depend on the speed"):
+        rk.inverse.Observations.asymmetric(by_speed, WORDS, facing=FACING, **KNOWN)

@@ -218,3 +218,21 @@ def test_ends_of_a_sum_of_pulses_are_ends():
     ends = [rk.critical_amplitudes(block, motion(0.3 + x), **asked).lowest for x in (-1e-5, 1e-5)]
     slope = found.derivative[int(np.argmin(found.value)), found.names.index("first.amplitude")]
     np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-6)
+
+
+def test_durations_of_a_block_of_two_sides():
+    block, pulse = rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0), rk.SinePulse(0.6, 1.0)
+    found = rk.studies.critical_durations(block, pulse, rk.Linear(), max_ends=1, derivatives=False, progress=False)
+    verdicts = [
+        bool(rk.outcome(block, rk.SinePulse(0.6, float(found.value[0]) * share), rk.Linear()).overturned)
+        for share in (1 - 1e-9, 1 + 1e-9)
+    ]
+    assert sorted(verdicts) == [False, True]
+
+
+def test_durations_are_refused_of_models_that_know_p():
+    """A longer motion is taken as a larger p, which a damper of so many newtons a metre a second would feel."""
+    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.5, 1.5)
+    moments = (lambda x, k: jnp.sin(k.alpha - x), lambda x, k: jnp.cos(k.alpha - x))
+    with pytest.raises(ValueError, match="`model` must not depend on the block's p"):
+        rk.studies.critical_durations(block, pulse, rk.models.Equation(*moments, lambda x, v, k: 0.3 / k.p * v))

@@ -237,7 +237,7 @@ def test_nrml(tmp_path):
     assert float(last["stddev"]) == pytest.approx(law.std(), rel=1e-9)
     rk.hazard.write_nrml({"topples": rk.hazard.TabulatedFragility([0.1, 0.2, 0.4], [0.0, 0.7, 0.6])}, path, "PGV")
     root = ElementTree.parse(path).getroot()
-    assert root.find(".//n:imls", space).text == "0.1 0.2 0.4"
+    assert root.find(".//n:imls", space).text == "10 20 40"  # m/s here, cm/s there
     assert root.find(".//n:poes", space).text == "0 0.7 0.6"
     with pytest.raises(ValueError, match="`fragilities` must hold fragilities by name"):
         rk.hazard.write_nrml({}, path)

@@ -10,6 +10,7 @@ from jaxrock._arguments import arguments, path_of
 from jaxrock._aside import written_aside
 from jaxrock._checks import shown
 from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility
+from jaxrock.hazard.openquake import CM_PER_M
 
 _SPACE = "http://openquake.org/xmlns/nrml/0.5"
 
@@ -30,7 +31,8 @@ def write_nrml(
     - `fragilities`: by the names of their limit states, from slight to severe: all `LogNormalFragility`, or all
       `TabulatedFragility` of the same levels.
     - `path`: the file; one that is there is replaced.
-    - `measure`: as OpenQuake calls it, such as "PGA" [g], "PGV" or "SA(0.5)".
+    - `measure`: as OpenQuake calls it, such as "PGA" [g], "PGV" or "SA(0.5)" [g]. Of "PGV" the fragilities are in m/s,
+      and the file in cm/s, as OpenQuake has it.
     - `taxonomy`, `description`: of the object.
 
     **Raises:** ValueError for fragilities that do not go together; OSError if the file cannot be written.
@@ -42,6 +44,7 @@ def write_nrml(
             "Argument `fragilities` must hold fragilities by name, all lognormal or all tabulated, but is "
             f"{shown(fragilities)}."
         )
+    fragilities = {name: _in_unit(each, CM_PER_M if measure == "PGV" else 1.0) for name, each in fragilities.items()}
     root = ElementTree.Element("nrml", xmlns=_SPACE)
     model = ElementTree.SubElement(
         root, "fragilityModel", id="jaxrock", assetCategory="contents", lossCategory="contents"
@@ -52,6 +55,13 @@ def write_nrml(
     ElementTree.indent(root)
     with written_aside(path_of("path", path), replace=True) as aside:
         ElementTree.ElementTree(root).write(aside, encoding="utf-8", xml_declaration=True)
+
+
+def _in_unit(fragility: LogNormalFragility | TabulatedFragility, factor: float):
+    """A fragility over so many times as large numbers."""
+    if isinstance(fragility, LogNormalFragility):
+        return LogNormalFragility(factor * fragility.median, fragility.dispersion)
+    return TabulatedFragility(factor * fragility.levels, fragility.probabilities)
 
 
 def _continuous(model, fragilities: Mapping, measure: str, taxonomy: str) -> None:

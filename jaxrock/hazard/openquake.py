@@ -28,6 +28,8 @@ _KIND = re.compile(r"\bkind='([^']*)'")
 # Older files, without kind=: "# quantile-0.1, investigation_time=...", "# source_model_tree_path=('b1',), gsim_...".
 _OLD_KIND = re.compile(r"#[\s,\"]*(.*?)[\s,]*\binvestigation_time=")
 
+CM_PER_M = 100.0  # OpenQuake's peak velocities are in cm/s
+
 # Probabilities are computed in single precision from many sources, so that equal ones may differ by a little.
 _NOISE = 1e-5, 3e-7
 
@@ -35,8 +37,8 @@ _NOISE = 1e-5, 3e-7
 class HazardCurves(eqx.Module):
     """Hazard curves of sites, each under one or more branches, as files hold them.
 
-    - `curves`: a `HazardCurve` with arrays of shape (branches, sites, levels), in the unit of the files (OpenQuake: g
-      for PGA and SA, cm/s for PGV).
+    - `curves`: a `HazardCurve` with arrays of shape (branches, sites, levels), in g for PGA and SA, in m/s for PGV (of
+      which files have cm/s), and in the unit of the files for others.
     - `longitude`, `latitude`: (sites,) [degrees].
     - `depth`: (sites,) below sea level [km]; 0 where a file has none.
     - `kinds`: what the files say of each branch, such as "mean", "rlz-000", "quantile-0.5".
@@ -105,7 +107,8 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
                 which = "sites" if what in ("names", "positions") else what
                 raise file_error(path.name, f"differs in its {which} from file `{found[0].name}`.")
     rates = np.stack([file["rates"] for file in files])
-    curves = HazardCurve(np.broadcast_to(first["levels"], rates.shape), rates, first["measure"])
+    levels = first["levels"] / (CM_PER_M if first["measure"] == "PGV" else 1.0)
+    curves = HazardCurve(np.broadcast_to(levels, rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
     longitude, latitude, depth = placed(list(np.asarray(first["positions"]).T))
     return HazardCurves(curves, longitude, latitude, depth, kinds=kinds, names=tuple(first["names"]))

@@ -15,7 +15,7 @@ from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import Corners, Housner, PerSide
+from jaxrock.blocks.restitution import AngularMomentum, Corners, Housner
 from jaxrock.blocks.rigid import Block
 
 SEEN = ("survived", "toppled", "rotation")
@@ -165,7 +165,8 @@ class Observations(eqx.Module):
 
         **Returns:** an `Observations`.
 
-        **Raises:** ValueError for values outside their ranges, or of different lengths.
+        **Raises:** ValueError for values outside their ranges, or of different lengths, and for blocks whose law of
+        restitution depends on the speed.
         """
         count = len(seen)
         leaves = ("alpha1", "alpha2", "p1", "p2", "inertia_ratio", "radius_ratio", "restitution1", "restitution2")
@@ -178,7 +179,9 @@ class Observations(eqx.Module):
         ways = two_ways if np.any(np.asarray(facing) == 0) else one_way
         other = OtherSide(alpha2 / alpha1, radii, inertia, ratio, ways)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
-        if isinstance(blocks.law, PerSide):
+        if blocks.law.depends_on_speed:
+            raise ValueError("Argument `blocks` must have a restitution that does not depend on the speed of impacts.")
+        if not isinstance(blocks.law, AngularMomentum):
             restitution = _where(restitution != restitution, both, restitution)
         return cls(alpha1, p1, seen, restitution, other=other, **known)
 

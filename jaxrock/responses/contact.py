@@ -9,7 +9,7 @@ from jaxrock._checks import scalar
 from jaxrock._parameters import check_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import ratio_of_inertia
+from jaxrock.blocks.restitution import Housner, ratio_of_inertia
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle, Rolled
@@ -60,15 +60,17 @@ class Contact(AbstractTable):
 
 
 @arguments
-def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_ratio: ArrayLike = 0.75) -> Contact:
+def contact_forces(
+    response: Response, block: Block | AsymmetricBlock, inertia_ratio: ArrayLike | None = None
+) -> Contact:
     """Compute the forces between block and ground along a response.
 
     **Arguments:**
 
     - `response`: of `simulate`, of one scene.
     - `block`: that of the response.
-    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; 3/4 for a rectangle. An
-      `AsymmetricBlock` has its own.
+    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; None: what its law of restitution
+      knows (of a block that was made with an inertia ratio), or 3/4, a rectangle's. An `AsymmetricBlock` has its own.
 
     **Returns:** a `Contact`.
 
@@ -77,6 +79,9 @@ def contact_forces(response: Response, block: Block | AsymmetricBlock, inertia_r
     **Source:** momentum of the centre of mass, on a circle about the corner, or as it rolls (Shenton 1996 for the
     beginning of rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
+    if inertia_ratio is None:
+        known = block.law.inertia_ratio if isinstance(block.law, Housner) else None
+        inertia_ratio = 0.75 if known is None else known
     ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
     check_single(block=block)
     response.trajectory.check_single()

@@ -30,7 +30,7 @@ from jaxrock.responses.current_model import current_model
 from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.lowest_ends import lowest_ends
 from jaxrock.studies.parameters import named, peak_of
-from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, on_border
+from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, check_sizeless, on_border
 from jaxrock.sweeps.sweep import known_surface, surface
 
 _FIRST = 256  # intervals of the first sampling
@@ -142,12 +142,12 @@ def critical_durations(
     **Returns:** a `Critical`; `value` is the duration of the whole motion [s].
     With traced arguments (within `jax.jit`, `jax.vmap`, `jax.grad`) it is a plain function of arrays.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, and for laws of restitution and models of your own that
+    depend on the speed of impacts, or on p.
     """
     low, high = _rising("factor", factor)
-    if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
-        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
     model = current_model(model, block, motion)
+    check_sizeless(block, model)
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
     grid = jnp.broadcast_to(grid, (scenes.threshold.size, grid.size))

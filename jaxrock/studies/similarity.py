@@ -119,10 +119,7 @@ def groups(block: Block, amplitude: ArrayLike, frequency: ArrayLike, kind: str =
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.11 (slender) and 5.3 (rigid).
     """
     amplitude, frequency = size("amplitude", amplitude), size("frequency", frequency)
-    if block.law.depends_on_speed:
-        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
-    if tells_sides(block.law, block.corners):
-        raise ValueError("Argument `block` must have a restitution that is the same on both sides.")
+    _check_law(block)
     if one_of("kind", kind, KINDS) == "slender":
         return Groups(frequency / block.p, block.alpha / amplitude, block.restitution)  # 4.11
     return Groups(frequency / block.p, jnp.tan(block.alpha) / amplitude, block.restitution, jnp.cos(block.alpha))  # 5.3
@@ -154,6 +151,13 @@ def _parts(form: Callable) -> tuple[list[str], dict[str, bool]]:
     return names[:2], {name: known[name].unit == "s" for name in names[2:]}
 
 
+def _check_law(block: Block) -> None:
+    if block.law.depends_on_speed:
+        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
+    if tells_sides(block.law, block.corners):
+        raise ValueError("Argument `block` must have a restitution that is the same on both sides.")
+
+
 @arguments
 def block(groups: Groups, amplitude: ArrayLike, frequency: ArrayLike) -> Block:
     """The slender block that has these groups under a motion with this peak [g] and angular frequency [rad/s].
@@ -182,6 +186,7 @@ def motion(groups: Groups, block: Block, form: Callable):
     **Raises:** ValueError for a block that is known not to have these groups under any motion, and for a pulse without
     their other parameters.
     """
+    _check_law(block)
     own = {"restitution": (groups.restitution, block.restitution)}
     if groups.cos_alpha is not None:
         own["cosine of alpha"] = (groups.cos_alpha, jnp.cos(block.alpha))

@@ -1,13 +1,19 @@
 """What is varied in a search for critical values: z is the logarithm of a factor, on the motion or on its times."""
 
 import abc
+import operator
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxrock._checks import is_traced
+from jaxrock.blocks.asymmetric import AsymmetricBlock
+from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.equation import AbstractEquation, Angle
+from jaxrock.models.user_equation import Equation
 from jaxrock.motions.motion import Scaled
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
@@ -91,7 +97,7 @@ class Duration(AbstractVaried):
 
     def scene(self, z, block, motion):
         """What is asked for at a factor."""
-        return eqx.tree_at(lambda b: b.p, block, block.p * jnp.exp(z)), motion
+        return faster(block, jnp.exp(z)), motion
 
     def unit(self, block, motion):
         """What the factor multiplies: the duration of the motion [s]."""
@@ -104,6 +110,44 @@ class Duration(AbstractVaried):
     def keeps(self, name: str) -> bool:
         """Whether the critical value depends on a parameter."""
         return name not in ("duration", "period", "dt")
+
+
+def faster(block: Block | AsymmetricBlock, factor) -> Block | AsymmetricBlock:
+    """A smaller block of the same shape: its frequency parameters times a factor."""
+    name = "p" if isinstance(block, Block) else "p1"
+    return eqx.tree_at(operator.attrgetter(name), block, getattr(block, name) * factor)
+
+
+def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> None:
+    """Raise ValueError where the law of restitution, or a model of the user's own, is known to depend on the size of a
+    block by itself, and not only through p times the time."""
+    if block.law.depends_on_speed:  # a longer motion is taken as a larger p, which makes impacts faster
+        raise ValueError("Argument `block` must have a restitution that does not depend on the speed of impacts.")
+    if is_traced((block, model)):
+        return
+    block = jax.tree.map(lambda x: jnp.ravel(x)[0], block)
+    two = block, faster(block, 1.7)
+    names = ("restitution",) if isinstance(block, Block) else ("restitution1", "restitution2")
+    one, other = ([getattr(each, name) for name in names] for each in two)
+    if not np.allclose(one, other, rtol=1e-9, atol=0):
+        raise ValueError("Argument `block` must have a restitution that does not depend on its p.")
+    if type(model).__module__.startswith("jaxrock.") and not isinstance(model, Equation):
+        return
+    one, other = (_accelerations(model, each) for each in two)
+    if not np.allclose(one, other, rtol=1e-9, atol=0, equal_nan=True):
+        raise ValueError("Argument `model` must not depend on the block's p: a longer motion is taken as a larger p.")
+
+
+@jax.jit
+def _accelerations(model: AbstractEquation, block: Block | AsymmetricBlock):
+    """Some accelerations of each side, over its p squared."""
+    found = []
+    for side in (block,) if isinstance(block, Block) else block.sides:
+        moments = model.moments(side)
+        for share, velocity, push in ((0.0, 0.0, 1.0), (0.3, -0.4, 0.5), (0.8, 0.6, -0.7)):
+            angle = Angle.of(share * side.alpha)
+            found.append(moments.acceleration(angle, velocity * side.alpha, push * jnp.ones_like(side.alpha)))
+    return jnp.stack(found)
 
 
 @eqx.filter_custom_jvp
