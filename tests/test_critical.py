@@ -236,3 +236,12 @@ def test_durations_are_refused_of_models_that_know_p():
     moments = (lambda x, k: jnp.sin(k.alpha - x), lambda x, k: jnp.cos(k.alpha - x))
     with pytest.raises(ValueError, match="`model` must not depend on the block's p"):
         rk.studies.critical_durations(block, pulse, rk.models.Equation(*moments, lambda x, v, k: 0.3 / k.p * v))
+
+
+def test_the_amplitude_of_what_is_made_of_a_pulse_is_its_peak():
+    """Of Mavroeidis and Papageorgiou's pulse the bound that it tells lies a tenth above."""
+    block, motion = rk.Block(0.2, 2.0), 1.0 * rk.MavroeidisPapageorgiouPulse(0.3, 1.0)
+    found = rk.critical_amplitudes(block, motion, rk.Linear(), max_ends=1, derivatives=False, progress=False)
+    factor = float(found.value[0] / rk.intensity.peak_acceleration(motion))
+    verdicts = [bool(rk.outcome(block, share * factor * motion, rk.Linear()).overturned) for share in (0.9999, 1.0001)]
+    assert sorted(verdicts) == [False, True]

@@ -684,3 +684,13 @@ def test_sensitivity_map():
     np.testing.assert_allclose(
         found.sensitivity.max_rotation.elasticity[1, 1], single.max_rotation.elasticity, rtol=1e-9, atol=1e-12
     )
+
+
+def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
+    pulse, how = rk.SinePulse(0.25, 0.5), {"model": rk.Linear(), "engine": rk.Series(order=8)}
+    alone, scaled, shifted = (
+        rk.studies.sensitivity(rk.Block(0.2, 2.0), each, **how) for each in (pulse, 1.0 * pulse, pulse.shifted(0.0))
+    )
+    for each in (scaled, shifted):
+        np.testing.assert_allclose(each.condition, alone.condition, rtol=1e-9)
+        np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)

@@ -23,6 +23,7 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
 from jaxrock.motions.turned import felt
 from jaxrock.studies.critical import critical_amplitudes
+from jaxrock.studies.parameters import amplitude_of
 from jaxrock.studies.spectra import axis
 
 _LANES = 64  # motions in one call of the compiled program
@@ -96,8 +97,8 @@ def feasible_region(
 class Unexceeded(AbstractTable):
     """The largest motions that all rocks survive, and all weaker ones too.
 
-    - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g] up to which every rock stands; infinite where no
-      amplitude that was looked at topples any.
+    - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g], as it is given to the motion, up to which every
+      rock stands; infinite where no amplitude that was looked at topples any.
     - `by_rock`: (rocks, n) the same for each rock alone that stands.
     - `weakest`: (n,) the number, from 0, among all rocks of the one that sets it; -1 where none does.
     - `complete`: (n,) whether every amplitude that was looked at could be decided.
@@ -157,35 +158,39 @@ def unexceeded_motion(
     seen = observations.of(standing)
     ways, count = np.asarray(seen.ways), durations.size
     blocks = placed(jax.tree.map(lambda x: np.tile(np.repeat(x, count), len(ways)), seen.blocks))
+    motions, own = _motions(motion, *placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size))))
     critical = critical_amplitudes(
         blocks,
-        _motions(motion, *placed((np.repeat(ways.ravel(), count), np.tile(durations, ways.size)))),
+        motions,
         model,
         intensity=intensity,
         derivatives=False,
         engine=engine,
         progress=progress,
     )
-    by_rock = np.asarray(critical.lowest).reshape(*ways.shape, count).max(axis=0)
+    by_rock = (np.asarray(critical.lowest) / np.asarray(own)).reshape(*ways.shape, count).max(axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = np.where(np.isfinite(amplitude), standing[np.argmin(by_rock, axis=0)], -1)
     complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0)
     return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))
 
 
-def _motions(motion: Callable, ways: Array, duration: Array) -> AbstractMotion:
-    """Those of amplitude 1, one way or (-1) the other, and of all durations in one, which share samples of a record."""
+def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMotion, Array]:
+    """Those of amplitude 1, one way or (-1) the other, and of all durations in one, which share samples of a record;
+    and what each calls its amplitude."""
     one = eqx.filter_eval_shape(motion, ways[0], duration[0])
     if not isinstance(one, AbstractMotion):
         raise ValueError(f"Argument `motion` must make a motion of amplitude and duration, but makes {shown(one)}.")
     is_level = eqx.filter_eval_shape(lambda *x: motion(*x).vertical_bounds, ways[0], duration[0]) is None
 
     def turned(way, duration):
-        return motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
+        made = motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
+        return made, jnp.abs(amplitude_of(made))
 
-    axes = jax.tree.map(lambda own: None if own else 0, shared(eqx.filter_eval_shape(turned, ways[0], duration[0])))
+    like, _ = eqx.filter_eval_shape(turned, ways[0], duration[0])
+    axes = jax.tree.map(lambda own: None if own else 0, shared(like))
     try:
-        return jax.vmap(turned, out_axes=axes)(ways, duration)
+        return jax.vmap(turned, out_axes=(axes, 0))(ways, duration)
     except ValueError as error:
         if "out_axes" not in str(error):
             raise

@@ -14,7 +14,8 @@ from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
 from jaxrock.motions.intensity import peaks_of_motion
-from jaxrock.motions.motion import AbstractMotion, Scaled, Summed
+from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, Summed
+from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgiouPulse
 
 Real = Inexact[Array, "..."]
 AnyBlock = Block | AsymmetricBlock | FlexibleBlock
@@ -32,13 +33,28 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     """
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
     found |= {leaf.name: leaf.value for leaf in _numbers(motion)}
-    return found if "amplitude" in found else found | {"amplitude": peak_of(motion)}
+    return found | {"amplitude": amplitude_of(motion)}
+
+
+def amplitude_of(motion: AbstractMotion) -> Real:
+    """The amplitude that a motion names, or its peak [g]."""
+    own = [leaf.value for leaf in _numbers(motion) if leaf.name == "amplitude"]
+    return own[0] if own else peak_of(motion)
 
 
 def peak_of(motion: AbstractMotion) -> Real:
-    """Peak acceleration [g]; of a sum its own, which may be far below what its parts add up to."""
-    parts = jax.tree.leaves(motion, is_leaf=lambda x: isinstance(x, Summed))
-    return peaks_of_motion(motion)[0] if any(isinstance(x, Summed) for x in parts) else peak_bound(motion)
+    """Peak acceleration [g], also where the bound that a motion tells lies above it: of a sum, which may be far below
+    what its parts add up to, of a pulse whose amplitude is not its peak, and of motions of the user's own."""
+    parts = jax.tree.leaves(motion, is_leaf=_is_loose)
+    return peaks_of_motion(motion)[0] if any(map(_is_loose, parts)) else peak_bound(motion)
+
+
+def _is_loose(part) -> bool:
+    """Whether the bound of a motion may lie above its peak."""
+    if not isinstance(part, AbstractMotion):
+        return False
+    is_ours = type(part).__module__.partition(".")[0] == __name__.partition(".")[0]
+    return isinstance(part, Summed | MavroeidisPapageorgiouPulse) or not is_ours
 
 
 def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter]:
@@ -131,8 +147,12 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
 
 
 def _numbers(motion: AbstractMotion) -> list[Leaf]:
-    """The single numbers of a motion; the factor of a scaled one is left out, for its amplitude says the same."""
-    return [leaf for leaf in leaves_of(motion) if leaf.is_number]
+    """The single numbers of a motion; of one that is scaled or shifted the factor and the amplitude of the pulse in it
+    are left out, for its own amplitude says the same."""
+    inner, place = motion, ""
+    while isinstance(inner, Scaled | Shifted):
+        inner, place = inner.motion, f"{place}motion."
+    return [leaf for leaf in leaves_of(motion) if leaf.is_number and not (place and leaf.name == f"{place}amplitude")]
 
 
 def _at(owner, path: tuple[str, ...]):
