@@ -93,6 +93,11 @@ def set_parameters(owner: eqx.Module, **values: Any) -> None:
     check_shapes(**{known[name].argument or name: getattr(owner, name) for name in values if known[name].axes == 0})
 
 
+def is_ours(owner: Any) -> bool:
+    """Whether an object's class is one of the package, and not of the user's own."""
+    return type(owner).__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
 def check_declared(owner: eqx.Module) -> None:
     """Raise ValueError for a value outside of what a class of the user's own declares: for `__check_init__`.
 
@@ -100,7 +105,7 @@ def check_declared(owner: eqx.Module) -> None:
     value (None), and nothing is raised where numbers are to be marked.
     """
     kind = type(owner)
-    if kind.__module__.partition(".")[0] == __name__.partition(".")[0] or is_marking():
+    if is_ours(owner) or is_marking():
         return
     for name, known in declared(kind).items():
         value = getattr(owner, name)

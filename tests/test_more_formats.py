@@ -454,3 +454,8 @@ def test_a_million_samples_in_seconds(tmp_path, kind):
     record = rk.read_record(path, **({"unit": "g"} if kind == "CSV" else {}))
     assert time.process_time() - begin < 5
     np.testing.assert_allclose(record.samples, np.tile(some, again), atol=1e-12)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'.*nowhere'"):
+        rk.motions.write_at2(rk.Record([0.1, 0.2], 0.01), tmp_path / "nowhere" / "mine.AT2")

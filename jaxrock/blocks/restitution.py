@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._checks import Range, check_shapes, checked, is_traced, not_negative, share, size, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
+from jaxrock._parameters import Owner, check_declared, is_ours, parameter, set_parameters
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -68,8 +68,7 @@ class AbstractRestitution(Owner):
 
     def __check_init__(self):
         check_declared(self)
-        is_ours = type(self).__module__.partition(".")[0] == __name__.partition(".")[0]
-        if is_ours or self.depends_on_speed or is_traced(self):
+        if is_ours(self) or self.depends_on_speed or is_traced(self):
             return
         slow, fast = (self.ratio(Corners(*jnp.array([0.2, 0.2, 1.0])), jnp.asarray(speed)) for speed in (0.1, 0.7))
         if not is_traced((slow, fast)) and np.any(np.asarray(slow) != np.asarray(fast)):

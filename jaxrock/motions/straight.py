@@ -60,13 +60,9 @@ def straight(motion: AbstractMotion) -> Straight:
     if isinstance(motion, WithVertical):
         return straight(motion.horizontal)
     if isinstance(motion, Shifted):
-        inner, quiet, delay = straight(motion.motion), np.zeros(1), float(motion.delay)
-        lengths = np.concatenate([[delay], inner.length])
-        return (
-            inner
-            if delay == 0
-            else Straight(np.concatenate([quiet, inner.begin]), np.concatenate([quiet, inner.end]), lengths)
-        )
+        inner, delay = straight(motion.motion), float(motion.delay)
+        before = (0.0, 0.0, delay)
+        return Straight(*(np.append(x, part) for x, part in zip(before, inner))) if delay else inner
     lengths = np.asarray(motion.lengths, float)
     # Pieces of no length, at the room of longer records, say nothing.
     pieces = np.flatnonzero(lengths > 0)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool
 
 from jaxrock._checks import is_traced, marked, put_down
 from jaxrock._guard import guarded
+from jaxrock._parameters import is_ours
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.engines.stepper import AbstractEngine
@@ -58,7 +59,7 @@ def standing(
     """
     if isinstance(model, Spring):
         return _balanced(block, model, throw)
-    if not isinstance(model, Equation) and (_is_ours(model) or not isinstance(engine, Series)):
+    if not isinstance(model, Equation) and (is_ours(model) or not isinstance(engine, Series)):
         return block
     for side in (block,) if isinstance(block, Block) else block.sides:
         # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
@@ -79,10 +80,6 @@ def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Bl
         if found is not alpha:
             block = eqx.tree_at(operator.attrgetter(name), block, found)
     return block
-
-
-def _is_ours(model: AbstractEquation) -> bool:
-    return type(model).__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def _faults(model: AbstractEquation, block: Block | Side) -> dict[str, Bool[Array, ""]]:

@@ -7,7 +7,7 @@ import jax
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
-from jaxrock._parameters import Leaf, Parameter, declared, leaves_of
+from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
@@ -53,8 +53,7 @@ def _is_loose(part) -> bool:
     """Whether the bound of a motion may lie above its peak."""
     if not isinstance(part, AbstractMotion):
         return False
-    is_ours = type(part).__module__.partition(".")[0] == __name__.partition(".")[0]
-    return isinstance(part, Summed | MavroeidisPapageorgiouPulse) or not is_ours
+    return isinstance(part, Summed | MavroeidisPapageorgiouPulse) or not is_ours(part)
 
 
 def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter]:

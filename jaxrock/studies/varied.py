@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._checks import is_traced
+from jaxrock._parameters import is_ours
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -131,7 +132,7 @@ def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> N
     one, other = ([getattr(each, name) for name in names] for each in two)
     if not np.allclose(one, other, rtol=1e-9, atol=0):
         raise ValueError("Argument `block` must have a restitution that does not depend on its p.")
-    if type(model).__module__.startswith("jaxrock.") and not isinstance(model, Equation):
+    if is_ours(model) and not isinstance(model, Equation):
         return
     one, other = (_accelerations(model, each) for each in two)
     if not np.allclose(one, other, rtol=1e-9, atol=0, equal_nan=True):
