@@ -8,7 +8,7 @@ in units of g; positive acceleration drives negative rotation.
 import abc
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -163,16 +163,10 @@ class _Changed(AbstractMotion):
         return None if vertical is None else vertical.times_gain(vertical.values)
 
 
-class Scaled(_Changed):
-    """A motion times a factor (`factor * motion`)."""
+class AtTheSameTimes(_Changed):
+    """A motion made of one other, piece by piece."""
 
     motion: AbstractMotion
-    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude says the same
-
-    @arguments
-    def __init__(self, motion: AbstractMotion, factor: ArrayLike):
-        self.motion = motion
-        set_parameters(self, factor=factor)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -192,6 +186,17 @@ class Scaled(_Changed):
     @property
     def scales(self) -> Inexact[Array, " pieces"] | None:
         return self.motion.scales
+
+
+class Scaled(AtTheSameTimes):
+    """A motion times a factor (`factor * motion`)."""
+
+    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude says the same
+
+    @arguments
+    def __init__(self, motion: AbstractMotion, factor: ArrayLike):
+        self.motion = motion
+        set_parameters(self, factor=factor)
 
     @property
     def envelope(self) -> Envelope:
@@ -294,11 +299,8 @@ def _shortest_scales(parts: tuple[_Pieces, ...]) -> Inexact[Array, " finer"] | N
 
 def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
     """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
-
-    def is_shifted(node: Any) -> bool:
-        return isinstance(node, Shifted)
-
-    if not any(map(is_shifted, jax.tree.leaves(parts, is_leaf=is_shifted))):
+    leaves = jax.tree.leaves(parts, is_leaf=lambda node: isinstance(node, Shifted))
+    if not any(isinstance(leaf, Shifted) for leaf in leaves):
         return None
     found = [part.lateness for part in parts]
     return sum((late for late in found if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
@@ -336,9 +338,8 @@ class Summed(AbstractMotion):
         return first + second
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        return (
-            sum_of_series(*(part.series(part.motion.series, piece, local, unit, order) for part in self._parts)) or []
-        )
+        found = (part.series(part.motion.series, piece, local, unit, order) for part in self._parts)
+        return sum_of_series(*found) or []
 
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
@@ -347,9 +348,8 @@ class Summed(AbstractMotion):
         return functools.reduce(jnp.add, found) if found else None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        return sum_of_series(
-            *(part.series(part.motion.vertical_series, piece, local, unit, order) for part in self._parts)
-        )
+        found = (part.series(part.motion.vertical_series, piece, local, unit, order) for part in self._parts)
+        return sum_of_series(*found)
 
 
 class WithVertical(_Changed):

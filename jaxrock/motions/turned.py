@@ -5,7 +5,7 @@ from jaxtyping import Array, Inexact
 
 from jaxrock._checks import factor
 from jaxrock._parameters import parameter
-from jaxrock.motions.motion import AbstractMotion, Piece, Scalar, Scaled
+from jaxrock.motions.motion import AbstractMotion, AtTheSameTimes, Piece, Scalar, Scaled
 from jaxrock.motions.shaking import Envelope
 
 
@@ -16,38 +16,10 @@ def felt(motion: AbstractMotion, times: Scalar) -> AbstractMotion:
     return Scaled(Turned(motion, jnp.where(times < 0, -1.0, 1.0)), jnp.abs(times))
 
 
-class Turned(AbstractMotion):
+class Turned(AtTheSameTimes):
     """A motion whose horizontal acceleration is mirrored where `way` is -1."""
 
-    motion: AbstractMotion
     way: Inexact[Array, "..."] = parameter("-", factor, is_free=False)
-
-    @property
-    def knots(self) -> Inexact[Array, " knots"]:
-        return self.motion.knots
-
-    @property
-    def lengths(self) -> Inexact[Array, " pieces"]:
-        return self.motion.lengths
-
-    def length(self, piece: Piece) -> Scalar:
-        return self.motion.length(piece)
-
-    @property
-    def lateness(self) -> Scalar | None:
-        return self.motion.lateness
-
-    @property
-    def scales(self) -> Inexact[Array, " pieces"] | None:
-        return self.motion.scales
-
-    @property
-    def bounds(self) -> Inexact[Array, " pieces"]:
-        return self.motion.bounds
-
-    @property
-    def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
-        return self.motion.vertical_bounds
 
     @property
     def envelope(self) -> Envelope:
