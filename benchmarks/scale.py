@@ -194,7 +194,7 @@ def report(largest):
         )
     lines += [
         "",
-        "Every sweep traces its function anew: some milliseconds, which small ones are made of. "
+        "Before its first response a sweep takes a millisecond, or three where its function is traced again. "
         "Memory: the results and about 100 MiB, whatever the number of responses.",
         "",
         f"| {SIDE} x {SIDE} points | first call | later calls | a response |",

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxrock._checks import is_traced
 from jaxrock.status import Status
 
 _Item = type(Status.successful)
@@ -43,6 +44,8 @@ def _numbers(value: Any) -> str:
 
 def _status(value: Any) -> str:
     kind, which = value._enumeration, value._value
-    if isinstance(which, jax.core.Tracer) or np.ndim(which) > 0:
-        return f"{kind.__name__}{list(np.shape(which))}"
+    if which is None:  # as `eqx.filter` leaves it
+        return f"{kind.__name__}.None"
+    if not isinstance(which, jax.Array | np.ndarray | np.generic | int) or is_traced(which) or np.ndim(which) > 0:
+        return f"{kind.__name__}{list(np.shape(which))}"  # of a shape without values, too
     return f"{kind.__name__}.{list(kind._name_to_item)[int(which)]}"

@@ -299,7 +299,7 @@ def test_constructors_agree():
 BAD = {
     "slenderness": (lambda: rk.blocks.AsymmetricBlock(0.2, 1.6, 2.0), "Argument `alpha2` must be in"),
     "inertia": (lambda: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, 1.2), "Argument `inertia_ratio` must be in"),
-    "energy": (lambda: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=(1.1, 0.95)), "energy kept by two impacts"),
+    "energy": (lambda: rk.blocks.AsymmetricBlock(0.2, 0.2, 2.0, restitution=(1.1, 0.95)), "speed kept by two impacts"),
     "frequency": (
         lambda: rk.blocks.AsymmetricBlock.from_frequencies(0.2, 0.2, 2.0, 3.0),
         "the largest about any corner",

@@ -75,7 +75,7 @@ def test_other_names_compile_nothing():
 
 
 def test_restitutions():
-    """Of two impacts, one on each side, the energy kept is the square; their ratio is that of moments of inertia."""
+    """Two impacts, one on each side, keep the square of it of the speed; their ratio is that of moments of inertia."""
     blocks = rk.blocks.AsymmetricBlock.from_radii(
         *np.array([[0.2, 0.3], [0.35, 0.25], [1.0, 1.2], [1.3, 1.1], [0.6, 0.7]])
     )

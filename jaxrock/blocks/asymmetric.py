@@ -76,8 +76,8 @@ class AsymmetricBlock(Owner):
 
     All may be arrays of one shape, for use under `jax.vmap`.
 
-    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the
-    energy that two impacts keep, exceeds 1. (One of them may: about corners of unequal height it often does.)
+    **Raises:** ValueError for a value outside its range; where the product of given restitutions, which is the part of
+    its speed that two impacts leave a block, exceeds 1. (One may: about corners of unequal height it often does.)
 
     **Source:** Housner (1963) for each side; `jaxrock.restitution.AngularMomentum` for the impact.
     """

@@ -33,7 +33,8 @@ class Outline(NamedTuple):
             return cls.of(given[::-1])._replace(order=order[::-1])
         area = twice.sum() / 2
         if not area > 1e-12 * np.ptp(a, axis=0).max() ** 2:
-            raise ValueError("Argument `outline` must enclose an area, but its vertices lie on a line.")
+            reason = "its vertices lie on a line, or it crosses itself"
+            raise ValueError(f"Argument `outline` must enclose an area, but {reason}.")
         _check_simple(given)
         centre = ((a + b) * twice[:, None]).sum(0) / (6 * area)
         a, b = a - centre, b - centre

@@ -132,14 +132,14 @@ class Constant(AbstractRestitution):
 
 
 class Housner(AbstractRestitution):
-    """The impact of a rectangle that keeps its angular momentum about the new corner: 1 - 1.5 sin^2(alpha), at least 0.
+    """The impact of a rectangle that keeps its angular momentum about the new corner: 1 - 1.5 sin^2(alpha).
 
     **Arguments:**
 
     - `inertia_ratio`: m R^2/I about a corner, in (0, 1], of a symmetric block that is no homogeneous rectangle:
       1 - 2 inertia_ratio sin^2(alpha). None: 3/4, a rectangle's.
 
-    **Raises:** ValueError for a value outside its range.
+    **Raises:** ValueError for a value outside its range; with a block so wide that it is negative, for the block.
 
     **Source:** Housner (1963); Dimitrakopoulos & DeJong (2012), equation 2.4.
     """
@@ -190,8 +190,8 @@ class PerSide(AbstractRestitution):
 
     - `first`, `second`: the ratio at the end of a stay on side 1 (rotation > 0), and on side 2, 0 or more.
 
-    **Raises:** ValueError where their product, which is the energy that two impacts keep, exceeds 1. (One of them may:
-    about corners of unequal height it often does. On a symmetric block neither may.)
+    **Raises:** ValueError where their product, which is the part of its speed that two impacts leave a block, exceeds
+    1. (One of them may: about corners of unequal height it often does. On a symmetric block neither may.)
     """
 
     first: Real = parameter("-", not_negative, symbol="e1", argument="restitution")
@@ -201,7 +201,7 @@ class PerSide(AbstractRestitution):
     def __init__(self, first: ArrayLike, second: ArrayLike, *, throw: bool = True):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
         check_shapes(**{"restitution[0]": self.first, "restitution[1]": self.second})
-        keeps = "be a pair whose product, the energy kept by two impacts, is at most 1"
+        keeps = "be a pair whose product, the speed kept by two impacts, is at most 1"
         product = checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
         self.first = where(jnp.isnan(product), product, self.first)
 
@@ -294,7 +294,7 @@ def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
     if law.inertia_ratio is None:
         widest = np.arcsin(np.sqrt(2 / 3)) * (1 + 1e-6)
         reason = "Housner's value is negative above"
-        allowed = f"be at most 0.955, of a width of 1.41 heights, when `restitution` is None: {reason}"
+        allowed = f"be at most 0.955, of a width of 1.41 heights, when `restitution` is None or Housner's: {reason}"
         return checked("alpha", alpha, allowed, lambda x: x <= widest)
     allowed = "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative"
     return checked("alpha", alpha, allowed, lambda x: law._loss * jnp.sin(x) ** 2 <= 1 + 1e-6)
@@ -316,8 +316,8 @@ class Reset(eqx.Module):
         if law.depends_on_speed:
             return cls(law, corners, p)
         ratio = law.ratio(corners, jnp.zeros_like(p))
-        if type(law) not in _ALIKE:  # whose parameters have been checked
-            ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
+        # Of the laws of the package, too: a step of an optimiser may have changed what a constructor has checked.
+        ratio = where((ratio >= 0) & (ratio <= most), ratio, jnp.nan)
         # As it is: of two corners of unequal height the ratio at one may exceed 1.
         return cls(eqx.tree_at(lambda c: c.value, Constant(0.0), ratio), None, None)
 

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import acute, check_shapes, one_program, rate, size, with_throw
+from jaxrock._checks import acute, check_shapes, one_program, rate, shown, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.restitution import (
@@ -48,6 +48,9 @@ class Block(Owner):
     @with_throw
     def __init__(self, alpha: ArrayLike, p: ArrayLike, restitution: Restitution | None = None, *, throw: bool = True):
         set_parameters(self, alpha=alpha, p=p)
+        if isinstance(restitution, tuple):
+            found = f"is {shown(restitution)}: one for each side is `jaxrock.restitution.PerSide`"
+            raise ValueError(f"Argument `restitution` must be a number, an array or a law, but {found}.")
         self.law = law_of(restitution, Housner(), symmetric=True)
         self.alpha = fitting_alpha(self.law, self.alpha)
 

@@ -57,7 +57,9 @@ def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
     a, w, e = intensity, frequency_ratio, restitution
     end, impact = formulas.end_of_pulse(a, w), formulas.first_impact(a, w)
     hits = jnp.isfinite(impact)
-    first = _flight(jnp.clip(time, 0.0, impact), end, arcs.start(a), a, w)
+    # At an impact, too, the slope by time is that before it: of a tie `jnp.clip` would take half.
+    before = jnp.where(time > 0, jnp.where(time <= impact, time, impact), 0.0)
+    first = _flight(before, end, arcs.start(a), a, w)
     impact = jnp.where(hits, impact, end)
     speed = jnp.where(hits, formulas.impact_speed(impact, a, w), 0.0)
     start = arcs.start(a)
@@ -73,8 +75,9 @@ def _history(time: Real, intensity: Real, frequency_ratio: Real, restitution: Re
 
 def _flight(since: Array, left: Array, lane: arcs.Lane, a: Array, w: Array) -> tuple[Array, Array]:
     """Opening and speed at a time since `lane`, of which the pulse lasts the first part: D&D 3.4, then 3.5."""
-    opening, speed = arcs.arc(jnp.minimum(since, left), lane, a, w)
-    free = jnp.maximum(since - left, 0.0)
+    lasts = since <= left
+    opening, speed = arcs.arc(jnp.where(lasts, since, left), lane, a, w)
+    free = jnp.where(lasts, 0.0, since - left)
     sinh, cosh, rise = jnp.sinh(free), jnp.cosh(free), 2 * jnp.sinh(free / 2) ** 2
     return opening * cosh + speed * sinh - rise, opening * sinh + speed * cosh - sinh
 

@@ -80,7 +80,7 @@ def during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
 def approximate_during_pulse_limit(frequency_ratio: Real, restitution: Real) -> Result:
     """Case 1.1 without a transcendental equation: D&D's approximation of `during_pulse_limit`.
 
-    Within 1 % for frequency ratios between 2.5 and 4 and restitutions of 0.8 to 0.96; below 2 it is 2 to 6 % low,
+    Within 1 % for frequency ratios from 2.5 to below 4 and restitutions of 0.8 to 0.96; below 2 it is 2 to 6 % low,
     near the upper end of the curve (above 4) up to 8 % high. **Returns:** inf where it has no root.
 
     **Source:** D&D 3.30 with 3.29.

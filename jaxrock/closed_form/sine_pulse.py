@@ -101,7 +101,8 @@ def approximate_impact_time(intensity: Real, frequency_ratio: Real) -> Result:
 def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
     """The largest rotation over alpha after the first impact, where that comes after the pulse.
 
-    Exact between `impact_time_limit` and `no_impact_limit`, and no result below (there D&D draw it dashed). The first
+    Exact between `impact_time_limit` and `no_impact_limit`. Below, where the impact comes while the pulse lasts, it is
+    what the formula gives (D&D draw it dashed), and says nothing of the block, not that it overturns either. The first
     excursion, before the impact, may be larger: see `first_peak`. **Returns:** inf where that impact overturns.
 
     **Source:** D&D 4.13, with D0* by its definition.

@@ -70,7 +70,7 @@ def pulse(time: Real, shape: Real) -> Result:
     rising = 2 * foot * jnp.exp(-up * (1 - 2 * foot)) * growth_ratio(-2 * up * foot) / growth_ratio(-up)
     inside = (time > 0) & (time < 1)
     # At -inf the hump has vertical sides, at +inf it has no width.
-    return jnp.where(inside, jnp.where(shape > 0, rising, falling), 0.0)
+    return jnp.where(inside, jnp.where(shape >= 0, rising, falling), 0.0)
 
 
 @_elementwise
@@ -350,10 +350,13 @@ def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tup
     rocks = (strength < 1) & (shape < _MOST_SHAPE)  # a perfect spike moves nothing
     strength = jnp.where(rocks, strength, 0.5)
     uplift, _ = _uplift(strength, shape)
-    rising = _rising(jnp.clip(time, uplift, 0.5) - uplift, strength, duration, shape)
+    # At the end of a piece, too, its slope by time is its own: of a tie `jnp.clip` would take half.
+    since = jnp.where(time > uplift, jnp.where(time <= 0.5, time, 0.5) - uplift, 0.0)
+    rising = _rising(since, strength, duration, shape)
     middle = _at_middle(strength, duration, shape)
-    falling = _falling(jnp.clip(time - 0.5, 0.0, 0.5), middle, strength, duration, shape)
-    after = duration * jnp.maximum(time - 1, 0.0)
+    since = jnp.where(time > 0.5, jnp.where(time <= 1, time - 0.5, 0.5), 0.0)
+    falling = _falling(since, middle, strength, duration, shape)
+    after = duration * jnp.where(time > 1, time - 1, 0.0)
     sinh, cosh, rise = jnp.sinh(after), jnp.cosh(after), 2 * jnp.sinh(after / 2) ** 2
     free = (
         falling[0] * cosh + falling[1] * sinh - strength * rise,

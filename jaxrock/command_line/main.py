@@ -37,7 +37,7 @@ _EXAMPLES = """\
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
 """
-_EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted"
+_EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted, 141 nobody reads it any more"
 
 
 def _epilog(command: str = "") -> str:

@@ -44,7 +44,7 @@ def add_description(parser: argparse.ArgumentParser) -> None:
     """Options for files that do not say all."""
     parser.add_argument("--dt", type=number, help="time between samples [s], for files that do not say")
     parser.add_argument("--unit", help="g, m/s2 or cm/s2, for files that do not say")
-    parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V2 file, from 0")
+    parser.add_argument("--column", type=int, help="column of a CSV, or channel of a V1 or V2 file, from 0")
 
 
 def record_of(arguments: argparse.Namespace) -> rk.Record:

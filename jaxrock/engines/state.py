@@ -73,6 +73,9 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     # A block whose threshold is not a number would seem to stand for ever; numbers beyond any physics (NaN, too) are
     # not followed to where squares of them overflow.
     finite = finite & (scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1] < _MOST)
+    # What a constructor refuses a step of an optimiser may have made of a block or a motion.
+    forward = (scene.knots[0] >= 0) & (jnp.diff(scene.knots) >= 0).all()
+    finite = finite & (scene.threshold > 0) & (scene.p > 0) & forward
     spread = Spread.none(opening).plus(eps * opening, eps * outward)
     if scene.motion.lateness is not None:  # a push that comes too late: at first a velocity that is missing
         spread = spread.plus(0.0, scene.outlook.strongest_drive * scene.p * scene.motion.lateness)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
@@ -97,9 +96,13 @@ class AbstractStepper(eqx.Module):
 
     def room(self, state: State) -> Scalar:
         """Time to the next knot or the stop [s]."""
+        # Of ties `jnp.minimum` and `jnp.maximum` would take half of both derivatives. No room has derivatives, too: of
+        # two knots that come together one may go.
         room = self._to_knot(state)
-        room = room if self.stop is None else jnp.minimum(room, self.stop - self.time(state))
-        return jnp.maximum(room, 0.0)
+        if self.stop is not None:
+            left = self.stop - self.time(state)
+            room = where(room <= left, room, left)
+        return where(room < 0, 0.0, room)
 
     def _to_knot(self, state: State) -> Scalar:
         return self.scene.length(state.piece) - state.local

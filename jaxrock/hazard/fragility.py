@@ -69,7 +69,7 @@ class LogNormalFragility(AbstractFragility):
     def __call__(self, level: Values) -> Real:
         level = if_known(at_level, "level", level)
         check_shapes(level=level, median=self.median)
-        return _lognormal(level, self.median, self.dispersion)
+        return lognormal(level, self.median, self.dispersion)
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -78,9 +78,11 @@ class LogNormalFragility(AbstractFragility):
 
 
 @one_program
-def _lognormal(level: Real, median: Real, dispersion: Real) -> Real:
-    z = jnp.log(level / median) / dispersion
-    return jax.lax.erfc(-z / math.sqrt(2)) / 2
+def lognormal(level: Real, median: Real, dispersion: Real) -> Real:
+    """Probability that a shaking of an intensity topples, for 0 and infinity too."""
+    none, any_level = level <= 0, level == jnp.inf  # of which logarithms have no slopes
+    z = jnp.log(jnp.where(none | any_level, 1.0, level) / median) / dispersion
+    return jnp.where(none, 0.0, jnp.where(any_level, 1.0, jax.lax.erfc(-z / math.sqrt(2)) / 2))
 
 
 class TabulatedFragility(AbstractFragility):
@@ -115,8 +117,10 @@ class TabulatedFragility(AbstractFragility):
 
 @one_program
 def _interpolated(level: Real, levels: Real, probabilities: Real) -> Real:
-    between = jnp.interp(jnp.log(level), jnp.log(levels), probabilities)
-    return jnp.where(level < levels[0], 0.0, between)
+    below, above = level < levels[0], level >= levels[-1]
+    inside = jnp.where(below | above, levels[0], level)  # logarithms of 0 and of infinity have no slopes
+    between = jnp.interp(jnp.log(inside), jnp.log(levels), probabilities)
+    return jnp.where(below, 0.0, jnp.where(above, probabilities[-1], between))
 
 
 def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:

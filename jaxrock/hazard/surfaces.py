@@ -5,7 +5,6 @@ pushed: together they say most of what a motion does to a rock.
 """
 
 import inspect
-import math
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
@@ -38,6 +37,7 @@ from jaxrock.hazard.fragility import (
     LogNormalFragility,
     TabulatedFragility,
     alike,
+    lognormal,
     outcomes,
     probit,
     probit_line,
@@ -74,8 +74,7 @@ class SurfaceFragility(eqx.Module):
         """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
         acceleration, median = if_known(level, "acceleration", acceleration), self._median(ratio)
         check_shapes(acceleration=acceleration, ratio=median)
-        z = (jnp.log(acceleration) - jnp.log(median)) / self.dispersion
-        return jax.lax.erfc(-z / math.sqrt(2)) / 2
+        return lognormal(acceleration, median, self.dispersion)
 
     def _median(self, ratio):
         return self.median * positive("ratio", ratio) ** self.exponent

@@ -83,7 +83,8 @@ class Estimate(AbstractTable):
     - `probability`: (rocks,) that each rock does what it did (that it stands, where a rotation was measured).
     - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
       least with which they would not; infinite if there is none up to ten times as large.
-    - `summits`, `summit_values`: (starts, parameters) where each start arrived, and (starts,) the log-likelihood there.
+    - `summits`, `summit_values`: (climbs, parameters) where each climb arrived, and (climbs,) the log-likelihood there:
+      those from points beside the best of the others first, then those from the starts.
     - `trace`: a `Trace` of the search from these starts, but for what was looked at beside their best; with
       `plot.search`.
     - `responses`: how many scenes were computed.

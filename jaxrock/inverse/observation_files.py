@@ -9,8 +9,8 @@ The first line that is not a comment (#) names the columns, with their units; th
   `p1_rad_per_s` and `p2_rad_per_s`, or `radius1_m` and `radius2_m`, the distances from the corners to the centre of
   mass. `inertia_ratio` is m R1^2/I1, optional; empty is 3/4, that of a rectangle. `facing`, optional: 1 where positive
   ground acceleration drives the rock from side 1 to side 2, -1 where it stands the other way round; empty is not known.
-- `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the energy that two impacts keep;
-  empty is by angular momentum.
+- `restitution`: optional; empty is Housner's. Of rocks whose sides differ the root of the product of those of both
+  sides; empty is by angular momentum.
 - `observed`: survived, toppled (stood, fell and the like are understood), or rotation (rocked); then `rotation_rad` or
   `rotation_deg` holds the largest |rotation|, which is empty otherwise.
 - `..._sd` of the measured ones, such as `alpha_deg_sd`: standard deviation, in the same unit; empty is 0. A measured

@@ -154,7 +154,7 @@ class Observations(eqx.Module):
 
         - `blocks`: an `AsymmetricBlock` of (rocks,) arrays.
         - `seen`: as in `Observations`.
-        - `restitution`: (rocks,) root of the energy that two impacts keep, one on each side, in [0, 1]; their ratio is
+        - `restitution`: (rocks,) root of the product of those of both sides, whose ratio is
           that of `blocks`. None, or NaN for a rock: that of `blocks`, where none was given by angular momentum.
         - `facing`: (rocks,) or one number: 1 where positive ground acceleration drives the rock from side 1 to side 2,
           as it does a block; -1 where it stands the other way round; 0 where that is not known, which is each rock's

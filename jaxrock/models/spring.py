@@ -27,8 +27,8 @@ class Spring(AbstractEquation):
       1 + 1/(2 (masses - 1)^2) times the block's. None: a mass that is spread along the column, as printed.
 
     All have the overturning arm cos(alpha) cos(x), uplift at tan(alpha), and lie flat at pi/2. So SM1, SM2 and SM3
-    differ by the law "plastic" alone, and mmSM is a slower SM1. It balances at x = alpha (SM1, mmSM), or where
-    sin(x) = tan(alpha) (SM2, SM3): there alpha must be below pi/4, for a stouter block on this spring never overturns.
+    differ by the law "plastic" alone, and mmSM is a slower SM1. They balance at x = alpha; SM2 and SM3 with the law
+    "plastic" where sin(x) = tan(alpha): there alpha must be below pi/4, for a stouter block never overturns on it.
 
     Equation 9 lets the weight lean in SM2 although its mass is at the pivot; it is taken as printed. Codes that shake
     SM2 by a moment, or use linear geometry, have the arm cos(alpha): `Equation` does that.

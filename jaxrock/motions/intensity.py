@@ -7,7 +7,6 @@ for records (straight lines between samples), to about 1e-7 for pulses. g is 9.8
 import warnings
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
@@ -17,9 +16,9 @@ from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.motion import AbstractMotion, Shifted
 from jaxrock.motions.oscillator import peaks_of_oscillator
-from jaxrock.motions.record import Record, with_room
+from jaxrock.motions.peaks import peaks_and_last_velocity
+from jaxrock.motions.record import Record
 from jaxrock.motions.straight import Straight, straight
-from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 __all__ = [
     "arias", "average_spectral_acceleration", "cumulative_absolute_velocity", "mean_period",
@@ -32,10 +31,6 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_NODES, _WEIGHTS = gauss_legendre(6)
-_PARTS = 256  # of every smooth piece, where there are few
-_NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
-_FEW = 32
 _LONG = 100  # samples of a record that is more than a pulse
 _APART, _SHORT, _MOST = 5e-3, 2.5e-4, 1 << 20  # Fourier amplitudes [Hz]; steps of time for them [s], and how many
 
@@ -51,7 +46,7 @@ def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
     **Returns:** the largest |acceleration|: exact for records and straight lines, to about 1e-9 for smooth pulses.
     """
     check_single(motion=motion)
-    return _peaks(motion)[0]
+    return peaks_and_last_velocity(motion)[0]
 
 
 @arguments
@@ -67,7 +62,7 @@ def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
     drifts.
     """
     check_single(motion=motion)
-    peak, last = _peaks(motion)[1:]
+    peak, last = peaks_and_last_velocity(motion)[1:]
     known = not isinstance(peak, jax.core.Tracer)
     if known and _is_long(motion) and abs(float(last)) > float(peak) / 4:
         _warn_of_drift(motion, f"ends with {abs(float(last)):.3g} m/s, its peak is {float(peak):.3g} m/s")
@@ -81,68 +76,6 @@ def _is_long(motion: AbstractMotion) -> bool:
 def _warn_of_drift(motion: AbstractMotion, how: str) -> None:
     name = motion.name if isinstance(motion, Record) and motion.name else "a record"
     warnings.warn(f"The ground of {name} {how}: its baseline drifts. See `jaxrock.processing`.", stacklevel=4)
-
-
-def peaks_of_motion(motion: AbstractMotion) -> tuple[Inexact[Array, ""], Inexact[Array, ""]]:
-    """`peak_acceleration` and `peak_velocity` at once, without a warning of a record's baseline."""
-    return _peaks(motion)[:2]
-
-
-def _peaks(motion: AbstractMotion):
-    """As `_peaks_of`, by a few programs for records of any lengths."""
-    return _peaks_of(with_room(motion))
-
-
-@jax.jit
-def _peaks_of(motion: AbstractMotion):
-    """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
-
-    Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
-    passes zero in it; the largest acceleration at an end of a part is followed to the top beside it.
-    """
-    knots = motion.knots
-    nodes, weights = (jnp.asarray(values, knots.dtype) / 2 for values in (_NODES, _WEIGHTS))
-    parts = _PARTS if knots.size - 1 <= _FEW else 1
-
-    def in_piece(piece, length):
-        step = length / parts
-        begins = step * jnp.arange(parts)
-
-        @jax.vmap
-        def jet(local):
-            """Acceleration and its first two derivatives."""
-            terms = motion.series(piece, jnp.clip(local, 0.0, length), jnp.ones_like(length), 2)
-            terms = [*terms, *[jnp.zeros_like(terms[0])] * (3 - len(terms))]
-            return terms[0], terms[1], 2 * terms[2]
-
-        def gains_and(widths, others):
-            """Velocities gained in as much of every part as is asked for, and the acceleration at other times."""
-            inner = begins[:, None] + widths[:, None] * (0.5 + nodes)
-            values = jet(jnp.concatenate([inner.ravel(), others]))[0]
-            return values[: inner.size].reshape(inner.shape) @ weights * widths, values[inner.size :]
-
-        gains, ends = gains_and(jnp.full(parts, step), step * jnp.arange(parts + 1))
-        left, right = ends[:-1], ends[1:]
-        turns = left * right < 0
-        zeros = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
-
-        def nearer(_, found):
-            zeros, top = found
-            values, slopes, bends = jet(jnp.append(begins + zeros, top))
-            zeros = jnp.clip(zeros - values[:-1] / jnp.where(slopes == 0, jnp.inf, slopes)[:-1], 0.0, step)
-            move = -slopes[-1] / jnp.where(bends == 0, jnp.inf, bends)[-1]
-            return zeros, top + jnp.where(jnp.abs(move) <= step, move, 0.0)
-
-        zeros, top = jax.lax.fori_loop(0, _NEWTON, nearer, (zeros, step * jnp.argmax(jnp.abs(ends))))
-        turning, highest = gains_and(zeros, top[None])
-        peak = jnp.maximum(jnp.max(jnp.abs(ends)), jnp.abs(highest[0]))
-        return peak, gains, jnp.where(turns, turning, 0.0)
-
-    peaks, gains, turnings = jax.vmap(in_piece)(jnp.arange(knots.size - 1), motion.lengths)
-    velocity = jnp.cumsum(gains.ravel())
-    before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
-    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings.ravel())))
-    return jnp.max(peaks), fastest * GRAVITY, velocity[-1] * GRAVITY
 
 
 @arguments
@@ -185,7 +118,7 @@ def velocity_to_acceleration(motion: AbstractMotion) -> float:
     acceleration = float(peak_acceleration(motion))
     if not acceleration > 0:
         raise ValueError("Argument `motion` must move, but does not.")
-    return float(_peaks(motion)[1]) / (GRAVITY * acceleration)
+    return float(peaks_and_last_velocity(motion)[1]) / (GRAVITY * acceleration)
 
 
 @arguments
@@ -379,7 +312,7 @@ def velocity_ratio(motion: AbstractMotion, block: Block) -> float:
     **Source:** Dimitrakopoulos & Paraskeva (2015), the measure.
     """
     check_single(block=block)
-    return float(_peaks(motion)[1]) * float(block.p) / (GRAVITY * float(np.tan(block.alpha)))
+    return float(peaks_and_last_velocity(motion)[1]) * float(block.p) / (GRAVITY * float(np.tan(block.alpha)))
 
 
 def _oscillators(period: Values, damping: ArrayLike) -> tuple[np.ndarray, float]:

@@ -7,17 +7,16 @@ in units of g; positive acceleration drives negative rotation.
 
 import abc
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
+from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
+from jaxrock.motions.finer import Finer
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import count_up_to, pick
@@ -259,44 +258,6 @@ class Shifted(_Changed):
         return None if inner is None else [where(piece > 0, v, 0.0) for v in inner]
 
 
-class _Pieces(NamedTuple):
-    """Where the pieces of one motion lie among the finer ones of two."""
-
-    motion: AbstractMotion
-    knots: Inexact[Array, " knots"]  # of both
-
-    def inside(self, middle: Inexact[Array, "..."]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
-        """Piece of the motion at a time strictly between knots, and whether it moves then."""
-        knots = self.motion.knots
-        found = count_up_to(knots, middle) if jnp.ndim(middle) == 0 else jnp.searchsorted(knots, middle, side="right")
-        piece = found.astype(jnp.int32) - 1
-        last = self.motion.knots.size - 2
-        return jnp.clip(piece, 0, last), (piece >= 0) & (piece <= last)
-
-    def spread(self, values: Inexact[Array, " pieces"], quiet: float) -> Inexact[Array, " finer"]:
-        """Values of the motion's pieces for the finer ones; `quiet` where it does not move."""
-        piece, moving = self.inside((self.knots[:-1] + self.knots[1:]) / 2)
-        return where(moving, values[piece], quiet)
-
-    def spread_bounds(self, bounds: Bounds) -> Bounds:
-        """Bounds of the motion's pieces for the finer ones."""
-        return bounds._replace(values=self.spread(bounds.values, 0.0))
-
-    def series(self, series: Callable, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        """What `series`, the motion's horizontal or vertical one, gives in a finer piece."""
-        inner, moving = self.inside((self.knots[piece] + self.knots[piece + 1]) / 2)
-        offset = self.knots[piece] - self.motion.knots[inner] + local
-        terms = series(inner, offset, unit, order)
-        return None if terms is None else [where(moving, u, 0.0) for u in terms]
-
-
-def _shortest_scales(parts: tuple[_Pieces, ...]) -> Inexact[Array, " finer"] | None:
-    """The scales of motions at once."""
-    scales = [(part, part.motion.scales) for part in parts]  # each once: sums of sums would take twice as long each
-    found = [part.spread(values, jnp.inf) for part, values in scales if values is not None]
-    return functools.reduce(jnp.minimum, found) if found else None
-
-
 def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
     """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
     leaves = jax.tree.leaves(parts, is_leaf=lambda node: isinstance(node, Shifted))
@@ -306,8 +267,36 @@ def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar
     return sum((late for late in found if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
 
-class Summed(AbstractMotion):
-    """The sum of two motions (`motion + motion`); its pieces end wherever a piece of either ends."""
+class _Together(AbstractMotion):
+    """Two motions at once; its pieces end wherever a piece of either ends."""
+
+    @property
+    @abc.abstractmethod
+    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
+        """The two."""
+
+    @property
+    def _finer(self) -> Finer:
+        first, second = self._both
+        return Finer(first.knots, second.knots)
+
+    @property
+    def knots(self) -> Inexact[Array, " knots"]:
+        return self._finer.knots
+
+    @property
+    def lateness(self) -> Scalar | None:
+        return _lateness(self.knots, *self._both)
+
+    @property
+    def scales(self) -> Inexact[Array, " pieces"] | None:
+        spread = self._finer.spread(*(motion.scales for motion in self._both), quiet=jnp.inf)
+        found = [values for values in spread if values is not None]
+        return functools.reduce(jnp.minimum, found) if found else None
+
+
+class Summed(_Together):
+    """The sum of two motions (`motion + motion`)."""
 
     first: AbstractMotion
     second: AbstractMotion
@@ -317,42 +306,30 @@ class Summed(AbstractMotion):
         self.first, self.second = first, second
 
     @property
-    def knots(self) -> Inexact[Array, " knots"]:
-        return jnp.sort(jnp.concatenate([self.first.knots, self.second.knots]))
-
-    @property
-    def lateness(self) -> Scalar | None:
-        return _lateness(self.knots, self.first, self.second)
-
-    @property
-    def _parts(self) -> tuple[_Pieces, _Pieces]:
-        return _Pieces(self.first, self.knots), _Pieces(self.second, self.knots)
-
-    @property
-    def scales(self) -> Inexact[Array, " pieces"] | None:
-        return _shortest_scales(self._parts)
+    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
+        return self.first, self.second
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
-        first, second = (part.spread(part.motion.bounds, 0.0) for part in self._parts)
+        first, second = self._finer.spread(self.first.bounds, self.second.bounds, quiet=0.0)
         return first + second
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        found = (part.series(part.motion.series, piece, local, unit, order) for part in self._parts)
-        return sum_of_series(*found) or []
+        both = (motion.series for motion in self._both)
+        return sum_of_series(*self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)) or []
 
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
-        found = [(part, part.motion.vertical_bounds) for part in self._parts]
-        found = [part.spread(bounds, 0.0) for part, bounds in found if bounds is not None]
+        spread = self._finer.spread(*(motion.vertical_bounds for motion in self._both), quiet=0.0)
+        found = [bounds for bounds in spread if bounds is not None]
         return functools.reduce(jnp.add, found) if found else None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        found = (part.series(part.motion.vertical_series, piece, local, unit, order) for part in self._parts)
-        return sum_of_series(*found)
+        both = (motion.vertical_series for motion in self._both)
+        return sum_of_series(*self._finer.series(*both, piece=piece, local=local, unit=unit, order=order))
 
 
-class WithVertical(_Changed):
+class WithVertical(_Changed, _Together):
     """A horizontal motion together with a vertical one (`horizontal.with_vertical(vertical)`).
 
     **Arguments:**
@@ -372,28 +349,17 @@ class WithVertical(_Changed):
         self.horizontal, self.vertical = horizontal, vertical
 
     @property
-    def knots(self) -> Inexact[Array, " knots"]:
-        return jnp.sort(jnp.concatenate([self.horizontal.knots, self.vertical.knots]))
-
-    @property
-    def lateness(self) -> Scalar | None:
-        return _lateness(self.knots, self.horizontal, self.vertical)
-
-    @property
-    def _parts(self) -> tuple[_Pieces, _Pieces]:
-        return _Pieces(self.horizontal, self.knots), _Pieces(self.vertical, self.knots)
-
-    @property
-    def scales(self) -> Inexact[Array, " pieces"] | None:
-        return _shortest_scales(self._parts)
+    def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
+        return self.horizontal, self.vertical
 
     @property
     def envelope(self) -> Envelope:
-        pairs = zip(self._parts, (self.horizontal, self.vertical))
-        return Envelope(*(part.spread_bounds(motion.envelope.horizontal) for part, motion in pairs))
+        return Envelope(*self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both)))
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        return self._parts[0].series(self.horizontal.series, piece, local, unit, order) or []
+        both = self.horizontal.series, None
+        return self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)[0] or []
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        return self._parts[1].series(self.vertical.series, piece, local, unit, order)
+        both = None, self.vertical.series
+        return self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)[1]

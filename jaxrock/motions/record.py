@@ -71,12 +71,13 @@ class Record(Straight):
 
     **Arguments:**
 
-    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1.
+    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1. Or (..., n) of many records of one
+      length, for use under `jax.vmap`.
     - `dt`: time between samples [s], positive.
     - `name`: where it comes from; shown in tables and figures.
     - `origin`: an `Origin`, what a file says of it; None: nothing.
 
-    **Raises:** ValueError for samples that are not a finite one-dimensional array, or dt <= 0.
+    **Raises:** ValueError for samples that are not finite numbers, a column (n, 1) in place of them, or dt <= 0.
 
     Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
     """
@@ -93,6 +94,10 @@ class Record(Straight):
         samples = strength("acceleration", acceleration)
         if samples.ndim == 0 or samples.shape[-1] == 0:
             raise ValueError(f"Argument `acceleration` must hold at least one sample, but has shape {samples.shape}.")
+        if samples.ndim > 1 and samples.shape[-1] == 1:
+            raise ValueError(
+                f"Argument `acceleration` must have its samples along the last axis, but has shape {samples.shape}."
+            )
         self.samples = samples
         self.dt = size("dt", dt)
         self.label = Label((name, origin or Origin()))

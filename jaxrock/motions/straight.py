@@ -1,6 +1,5 @@
 """A known motion as straight lines, in NumPy: what measures of intensity are sums over."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,9 @@ from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.record import Record
 
-_PARTS = 16384  # of a motion of few smooth pieces
+_LINES = 16384  # of smooth pieces, at least
+_PER_SCALE = 1024  # of the time in which an acceleration changes
+_MOST = 1 << 19
 
 
 class Straight(NamedTuple):
@@ -64,19 +65,33 @@ def straight(motion: AbstractMotion) -> Straight:
         before = (0.0, 0.0, delay)
         return Straight(*(np.append(x, part) for x, part in zip(before, inner))) if delay else inner
     lengths = np.asarray(motion.lengths, float)
-    # Pieces of no length, at the room of longer records, say nothing.
-    pieces = np.flatnonzero(lengths > 0)
-    parts = max(1, -(-_PARTS // max(pieces.size, 1)))
-    values = GRAVITY * np.asarray(_values(motion, parts, pieces), float)
-    return Straight(values[:, :-1].ravel(), values[:, 1:].ravel(), np.repeat(lengths[pieces] / parts, parts))
+    counts = _counts(lengths, None if motion.scales is None else np.asarray(motion.scales, float))
+    piece = np.repeat(np.arange(lengths.size), counts)
+    number = np.arange(piece.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    step = (lengths / np.maximum(counts, 1))[piece]
+    ends = (number * step, np.minimum((number + 1) * step, lengths[piece]))
+    begin, end = (GRAVITY * _values(motion, piece, local) for local in ends)
+    return Straight(begin, end, step)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _values(motion: AbstractMotion, parts: int, pieces):
-    """Acceleration [g] at the ends of all parts of each piece, from within it."""
-    lengths, shares = motion.lengths, jnp.arange(parts + 1) / parts
+def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
+    """Of how many lines each piece is made: one, if it is one; none without a length (the room of longer records); else
+    as many as its curves ask for."""
+    lasting = lengths > 0
+    if scales is None:
+        return lasting.astype(int)
+    smooth = lasting & np.isfinite(scales)
+    wanted = np.where(smooth, _PER_SCALE * lengths / np.where(smooth, scales, 1.0), 0.0)
+    wanted = np.maximum(wanted, np.where(smooth, _LINES / max(smooth.sum(), 1), 0.0))
+    return np.where(lasting, np.ceil(np.maximum(wanted * min(1.0, _MOST / max(wanted.sum(), 1.0)), 1.0)), 0).astype(int)
 
-    def at(piece, share):
-        return motion.series(piece, share * lengths[piece], jnp.ones_like(lengths[piece]), 0)[0]
 
-    return jax.vmap(lambda piece: jax.vmap(lambda share: at(piece, share))(shares))(pieces)
+def _values(motion: AbstractMotion, piece: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Acceleration [g] at times from the beginnings of pieces, from within them."""
+    room = (0, (1 << (piece.size - 1).bit_length()) - piece.size)  # few lengths: each is a program
+    return np.asarray(_series(motion, np.pad(piece, room, "edge"), np.pad(local, room, "edge")), float)[: piece.size]
+
+
+@jax.jit
+def _series(motion: AbstractMotion, piece, local):
+    return jax.vmap(lambda piece, local: motion.series(piece, local, jnp.ones_like(local), 0)[0])(piece, local)

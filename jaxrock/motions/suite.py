@@ -19,9 +19,9 @@ from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
-from jaxrock.motions.intensity import peaks_of_motion
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
+from jaxrock.motions.peaks import peaks_of_motion
 from jaxrock.motions.record import Record, with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak

@@ -13,8 +13,8 @@ from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
-from jaxrock.motions.intensity import peaks_of_motion
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, Summed
+from jaxrock.motions.peaks import peaks_of_motion
 from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgiouPulse
 
 Real = Inexact[Array, "..."]

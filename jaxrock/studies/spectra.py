@@ -329,13 +329,19 @@ _PEAKS = ("max_rotation", "max_velocity", "impact_count", "overturned", "margin"
 _STATES = ("state", "max_rotation", "impact_count", "margin", "status")
 
 
+def _over(value: Array, size: Array) -> Array:
+    """A quotient that may be infinite; without slopes there, where they would be no numbers."""
+    finite = jnp.isfinite(value)
+    return jnp.where(finite, jnp.where(finite, value, 0.0) / size, value)
+
+
 def _kept(result: Outcome, block: Block) -> dict:
     """Of a spectrum, and of a map."""
     rest = {name: getattr(result, name) for name in ("impact_count", "overturned", "margin", "status")}
-    velocity = result.max_velocity / (block.p * block.alpha)
+    velocity = _over(result.max_velocity, block.p * block.alpha)
     state = jnp.where(result.overturned, jnp.where(result.impact_count > 0, 2, 1), 0)
     state = jnp.where(result.status == Status.successful, state, -1)
-    return {"state": state, "max_rotation": result.max_rotation / block.alpha, "max_velocity": velocity, **rest}
+    return {"state": state, "max_rotation": _over(result.max_rotation, block.alpha), "max_velocity": velocity, **rest}
 
 
 # The functions of surfaces. What is given for all points lies in the scene, a pytree, so that a second surface of a

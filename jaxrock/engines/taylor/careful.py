@@ -61,10 +61,10 @@ class Series(AbstractEngine):
 
     **Arguments:**
 
-    - `order`: order of the Taylor steps, at least 4; None takes 9 for motions of many pieces (records), else 20 for
+    - `order`: order of the Taylor steps, 4 to 64; None takes 9 for motions of many pieces (records), else 20 for
       linear equations and 16 for others, and fewer where a `tolerance`, or single precision, leaves room for it.
-    - `tolerance`: local error of a step over the slenderness alpha, positive; None takes half the rounding unit. Larger
-      ones take less time where there are many scenes, and leave more of them undecided.
+    - `tolerance`: local error of a step over the slenderness alpha, in (0, 1); None takes half the rounding unit.
+      Larger ones take less time where there are many scenes, and leave more of them undecided.
     - `max_steps`: step budget; None takes 100,000 (`outcome`), or 4,096 and two per piece of the motion
       (`simulate`, which stores every step).
 
@@ -249,7 +249,9 @@ class TaylorStepper(AbstractStepper):
         moved = (step.length > 0) & rocking
         time = where(step.length > 0, step.length * start.stretch, jnp.inf)
         missed = step.rounded + step.missed, step.rounded + step.missed * jnp.maximum(self.order / time, 1.0)
-        exact = landed(self.scene, hits, opening, where(moved, velocity, state.velocity))
+        # After a step of no length it is what it was, to the digit, and moves as the knots do that came together.
+        kept = where(rocking, with_derivatives_of(state.velocity, velocity), state.velocity)
+        exact = landed(self.scene, hits, opening, where(moved, velocity, kept))
         jerk = where(hits.extremum, jet(derivative(step.coefficients), length, 2)[2], jnp.inf)
         fastest = extreme_speed(start, length, opening, speed, jerk) / start.stretch
         passed = replace(

@@ -1,0 +1,94 @@
+"""The largest acceleration and velocity of a motion, as functions of JAX."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.motions.motion import AbstractMotion, Scalar
+from jaxrock.motions.record import with_room
+from jaxrock.numerics.gauss_legendre import gauss_legendre
+
+_NODES, _WEIGHTS = gauss_legendre(6)
+_FEW = 32  # pieces
+_PARTS = 256  # of every piece, where there are few
+_PER_SCALE = 8  # parts of the time in which an acceleration changes, where there are many
+_NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
+
+
+def peaks_of_motion(motion: AbstractMotion) -> tuple[Scalar, Scalar]:
+    """`intensity.peak_acceleration` [g] and `peak_velocity` [m/s] at once, without a warning of a record's baseline."""
+    return peaks_and_last_velocity(motion)[:2]
+
+
+def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Scalar]:
+    """The same, and the velocity at the end [m/s]: by a few programs for records of any lengths."""
+    return _peaks_of(with_room(motion))
+
+
+@jax.jit
+def _peaks_of(motion: AbstractMotion):
+    """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
+
+    Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
+    passes zero in it; from the larger of its ends the acceleration is followed to the top beside it.
+    """
+    kind = motion.knots.dtype
+    nodes, weights = (jnp.asarray(values, kind) / 2 for values in (_NODES, _WEIGHTS))
+    lengths = motion.lengths
+
+    def in_part(piece, begin, step):
+        @jax.vmap
+        def jets(local):
+            """Acceleration and its first two derivatives, at some times."""
+            terms = motion.series(piece, jnp.clip(local, 0.0, lengths[piece]), jnp.ones_like(local), 2)
+            terms = [*terms, *[jnp.zeros_like(terms[0])] * (3 - len(terms))]
+            return terms[0], terms[1], 2 * terms[2]
+
+        def gain_and(width, others):
+            """Velocity gained in as much of it as is asked for, and the acceleration at other times."""
+            values = jets(jnp.concatenate([begin + width * (0.5 + nodes), others]))[0]
+            return values[: nodes.size] @ weights * width, values[nodes.size :]
+
+        gain, (left, right) = gain_and(step, jnp.stack([begin, begin + step]))
+        turns = left * right < 0
+        zero = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
+
+        def nearer(_, found):
+            zero, top = found
+            values, slopes, bends = jets(begin + jnp.stack([zero, top]))
+            zero = jnp.clip(zero - values[0] / jnp.where(slopes[0] == 0, jnp.inf, slopes[0]), 0.0, step)
+            move = -slopes[1] / jnp.where(bends[1] == 0, jnp.inf, bends[1])
+            return zero, top + jnp.where(jnp.abs(move) <= step, move, 0.0)
+
+        larger = jnp.where(jnp.abs(left) >= jnp.abs(right), 0.0, step)
+        zero, top = jax.lax.fori_loop(0, _NEWTON, nearer, (zero, larger))
+        turning, (highest,) = gain_and(zero, (begin + top)[None])
+        peak = jnp.max(jnp.abs(jnp.stack([left, right, highest])))
+        return peak, gain, jnp.where(turns, turning, 0.0)
+
+    peaks, gains, turnings = jax.vmap(in_part)(*_parts(motion))
+    velocity = jnp.cumsum(gains)
+    before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
+    fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings)))
+    return jnp.max(peaks), fastest * GRAVITY, velocity[-1] * GRAVITY
+
+
+def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
+    """The piece of every part, where in it the part begins, and how long it is [s].
+
+    Of few pieces all have as many; of many those that are no straight line have as many as their curves ask for.
+    """
+    lengths, scales = motion.lengths, motion.scales
+    if lengths.size <= _FEW:
+        counts, total = jnp.full(lengths.size, _PARTS), _PARTS * lengths.size
+    elif scales is None:
+        counts, total = jnp.full(lengths.size, 1), lengths.size
+    else:
+        room, wanted = _PARTS * _FEW, _PER_SCALE * lengths / scales
+        counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
+        total = lengths.size + room  # those that are left over lie at the end, without a length
+    piece = jnp.repeat(jnp.arange(lengths.size), counts, total_repeat_length=total)
+    within = jnp.arange(total) - (jnp.cumsum(counts) - counts)[piece]
+    step = lengths[piece] / counts[piece]
+    return piece, jnp.minimum(within * step, lengths[piece]), jnp.where(within < counts[piece], step, 0.0)
