@@ -352,8 +352,7 @@ def _history(time: Array, strength: Array, duration: Array, shape: Array) -> tup
     uplift, _ = _uplift(strength, shape)
     # At the end of a piece, too, its slope by time is its own: of a tie `jnp.clip` would take half.
     since = jnp.where(time > uplift, jnp.where(time <= 0.5, time, 0.5) - uplift, 0.0)
-    rising = _rising(since, strength, duration, shape)
-    middle = _at_middle(strength, duration, shape)
+    rising, middle = _rising(since, strength, duration, shape), _at_middle(strength, duration, shape)
     since = jnp.where(time > 0.5, jnp.where(time <= 1, time - 0.5, 0.5), 0.0)
     falling = _falling(since, middle, strength, duration, shape)
     after = duration * jnp.where(time > 1, time - 1, 0.0)

@@ -30,6 +30,7 @@ def wait(
     never = scene.outlook.is_over(state.piece)
     # How far a step goes changes nothing: it has no derivative.
     room, length = fixed((room, where(jnp.isfinite(length), length, 0.0)))
+    lasting = room > 0  # in a piece without a length nothing happens
     zero = jnp.zeros_like(length)
     lifted, found = [], []
     # A ground that does not change is the same at any scale; powers of a long time would overflow.
@@ -37,8 +38,8 @@ def wait(
         held, high = fixed((drive, level))
         slope = held[1] if len(held) > 1 else zero
         slack = 8 * eps * high
-        touching = jnp.abs(high - held[0]) <= slack
-        lifts = (high - held[0] < -slack) | (touching & (slope > 0))
+        touching = lasting & (jnp.abs(high - held[0]) <= slack)
+        lifts = lasting & (high - held[0] < -slack) | (touching & (slope > 0))
         # A threshold that is touched already counts as passed when it is left behind by more than rounding.
         least = high + where(touching, 2 * slack, 0.0)
 
@@ -49,7 +50,7 @@ def wait(
             return landing.x, landing.hits[0] & (landing.jet[1] > 0)
 
         # What is not a number is looked for, too: it ends in a status.
-        reachable = ~lifts & ~never & (state.side == 0) & ~(sum(jnp.abs(c) for c in held) < high)
+        reachable = lasting & ~lifts & ~never & (state.side == 0) & ~(sum(jnp.abs(c) for c in held) < high)
         x, met = branch(reachable, search, (jnp.ones_like(length), jnp.zeros_like(lifts)))
         found.append((where(met, meet(x, drive, level), x), met, x))
         lifted.append((lifts, touching))

@@ -44,9 +44,10 @@ class Finer(NamedTuple):
         passed = jnp.minimum(up_to(self.first, begin), piece + 1 - below(self.second, begin))
         return _place(self.first, passed - 1), _place(self.second, piece - passed)
 
-    def spread(self, *values: Inexact[Array, " pieces"] | None, quiet: float) -> list[Inexact[Array, " finer"] | None]:
-        """Values of the pieces of either motion (None: it has none) for the finer ones; `quiet` where it is still."""
-        begins = self.knots[:-1]
+    def spread(self, *values: Inexact[Array, " _"] | None, quiet: float) -> list[Inexact[Array, " finer"] | None]:
+        """Values of the pieces of either motion (None: it has none) for the finer ones; `quiet` where it is still, and
+        in pieces without a length, where both never are at once."""
+        begins, lasting = self.knots[:-1], jnp.diff(self.knots) > 0
         places = self._places(
             jnp.arange(begins.size),
             begins,
@@ -54,7 +55,7 @@ class Finer(NamedTuple):
             lambda knots, x: jnp.searchsorted(knots, x, side="left"),
         )
         return [
-            None if each is None else where(place.moving, each[place.piece], quiet)
+            None if each is None else where(place.moving & lasting, each[place.piece], quiet)
             for place, each in zip(places, values)
         ]
 

@@ -212,7 +212,9 @@ def mean_period(motion: AbstractMotion) -> float:
     if lasting.size == 0:
         raise ValueError("Argument `motion` must last, but ends where it begins.")
     end = lines.times[-1]
-    step = max(lasting.min(), min(_SHORT, end / 1000), end / _MOST)
+    step = max(min(_SHORT, end / 1000), end / _MOST)
+    if lasting.size > 1 and np.ptp(lasting) <= 1e-9 * lasting.max() and np.allclose(lines.begin[1:], lines.end[:-1]):
+        step = max(lasting.min(), step)  # such lines are known by their ends
     time = step * np.arange(int(np.floor(end / step * (1 + 1e-12))) + 1)
     knots = np.stack([lines.times[:-1], lines.times[1:] - 1e-9 * step], axis=1).ravel()
     values = np.stack([lines.begin, lines.end], axis=1).ravel()

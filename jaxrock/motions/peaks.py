@@ -65,7 +65,7 @@ def _peaks_of(motion: AbstractMotion):
         zero, top = jax.lax.fori_loop(0, _NEWTON, nearer, (zero, larger))
         turning, (highest,) = gain_and(zero, (begin + top)[None])
         peak = jnp.max(jnp.abs(jnp.stack([left, right, highest])))
-        return peak, gain, jnp.where(turns, turning, 0.0)
+        return jnp.where(step > 0, peak, 0.0), gain, jnp.where(turns, turning, 0.0)
 
     peaks, gains, turnings = jax.vmap(in_part)(*_parts(motion))
     velocity = jnp.cumsum(gains)

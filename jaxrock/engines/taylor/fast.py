@@ -310,13 +310,14 @@ def wait(stepper: TaylorStepper, state: State) -> State:
         share = jnp.minimum(share, _monotone(drive, length))
     full = (length >= room * (1 - 1e-9)) & (share == 1)
     length = keep(share * length, state.local)
+    lasting = room > 0  # in a piece without a length nothing happens
 
     def of(drive, level):
         """Whether this drive lifts the block at once, touches the threshold, or passes it in the step."""
         end, slack = horner(drive, length), 8 * jnp.finfo(length.dtype).eps * level
-        lifts = drive[0] > level + slack
-        touching = ~lifts & (drive[0] >= level - slack)
-        return lifts, touching, ~lifts & (end > level + slack), end
+        lifts = lasting & (drive[0] > level + slack)
+        touching = lasting & ~lifts & (drive[0] >= level - slack)
+        return lifts, touching, lasting & ~lifts & (end > level + slack), end
 
     (drive, level), (drive2, level2) = drives
     (lifts, touching, meets, end), (lifts2, touching2, meets2, end2) = of(drive, level), of(drive2, level2)
