@@ -335,3 +335,17 @@ def test_forces_of_a_block_that_knows_its_inertia():
         rk.responses.contact_forces(response, block, *given).largest_friction for given in ((), (0.5,), (0.75,))
     )
     assert own == same != rectangle
+
+
+@pytest.mark.parametrize("engine", [rk.Series(), rk.Diffrax(rtol=1e-10)])
+def test_an_impact_may_hasten_a_block(engine):
+    """About the lower corner: the largest velocity is that of the rebound."""
+    block = rk.blocks.AsymmetricBlock.from_corners((0.3, -1.0), (-0.15, -1.35), (0.0, 0.0), 0.6)
+    motion = -1 * (rk.RectangularPulse(0.05, 3.0) + rk.TriangularPulse(0.01, 4.0))
+    response = rk.simulate(block, motion, initial=(-0.02, 0.0), engine=engine)
+    rebound = abs(float(response.impact_velocities[0])) * float(block.restitution2)
+    assert block.restitution2 > 1.1
+    for found in (response, rk.outcome(block, motion, initial=(-0.02, 0.0), engine=engine)):
+        np.testing.assert_allclose(found.max_velocity, rebound, rtol=1e-6)
+    times = np.linspace(0, float(response.duration), 20_001)
+    assert np.abs(response(times)[1]).max() <= response.max_velocity * (1 + 1e-9)

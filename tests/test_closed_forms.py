@@ -503,3 +503,32 @@ def test_free_rocking():
     assert impacts[0] == pytest.approx(float(pushover.period(0.5)) / 8, rel=1e-12)
     amplitudes = np.asarray(pushover.amplitude_after(np.arange(1, len(impacts)), 0.5, 0.9))
     np.testing.assert_allclose(np.diff(impacts) * 2.0, 0.5 * pushover.period(amplitudes), rtol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [0.7, 0.0, -3.0])
+@pytest.mark.parametrize("time", [0.5, 1.0])
+def test_slopes_by_time_where_the_branches_of_a_pulse_meet(time, shape):
+    """The rotation's is the velocity, the velocity's what differences say from before."""
+    given = 0.4, 1.5, shape
+    np.testing.assert_allclose(
+        each(jax.grad(single_lobe.rotation), time, *given), 1.5 * each(single_lobe.velocity, time, *given), rtol=1e-12
+    )
+    before = [each(single_lobe.velocity, time - x, *given) for x in (0.0, 1e-6, 2e-6)]
+    slope = (3 * before[0] - 4 * before[1] + before[2]) / 2e-6
+    np.testing.assert_allclose(each(jax.grad(single_lobe.velocity), time, *given), slope, rtol=1e-6)
+
+
+def test_slopes_by_time_at_an_impact_are_those_before_it():
+    given = 1.2, 5.0, 0.9
+    time = float(each(sine_pulse.impact_time, *given[:2]))
+    np.testing.assert_allclose(
+        each(jax.grad(sine_pulse.rotation), time, *given), each(sine_pulse.velocity, time, *given), rtol=1e-12
+    )
+    before = [each(sine_pulse.velocity, time - x, *given) for x in (0.0, 1e-6, 2e-6)]
+    slope = (3 * before[0] - 4 * before[1] + before[2]) / 2e-6
+    np.testing.assert_allclose(each(jax.grad(sine_pulse.velocity), time, *given), slope, rtol=1e-6)
+
+
+def test_a_triangle_has_the_slope_by_shape_of_its_neighbours():
+    slopes = [each(jax.grad(single_lobe.pulse, 1), 0.3, shape) for shape in (-1e-7, 0.0, 1e-7)]
+    np.testing.assert_allclose(slopes, -0.12, rtol=1e-6)

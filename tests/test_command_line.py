@@ -19,6 +19,7 @@ import jaxrock as rk
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
+from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.motions.pulses import PULSES
 
 STEPS = np.arange(60)
@@ -384,7 +385,7 @@ BAD = {
     "stocky": (["run", "--width", "6"], "Argument `alpha` must be at most 0.955"),
     "restitution 2": (["run", "--restitution", "2"], r"Argument `--restitution` must be in \[0, 1\], but is 2.0"),
     "duration 0": (["run", "--duration", "0"], "Argument `--duration` must be positive and finite, .*, but is 0.0"),
-    "scale NaN": (["run", "--scale", "nan"], "Argument `acceleration` must be finite, .*, but is nan"),
+    "scale NaN": (["run", "--scale", "nan"], "Argument `--scale` must be finite, but is nan"),
     "fragility, missing file": (["fragility", "missing.AT2"], "No such file or directory"),
     "fragility, one file twice": (
         ["fragility", "motion.txt", "motion.txt", "--unit", "g", "--dt", "0.02"],
@@ -409,6 +410,18 @@ BAD = {
     "map, points 0": (["map", "--points", "0"], "Argument `--points` must be at least 2, but is 0"),
     "map, points 1": (["map", "--points", "1"], "Argument `--points` must be at least 2, but is 1"),
     "map, restitution 2": (["map", "--restitution", "2"], r"Argument `--restitution` must be in \[0, 1\], but is 2.0"),
+    "invert, shape of a sine": (
+        ["invert", "rocks.csv", "--pulse", "sine", "--shape", "0", "1"],
+        "Argument `--shape` is not a parameter of the pulse sine",
+    ),
+    "invert, amplitudes in no order": (
+        ["invert", "rocks.csv", "--amplitude", "3", "1"],
+        "Argument `--amplitude` must be positive, finite and in order, but is 3 to 1",
+    ),
+    "invert, prior below 0": (
+        ["invert", "rocks.csv", "--prior", "amplitude", "-1", "0.2"],
+        "Argument `--prior` must end with a positive median and deviation, but is amplitude -1 0.2",
+    ),
     "map, shape of a sine": (["map", "--shape", "1"], "Argument `--shape` is not a parameter of the pulse sine"),
     "map, alpha 2": (["map", "--alpha", "2"], r"Argument `--alpha` must be in \(0, pi/2\), .*, but is 2.0"),
     "map, ratio from 0": (
@@ -434,6 +447,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, words, error):
     """Exit status 2, one line on the error stream, nothing else printed, nothing written."""
     (tmp_path / "motion.txt").write_text("".join(f"{a}\n" for a in SAMPLES))
     (tmp_path / "words.txt").write_text("shaken, not stirred\n")
+    (tmp_path / "rocks.csv").write_text(EXAMPLE)
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     printed = capsys.readouterr()

@@ -694,3 +694,67 @@ def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
     for each in (scaled, shifted):
         np.testing.assert_allclose(each.condition, alone.condition, rtol=1e-9)
         np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)
+
+
+LAST = rk.RectangularPulse(-0.25, 0.4)
+TOGETHER = {
+    "a pulse that begins where another ends": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b), 0.5),
+    "the other way round": (lambda a, b: LAST.shifted(b) + rk.HalfSinePulse(0.45, a), 0.5),
+    "pulses that end together": (lambda a, b: rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b), 0.6),
+    "three": (
+        lambda a, b: rk.RectangularPulse(0.1, b) + (rk.HalfSinePulse(0.45, a) + LAST.shifted(a + b - 0.5)),
+        0.5,
+    ),
+    "with the vertical motion": (lambda a, b: rk.SinePulse(0.4, a).with_vertical(rk.CosinePulse(0.2, b)), 0.6),
+    "later": (lambda a, b: (rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b)).shifted(a), 0.6),
+}
+
+
+@pytest.mark.parametrize(
+    "case, engine", [*((case, None) for case in TOGETHER), (next(iter(TOGETHER)), rk.Diffrax(rtol=1e-10))]
+)
+def test_where_knots_come_together(case, engine):
+    """Each has a slope of its own: what differences say, on both sides of the tie."""
+    make, at = TOGETHER[case]
+    block, x = rk.Block(0.2, 2.0, 0.9), jnp.array([at, at])
+
+    @jax.jit
+    def results(x):
+        found = rk.outcome(block, make(*x), engine=engine)
+        return jnp.stack([found.max_rotation, found.margin])
+
+    step = 1e-5 if engine is None else 1e-4
+    differences = [(results(x + step * way) - results(x - step * way)) / (2 * step) for way in jnp.eye(2)]
+    found = jax.jacfwd(results)(x)
+    np.testing.assert_allclose(found, np.stack(differences, axis=1), rtol=1e-4, atol=1e-5)
+    if engine is None:
+        np.testing.assert_allclose(jax.jacrev(results)(x), found, rtol=1e-12, atol=1e-14)
+        many = jax.vmap(jax.jacfwd(results))(jnp.broadcast_to(x, (70, 2)))
+        np.testing.assert_allclose(many[3], found, rtol=1e-12, atol=1e-14)
+
+
+def test_a_history_where_knots_come_together():
+    """Within it, and where it stops just there."""
+
+    def rotations(x, duration, times):
+        motion = rk.SinePulse(0.4, x[0]) + rk.RectangularPulse(0.1, x[1])
+        return rk.simulate(rk.Block(0.2, 2.0, 0.9), motion, duration=duration)(times)[0]
+
+    x, step = jnp.array([0.6, 0.6]), 1e-5
+    for until in ((3.0, jnp.array([0.5, 0.6, 1.0])), (0.6, jnp.array([0.5, 0.6]))):
+        ends = [[rotations(x + way * each, *until) for way in (step, -step)] for each in jnp.eye(2)]
+        differences = [(above - below) / (2 * step) for above, below in ends]
+        np.testing.assert_allclose(jax.jacfwd(rotations)(x, *until), np.stack(differences, axis=1), atol=1e-5)
+
+
+def test_nothing_is_lifted_between_knots_that_come_together():
+    """Two pulses, each too weak, one of which ends as the other begins: never both at once."""
+    block, first = rk.Block(0.3, 2.0), rk.RectangularPulse(0.2, 0.5)
+    second = rk.RectangularPulse(0.2, 0.4).shifted(0.5)
+    factors = jnp.linspace(0.9, 1.0, 70)
+    for motion in (first + second, second + first):
+        np.testing.assert_array_less(motion.bounds, 0.2 + 1e-12)
+        many = jax.vmap(lambda factor, motion=motion: rk.outcome(block, factor * motion))(factors)
+        for found in (rk.outcome(block, motion), jax.tree.map(lambda x: x[-1], many), rk.simulate(block, motion)):
+            assert found.max_rotation == 0 and found.impact_count == 0
+            np.testing.assert_allclose(found.margin, 2 - 0.2 / np.tan(0.3), rtol=1e-12)

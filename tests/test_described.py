@@ -85,3 +85,11 @@ def test_nothing_public_that_holds_numbers_shows_their_shapes_alone():
     kinds = {kind for space in spaces for kind in map(space.__dict__.get, dir(space)) if isinstance(kind, type)}
     bare = [k for k in kinds if issubclass(k, eqx.Module) and k.__repr__ is eqx.Module.__repr__]
     assert not [kind for kind in bare if not issubclass(kind, settings + functions)]
+
+
+def test_results_without_values_can_be_seen():
+    """What `jax.eval_shape` and `eqx.filter` leave of them."""
+    block, motion = rk.Block(0.3, 1.6), rk.SinePulse(0.5, 0.9)
+    shapes = jax.eval_shape(lambda: rk.outcome(block, motion))
+    assert "status=Status[]" in repr(shapes)
+    assert "status=Status.None" in repr(eqx.filter(rk.outcome(block, motion), eqx.is_inexact_array))

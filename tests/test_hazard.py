@@ -776,3 +776,23 @@ def test_what_is_not_there(file):
         rk.hazard.read_hazard_curves([])
     with pytest.raises(FileNotFoundError):
         rk.hazard.read_hazard_curves("nowhere.csv")
+
+
+@pytest.mark.parametrize("level, probability", [(0.0, 0.0), (np.inf, 1.0)])
+def test_slopes_at_the_ends_of_all_levels(level, probability):
+    """None, and no NaN, which would spoil the slopes of all other levels."""
+
+    def probabilities(size):
+        lognormal = rk.hazard.LogNormalFragility(0.5 * size, 0.4)
+        table = rk.hazard.TabulatedFragility(jnp.array([0.1, 0.3]) * size, [0.0, 1.0])
+        levels = jnp.array([level, 0.2])
+        surface = rk.hazard.SurfaceFragility(0.5 * jnp.asarray(size), jnp.asarray(0.0), jnp.asarray(0.4))
+        return jnp.stack([lognormal(levels), table(levels), surface(levels, 1.0)])
+
+    values, slopes = probabilities(1.0), jax.jacfwd(probabilities)(1.0)
+    np.testing.assert_allclose(values[:, 0], probability, atol=0)
+    np.testing.assert_allclose(slopes[:, 0], 0, atol=0)
+    np.testing.assert_allclose(
+        slopes[:, 1], (probabilities(1 + 1e-6) - probabilities(1 - 1e-6))[:, 1] / 2e-6, rtol=1e-6
+    )
+    np.testing.assert_allclose(jax.jacrev(probabilities)(1.0), slopes, rtol=1e-12)

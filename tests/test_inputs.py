@@ -27,7 +27,10 @@ SLENDERNESS = "be in (0, pi/2)"
 POSITIVE = "be positive and finite"
 FINITE = "be finite"
 SHARE = "be in [0, 1]"
-HOUSNER = "be at most 0.955, of a width of 1.41 heights, when `restitution` is None: Housner's value is negative above"
+HOUSNER = (
+    "be at most 0.955, of a width of 1.41 heights, when `restitution` is None or Housner's: Housner's value is "
+    "negative above"
+)
 LIST = "be a list of at least one value"
 SCENE = "hold one scene"
 ONE_SAMPLE = "hold at least one sample"

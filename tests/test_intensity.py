@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid, quad, solve_ivp
 
 import jaxrock as rk
+from jaxrock.motions.straight import straight
 
 G, A, T = 9.81, 0.3, 0.8
 SINE = rk.SinePulse(A, T)
@@ -208,3 +209,29 @@ def test_a_displacement_that_is_drift_warns():
 def test_what_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+BESIDE = {
+    "a record that rests": (rk.Record(np.zeros(3), 1.0) + rk.SinePulse(0.3, 0.25), 0.3, 0.25),
+    "a record that comes later": (rk.SinePulse(0.6, 1.0) + rk.example_record().shifted(5.0), 0.6, 1.0),
+}
+
+
+@pytest.mark.parametrize("case", BESIDE)
+def test_a_pulse_among_many_pieces(case):
+    """Its peaks lie within a piece of its own, however many pieces there are."""
+    motion, amplitude, period = BESIDE[case]
+    speed = amplitude * 9.81 * period / np.pi
+    np.testing.assert_allclose(rk.intensity.peak_acceleration(motion), amplitude, rtol=1e-12)
+    np.testing.assert_allclose(rk.intensity.peak_velocity(motion), speed, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(straight(motion).velocity).max(), speed, rtol=1e-6)
+    block = rk.Block(0.25, 2.0)
+    np.testing.assert_allclose(rk.intensity.uplift_ratio(motion, block), amplitude / np.tan(0.25), rtol=1e-12)
+
+
+def test_sums_over_a_pulse_beside_a_record():
+    """Of what does not overlap they add up."""
+    pulse, record = rk.SinePulse(0.6, 1.0), rk.example_record()
+    both = pulse + record.shifted(5.0)
+    for measure in (rk.intensity.arias, rk.intensity.cumulative_absolute_velocity):
+        np.testing.assert_allclose(measure(both), measure(pulse) + measure(record), rtol=1e-6)

@@ -9,6 +9,7 @@ from jaxrock.motions.files.example import example_record
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import STANDARD_GRAVITY
 from jaxrock.motions.files.reading import FORMATS, read_record
+from jaxrock.motions.record import Record
 
 SAMPLES = np.array([0.01, -0.2556093, 0.3, -0.04, 0.05, 1.06e-3, -7e-5])  # g
 
@@ -795,3 +796,9 @@ def test_an_at2_file_that_is_cut_within_its_last_number(tmp_path):
         else:
             with pytest.raises(ValueError, match="cut off|announces 5 samples|should hold samples"):
                 read_record(path)
+
+
+def test_a_column_is_no_record():
+    """Of a file, say: it would be many records of one sample."""
+    with pytest.raises(ValueError, match=r"Argument `acceleration` must have its samples along the last axis"):
+        Record(np.ones((500, 1)), 0.01)

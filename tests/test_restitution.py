@@ -475,3 +475,27 @@ def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
 def test_parameters_have_ranges(given):
     with pytest.raises(ValueError, match="must be"):
         rk.restitution.SpeedDependent(*given)
+
+
+def _with(where, number):
+    return lambda owner: eqx.tree_at(where, owner, jnp.array(number))
+
+
+PLAIN, SINE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.45, 0.5)
+CHANGED = {
+    "a restitution above 1": (_with(lambda b: b.law.value, 1.3)(PLAIN), SINE),
+    "a restitution below 0": (_with(lambda b: b.law.value, -0.5)(PLAIN), SINE),
+    "a negative slenderness": (_with(lambda b: b.alpha, -0.2)(PLAIN), SINE),
+    "a negative p": (_with(lambda b: b.p, -2.0)(PLAIN), SINE),
+    "a negative period": (PLAIN, _with(lambda m: m.period, -0.5)(SINE)),
+    "a negative delay": (PLAIN, _with(lambda m: m.delay, -0.1)(SINE.shifted(0.1))),
+    "a negative time between samples": (PLAIN, _with(lambda m: m.dt, -0.2)(rk.Record([0.3, -0.4, 0.2], 0.2))),
+}
+
+
+@pytest.mark.parametrize("case", CHANGED)
+def test_what_no_constructor_has_seen_has_a_status(case):
+    """A step of an optimiser changes numbers of blocks and motions as they are."""
+    block, motion = CHANGED[case]
+    assert rk.outcome(block, motion).status == rk.Status.not_finite
+    assert rk.simulate(block, motion, throw=False).status == rk.Status.not_finite

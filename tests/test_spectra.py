@@ -298,3 +298,20 @@ def test_a_block_of_plain_numbers_is_made_once_in_each_precision():
     for _ in range(2):
         with pytest.raises(ValueError, match=r"Argument `restitution` must be in \[0, 1\], but is 1.5."):
             of_any_size(0.2, 1.5)
+
+
+def test_slopes_beside_a_point_that_overturns():
+    """They are what they are without it; its own are zero."""
+    motion, periods = 0.9 * rk.SinePulse(0.5, 0.9), jnp.array([2.0, 4.5])
+
+    def peaks(alpha):
+        spectrum = rk.rocking_spectrum(alpha, motion, periods, progress=False)
+        surface = rk.overturning_map([2.0, 4.0], [1.2, 3.0], alpha=alpha, progress=False)
+        return jnp.concatenate([spectrum.max_rotation, spectrum.max_velocity, surface.max_rotation.ravel()])
+
+    at = 0.3
+    found, lost = peaks(at), jnp.isinf(peaks(at))
+    assert lost.any() and not lost.all()
+    differences = (peaks(at + 1e-6) - peaks(at - 1e-6)) / 2e-6
+    for slopes in (jax.jacfwd(peaks)(at), jax.jacrev(peaks)(at)):
+        np.testing.assert_allclose(slopes, jnp.where(jnp.isinf(found), 0.0, differences), rtol=1e-6, atol=1e-7)

@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import check_points, extent_of, model_of, number, other_parameters
+from jaxrock.command_line.options import check_points, check_range, extent_of, model_of, number, other_parameters
 from jaxrock.command_line.output import Report, plain
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.inverse.observations import SEEN, TOPPLED
@@ -23,6 +23,11 @@ _RANGES = {"shape": (-6.0, 6.0)}
 def _estimated(word: str) -> list[str]:
     """Parameters of a pulse, beyond amplitude and period or duration, that have no default: they are unknowns."""
     return [name for name, default in other_parameters(PULSES[word]).items() if default is Parameter.empty]
+
+
+def _all_estimated() -> list[str]:
+    """Those of any pulse."""
+    return list(dict.fromkeys(name for word in PULSES for name in _estimated(word)))
 
 
 class _Example(argparse.Action):
@@ -51,11 +56,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--duration", default=(0.1, 5.0), help="range of duration or period [s] (default 0.1 5)", **ends
     )
-    for name in dict.fromkeys(name for word in PULSES for name in _estimated(word)):
+    for name in _all_estimated():
         words = ", ".join(word for word in PULSES if name in _estimated(word))
         known = _RANGES.get(name)
         shown = "" if known is None else f" (default {known[0]:g} {known[1]:g})"
-        parser.add_argument(f"--{name}", default=known, help=f"range of the {name} of the pulse {words}{shown}", **ends)
+        parser.add_argument(f"--{name}", help=f"range of the {name} of the pulse {words}{shown}", **ends)
     parser.add_argument(
         "--scatter", type=number, default=0.3, help="standard deviation of ln amplitude from rock to rock (default 0.3)"
     )
@@ -109,12 +114,17 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
 
 def _unknowns(arguments: argparse.Namespace, priors: dict) -> dict[str, rk.inverse.Unknown]:
     """What is estimated."""
+    for name in ("amplitude", "duration"):
+        check_range(f"--{name}", getattr(arguments, name))
+    for name in _all_estimated():
+        if getattr(arguments, name) is not None and name not in _estimated(arguments.pulse):
+            raise ValueError(f"Argument `--{name}` is not a parameter of the pulse {arguments.pulse}.")
     unknowns = {
         "amplitude": rk.inverse.Unknown(*arguments.amplitude, prior=priors.get("amplitude")),
         extent_of(PULSES[arguments.pulse]): rk.inverse.Unknown(*arguments.duration, prior=priors.get("duration")),
     }
     for name in _estimated(arguments.pulse):
-        ends = getattr(arguments, name)
+        ends = getattr(arguments, name) or _RANGES.get(name)
         if ends is None:
             raise ValueError(f"Argument `--{name}` must be given for the pulse {arguments.pulse}, but is None.")
         unknowns[name] = rk.inverse.Unknown(*ends, log=False, prior=priors.get(name))
@@ -140,10 +150,14 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
         if name not in known or name in priors:
             raise ValueError(f"Argument `--prior` must name each of {', '.join(known)} at most once, but names {name}.")
         try:
-            priors[name] = number(numbers[0]), number(numbers[1])
+            median, deviation = number(numbers[0]), number(numbers[1])
         except ValueError:
             said = f"{name} {' '.join(numbers)}"
             raise ValueError(f"Argument `--prior` must end with two numbers, but is {said}.") from None
+        if not deviation > 0 or not (median > 0 or name in _RANGES):
+            said = f"{name} {' '.join(numbers)}"
+            raise ValueError(f"Argument `--prior` must end with a positive median and deviation, but is {said}.")
+        priors[name] = median, deviation
     return priors
 
 

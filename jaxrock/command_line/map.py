@@ -21,8 +21,12 @@ from jaxrock.command_line.output import Entry, Report, check_surface, save, writ
 _AXES = {
     "frequency_ratio": (False, (0.3, 8.0), "2 pi/period of the pulse over p"),
     "intensity": (False, (1.02, 10.0), "peak acceleration over the uplift threshold"),
-    "pulse_duration": (True, (0.05, 8.0), "in place of the frequency ratio: p times the duration or period"),
-    "uplift_strength": (True, (0.02, 0.98), "in place of the intensity: uplift threshold over peak acceleration"),
+    "pulse_duration": (
+        True,
+        (0.05, 8.0),
+        "p times the duration or period: with the strength of uplift, in place of the two above",
+    ),
+    "uplift_strength": (True, (0.02, 0.98), "uplift threshold over peak acceleration: with the duration of the pulse"),
 }
 
 

@@ -56,6 +56,8 @@ def record_of(arguments: argparse.Namespace) -> rk.Record:
         record = rk.example_record()
     else:
         record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
+    if not abs(arguments.scale) < float("inf"):
+        raise ValueError(f"Argument `--scale` must be finite, but is {arguments.scale:g}.")
     return rk.Record(record.samples * arguments.scale, record.dt, record.name, record.origin)
 
 

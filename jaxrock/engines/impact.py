@@ -52,6 +52,9 @@ def impact(
         slowed, lambda: speed**2 / (2 * where(slowed, -rebound.there, 1.0)), lambda: jnp.zeros_like(speed)
     )
     rests, more, wait = _rests_if_soon(stepper, state, hit, rebound, steepest, reach)
+    fastest = state.fastest
+    if stepper.scene.far is not None:  # of corners of unequal height an impact may hasten it about one
+        fastest = where(hit & (rebound.speed > fastest), rebound.speed, fastest)
     return replace(
         state,
         impacts=state.impacts + (hit & (speed < 0)) + more,
@@ -59,6 +62,7 @@ def impact(
         impact_velocity=where(hit, state.side * speed, state.impact_velocity),
         side=where(rests, 0.0, where(hit, -state.side, state.side)),
         clearance=where(slowed, jnp.minimum(state.clearance, depth), state.clearance),
+        fastest=fastest,
         opening=where(hit, 0.0, state.opening),
         velocity=where(rests, 0.0, where(hit, rebound.speed, state.velocity)),
         spread=Spread.where(rests, Spread.none(speed), Spread.where(hit, rebound.spread, state.spread)),
