@@ -1,7 +1,7 @@
 """Two motions at once: where the pieces of each lie among the finer ones that end wherever a piece of either ends."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
@@ -44,7 +44,7 @@ class Finer(NamedTuple):
         passed = jnp.minimum(up_to(self.first, begin), piece + 1 - below(self.second, begin))
         return _place(self.first, passed - 1), _place(self.second, piece - passed)
 
-    def spread(self, *values: Inexact[Array, " _"] | None, quiet: float) -> list[Inexact[Array, " finer"] | None]:
+    def spread(self, *values: Inexact[Array, " _"] | None, quiet: float) -> list[Any]:
         """Values of the pieces of either motion (None: it has none) for the finer ones; `quiet` where it is still, and
         in pieces without a length, where both never are at once."""
         begins, lasting = self.knots[:-1], jnp.diff(self.knots) > 0
