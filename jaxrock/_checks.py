@@ -24,6 +24,15 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def check_known(**values: Any) -> None:
+    """Raise ValueError for what is traced, where NumPy takes over."""
+    for name, value in values.items():
+        if is_traced(value):
+            raise ValueError(
+                f"Argument `{name}` must be known: this is no function under `jax.jit`, `jax.vmap` or a derivative."
+            )
+
+
 def one_program(function: Making) -> Making:
     """Decorate a pure function of arrays: of known ones all its operations are one program, where each would be one for
     every shape; of traced ones it is as it is written."""

@@ -3,6 +3,7 @@
 import functools
 import warnings
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, quad, solve_ivp
@@ -235,3 +236,29 @@ def test_sums_over_a_pulse_beside_a_record():
     both = pulse + record.shifted(5.0)
     for measure in (rk.intensity.arias, rk.intensity.cumulative_absolute_velocity):
         np.testing.assert_allclose(measure(both), measure(pulse) + measure(record), rtol=1e-6)
+
+
+def test_ratios_to_a_block_are_functions_of_jax():
+    block, step = rk.Block(0.2, 2.0), 1e-6
+    for measure in (rk.intensity.uplift_ratio, rk.intensity.velocity_ratio):
+
+        def of(amplitude, measure=measure):
+            return measure(rk.SinePulse(amplitude, 0.6), block)
+
+        assert isinstance(of(0.4), float)
+        np.testing.assert_allclose(jax.jit(of)(0.4), of(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(of)(0.4), (of(0.4 + step) - of(0.4 - step)) / (2 * step), rtol=1e-8)
+
+
+@pytest.mark.parametrize("name, call", [
+    ("motion", lambda x: rk.intensity.arias(rk.SinePulse(x, 0.6))),
+    ("motion", lambda x: rk.intensity.velocity_to_acceleration(rk.SinePulse(x, 0.6))),
+    ("record", lambda x: rk.processing.baseline_corrected(rk.Record(x * np.ones(9), 0.1))),
+    ("record", lambda x: rk.motions.fit_pulse(rk.Record(x * np.ones(9), 0.1), rk.SinePulse)),
+    ("factor", lambda x: rk.processing.scaled(rk.Record(np.ones(9), 0.1), factor=x)),
+    ("outline", lambda x: rk.blocks.AsymmetricBlock.from_outline(x * np.array([[0.0, 0], [1, 0], [0, 1]])).p1),
+])  # fmt: skip
+def test_what_must_be_known_is_called_by_its_name(name, call):
+    for way in (jax.jit(call), jax.grad(call)):
+        with pytest.raises(ValueError, match=f"Argument `{name}` must be known"):
+            way(0.4)

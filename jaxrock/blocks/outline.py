@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxrock._checks import Values, strength, whole
+from jaxrock._checks import Values, check_known, strength, whole
 
 
 class Outline(NamedTuple):
@@ -22,6 +22,7 @@ class Outline(NamedTuple):
 
         **Raises:** ValueError where it has fewer than three vertices, no area, or crosses itself.
         """
+        check_known(outline=outline)
         given = np.asarray(strength("outline", outline), float)
         if given.ndim != 2 or given.shape[1] != 2 or len(given) < 3:
             raise ValueError(f"Argument `outline` must have shape (n, 2) with n at least 3, but has {given.shape}.")

@@ -1,17 +1,19 @@
 """Intensity measures of ground motions: peaks, what is summed over time, response spectra, rocking's own.
 
-`peak_acceleration` and `peak_velocity` are functions of JAX. The others are of known motions, in NumPy and SciPy: exact
-for records (straight lines between samples), to about 1e-7 for pulses. g is 9.81 m/s^2.
+`peak_acceleration`, `peak_velocity` and their ratios to a block's are functions of JAX. The others are of known
+motions, in NumPy and SciPy: exact for records (straight lines between samples), to about 1e-7 for pulses. g is 9.81
+m/s^2.
 """
 
 import warnings
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, checked, scalar
+from jaxrock._checks import Values, check_known, checked, is_traced, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.motion import AbstractMotion, Shifted
@@ -115,6 +117,7 @@ def velocity_to_acceleration(motion: AbstractMotion) -> float:
 
     **Raises:** ValueError for a motion that does not move.
     """
+    check_known(motion=motion)
     acceleration = float(peak_acceleration(motion))
     if not acceleration > 0:
         raise ValueError("Argument `motion` must move, but does not.")
@@ -293,28 +296,34 @@ def average_spectral_acceleration(motion: AbstractMotion, period: Values, dampin
 
 
 @arguments
-def uplift_ratio(motion: AbstractMotion, block: Block) -> float:
+def uplift_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array, ""]:
     """PGA/(g tan alpha) [-]: above 1 the block uplifts.
 
     **Arguments:**
 
     - `motion`: a motion of scalar parameters.
     - `block`: one `Block`.
+
+    **Returns:** the ratio; of what is traced, an array with derivatives.
     """
     check_single(block=block)
-    return float(peak_acceleration(motion)) / float(np.tan(block.alpha))
+    ratio = peak_acceleration(motion) / jnp.tan(block.alpha)
+    return ratio if is_traced(ratio) else float(ratio)
 
 
 @arguments
-def velocity_ratio(motion: AbstractMotion, block: Block) -> float:
+def velocity_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array, ""]:
     """p PGV/(g tan alpha) [-]: the ground's velocity against the one that overturns the block in an instant.
 
     **Arguments:** as `uplift_ratio`.
 
+    **Returns:** as `uplift_ratio`.
+
     **Source:** Dimitrakopoulos & Paraskeva (2015), the measure.
     """
     check_single(block=block)
-    return float(peaks_and_last_velocity(motion)[1]) * float(block.p) / (GRAVITY * float(np.tan(block.alpha)))
+    ratio = peaks_and_last_velocity(motion)[1] * block.p / (GRAVITY * jnp.tan(block.alpha))
+    return ratio if is_traced(ratio) else float(ratio)
 
 
 def _oscillators(period: Values, damping: ArrayLike) -> tuple[np.ndarray, float]:

@@ -11,10 +11,20 @@ from typing import Annotated
 import numpy as np
 import scipy.interpolate
 import scipy.signal
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments, at_least, known, word_of
-from jaxrock._checks import Values, delay, factor as any_factor, not_negative, positive, scalar, size, strength
+from jaxrock._checks import (
+    Values,
+    check_known,
+    delay,
+    factor as any_factor,
+    not_negative,
+    positive,
+    scalar,
+    size,
+    strength,
+)
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
@@ -35,7 +45,13 @@ _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 def _samples(record: Record) -> tuple[np.ndarray, float]:
     check_single(record=record)
+    check_known(record=record)
     return np.asarray(record.samples, float), float(record.dt)
+
+
+def _number(name: str, value: Inexact[Array, "..."]) -> float:
+    check_known(**{name: value})
+    return float(scalar(name, value))
 
 
 def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Record:
@@ -107,7 +123,7 @@ def _series(name: str, values: Values, dt: ArrayLike, unit: str) -> tuple[np.nda
     array = np.asarray(strength(name, values), float)
     if array.ndim != 1 or array.size < 4:
         raise ValueError(f"Argument `{name}` must be a list of at least 4 samples, but has shape {array.shape}.")
-    return array * _UNITS[unit], float(scalar("dt", size("dt", dt)))
+    return array * _UNITS[unit], _number("dt", size("dt", dt))
 
 
 @arguments
@@ -256,7 +272,7 @@ def tapered(record: Record, seconds: ArrayLike) -> Record:
     **Raises:** ValueError for arguments outside their ranges.
     """
     samples, dt = _samples(record)
-    seconds, whole = float(scalar("seconds", not_negative("seconds", seconds))), (samples.size - 1) * dt
+    seconds, whole = _number("seconds", not_negative("seconds", seconds)), (samples.size - 1) * dt
     if 2 * seconds > whole:
         raise ValueError(f"Argument `seconds` must be at most half the record, {whole / 2:g} s, but is {seconds}.")
     return _like(record, samples * scipy.signal.windows.tukey(samples.size, 2 * seconds / whole if whole else 0.0))
@@ -302,7 +318,7 @@ def resampled(record: Record, dt: ArrayLike) -> Record:
     **Raises:** ValueError for arguments outside their ranges, or a longer step that is no ratio of small numbers.
     """
     samples, old = _samples(record)
-    new = float(scalar("dt", size("dt", dt)))
+    new = _number("dt", size("dt", dt))
     if new <= old:
         time = new * np.arange(int(np.floor((samples.size - 1) * old / new * (1 + 1e-12))) + 1)
         return _like(record, np.interp(time, old * np.arange(samples.size), samples), new)
@@ -325,8 +341,8 @@ def cut(record: Record, begin: ArrayLike = 0.0, end: ArrayLike | None = None) ->
     **Raises:** ValueError for a part without samples.
     """
     samples, dt = _samples(record)
-    begin = float(scalar("begin", delay("begin", begin)))
-    end = (samples.size - 1) * dt if end is None else float(scalar("end", delay("end", end)))
+    begin = _number("begin", delay("begin", begin))
+    end = (samples.size - 1) * dt if end is None else _number("end", delay("end", end))
     first, last = int(np.ceil(begin / dt - 1e-9)), int(np.floor(min(end / dt, samples.size) + 1e-9))
     part = samples[first : last + 1]
     if last < first or part.size == 0:
@@ -361,8 +377,8 @@ def scaled(
         raise ValueError("Just one of the arguments `factor`, `acceleration` and `velocity` must be given.")
     ((name, value),) = given.items()
     if name == "factor":
-        return _like(record, samples * float(scalar(name, any_factor(name, value))))
-    value = float(scalar(name, positive(name, value)))
+        return _like(record, samples * _number(name, any_factor(name, value)))
+    value = _number(name, positive(name, value))
     peak = float((peak_acceleration if name == "acceleration" else peak_velocity)(record))
     if not peak > 0:
         raise ValueError("Argument `record` must move, but does not.")

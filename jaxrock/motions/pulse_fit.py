@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, at_least, pair, word_of
-from jaxrock._checks import finite, scalar, shown
+from jaxrock._checks import check_known, finite, scalar, shown
 from jaxrock._described import described
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
@@ -102,6 +102,7 @@ def fit_pulse(
     **Source:** Mavroeidis & Papageorgiou (2003), fits to velocities; Branch, Coleman & Li (1999), the descent.
     """
     check_single(record=record)
+    check_known(record=record)
     if ranges is not None and not isinstance(ranges, Mapping):
         raise ValueError(f"Argument `ranges` must hold pairs by name, but is {shown(ranges)}.")
     problem = _Problem.of(record, pulse, ranges or {}, of)

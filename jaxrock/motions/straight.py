@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrock._checks import is_traced
+from jaxrock._checks import check_known
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
@@ -50,8 +50,7 @@ def straight(motion: AbstractMotion) -> Straight:
     **Raises:** ValueError for many motions in one, or one that is traced.
     """
     check_single(motion=motion)
-    if is_traced(motion):
-        raise ValueError("Argument `motion` must be known: its intensity is no function under `jax.jit` or `jax.vmap`.")
+    check_known(motion=motion)
     if isinstance(motion, Record):
         samples = GRAVITY * np.asarray(motion.samples, float)
         return Straight(samples[:-1], samples[1:], np.full(samples.size - 1, float(motion.dt)))
