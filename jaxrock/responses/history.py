@@ -79,7 +79,8 @@ class Response(AbstractTable):
         - `time`: any shape, between 0 and duration [s].
 
         **Returns:** rotation [rad] and angular velocity [rad/s], of the shape of `time`, to the accuracy of the
-        steps themselves; at an impact the velocity after it. A block that has fallen lies still.
+        steps themselves; at an impact the velocity after it. A block that has fallen lies still (by a linear equation,
+        which knows no flat, from where nothing to come could bring it back).
 
         **Raises:** ValueError for a time outside the history.
         """
