@@ -406,7 +406,7 @@ def test_rocks_that_say_nothing_leave_what_was_known_before(tmp_path, capsys):
     [
         (("shape", "1", "1"), "must name each of amplitude, duration at most once, but names shape"),
         (("duration", "1", "wide"), "must end with two numbers, but is duration 1 wide"),
-        (("duration", "1", "-1"), r"`prior\[1\]` must be positive"),
+        (("duration", "1", "-1"), "must end with a positive median and deviation, but is duration 1 -1"),
     ],
 )
 def test_impossible_priors_of_the_command(tmp_path, capsys, prior, message):
