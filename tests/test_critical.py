@@ -245,3 +245,24 @@ def test_the_amplitude_of_what_is_made_of_a_pulse_is_its_peak():
     factor = float(found.value[0] / rk.intensity.peak_acceleration(motion))
     verdicts = [bool(rk.outcome(block, share * factor * motion, rk.Linear()).overturned) for share in (0.9999, 1.0001)]
     assert sorted(verdicts) == [False, True]
+
+
+@pytest.mark.parametrize("most", [None, 2])
+def test_a_block_that_overturns_at_the_least_amplitude(most):
+    """Its lowest end lies below what was looked at: no number, where infinity would say that it stands."""
+    block, pulse = rk.Block(0.15, 2.5), rk.SinePulse(1.0, 1.5)
+    asked = {"max_ends": most, "derivatives": False, "progress": False}
+    found = rk.critical_amplitudes(block, pulse, intensity=(3.0, 20.0), **asked)
+    assert found.from_the_least and np.isnan(found.lowest)
+    found = rk.critical_amplitudes(block, pulse, intensity=(1.0, 20.0), **asked)
+    assert not found.from_the_least and found.lowest < 3 * 0.15
+
+
+def test_no_motion_is_unexceeded_where_the_least_topples_a_rock():
+    rocks = rk.inverse.Observations([0.15, 0.2], [2.5, 2.0], ["survived"] * 2)
+    found, below = (
+        rk.inverse.unexceeded_motion(rocks, rk.SinePulse, [0.6, 1.5], intensity=(low, 20.0), progress=False)
+        for low in (1.0, 3.0)
+    )
+    assert found.complete.all() and np.isfinite(found.amplitude).all()
+    assert not below.complete.any() and np.isnan(below.amplitude).all()

@@ -796,3 +796,26 @@ def test_slopes_at_the_ends_of_all_levels(level, probability):
         slopes[:, 1], (probabilities(1 + 1e-6) - probabilities(1 - 1e-6))[:, 1] / 2e-6, rtol=1e-6
     )
     np.testing.assert_allclose(jax.jacrev(probabilities)(1.0), slopes, rtol=1e-12)
+
+
+def test_slopes_where_a_knot_is_a_level_of_the_curve():
+    """Beside the closed form of a lognormal fragility, and beside differences."""
+    levels = jnp.array([0.1, 0.2, 0.4, 0.8])
+    curve = rk.hazard.HazardCurve(levels, [1e-2, 3e-3, 5e-4, 5e-5])
+
+    def survival(median):
+        return rk.hazard.survival_probability(rk.hazard.LogNormalFragility(median, 0.35), 1000.0, curve)
+
+    def closed(median):
+        return jnp.exp(-1000 * rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(median, 0.35), curve))
+
+    np.testing.assert_allclose(jax.grad(survival)(0.4), jax.grad(closed)(0.4), rtol=1e-9)
+    np.testing.assert_allclose(jax.hessian(survival)(0.4), jax.hessian(closed)(0.4), rtol=1e-8)
+
+    def rate(levels):
+        return rk.hazard.toppling_rate(rk.hazard.TabulatedFragility(levels, [0.0, 0.2, 0.6, 1.0]), curve)
+
+    for i in (1, 2):
+        step = 1e-6 * jnp.eye(4)[i]
+        difference = (rate(levels + step) - rate(levels - step)) / 2e-6
+        np.testing.assert_allclose(jax.grad(rate)(levels)[i], difference, rtol=1e-5)

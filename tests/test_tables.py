@@ -53,7 +53,7 @@ TABLES = {
     "critical amplitudes": made(
         rk.studies.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)),
         rising=jnp.ones((1, 2)), impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
-        complete=jnp.array([True]), names=("alpha",),
+        complete=jnp.array([True]), from_the_least=jnp.array([False]), names=("alpha",),
     ),
     "fragility intervals": rk.hazard.fragility_intervals([0.2, 0.3, 0.4, 0.5], [0, 1, 0, 1]),
     "estimate": made(

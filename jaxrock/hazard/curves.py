@@ -182,10 +182,14 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     """
     known, exponents = power_laws(curve)
     logarithms = jnp.log(curve.levels)
-    breaks = jnp.clip(jnp.log(knots), logarithms[0], logarithms[-1])
-    breaks = jnp.sort(jnp.concatenate([logarithms, breaks]))
+    breaks, low, high = jnp.log(knots), logarithms[0], logarithms[-1]
+    breaks = jnp.where(breaks <= low, low, jnp.where(breaks >= high, high, breaks))
+    # Of those that come together levels come first, and so in the piece without a length between, which has slopes.
+    breaks = jnp.concatenate([logarithms, breaks])
+    order = jnp.argsort(breaks, stable=True)
+    breaks, passed = breaks[order], jnp.cumsum(order < logarithms.size)[:-1]
     middle, half = (breaks[1:] + breaks[:-1]) / 2, (breaks[1:] - breaks[:-1]) / 2
-    interval = jnp.clip(jnp.searchsorted(logarithms, middle, method="compare_all") - 1, 0, known.size - 1)
+    interval = jnp.clip(passed - 1, 0, known.size - 1)
     start, exponent = jnp.where(known, curve.rates[:-1], 0.0)[interval], exponents[interval]
     nodes = middle[:, None] + half[:, None] * _NODES
     density = (start * exponent)[:, None] * jnp.exp(-exponent[:, None] * (nodes - logarithms[interval][:, None]))

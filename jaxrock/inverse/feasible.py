@@ -98,10 +98,10 @@ class Unexceeded(AbstractTable):
     """The largest motions that all rocks survive, and all weaker ones too.
 
     - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g], as it is given to the motion, up to which every
-      rock stands; infinite where no amplitude that was looked at topples any.
+      rock stands; infinite where no amplitude that was looked at topples any, not a number where the least topples one.
     - `by_rock`: (rocks, n) the same for each rock alone that stands.
     - `weakest`: (n,) the number, from 0, among all rocks of the one that sets it; -1 where none does.
-    - `complete`: (n,) whether every amplitude that was looked at could be decided.
+    - `complete`: (n,) whether every amplitude that was looked at could be decided, and the least topples none.
     """
 
     durations: Float[Array, " n"]
@@ -168,10 +168,11 @@ def unexceeded_motion(
         engine=engine,
         progress=progress,
     )
-    by_rock = (np.asarray(critical.lowest) / np.asarray(own)).reshape(*ways.shape, count).max(axis=0)
+    # Of the two ways round that of a larger motion; NaN, where a rock topples either way from the least on.
+    by_rock = np.fmax.reduce((np.asarray(critical.lowest) / np.asarray(own)).reshape(*ways.shape, count), axis=0)
     amplitude = by_rock.min(axis=0)
-    weakest = np.where(np.isfinite(amplitude), standing[np.argmin(by_rock, axis=0)], -1)
-    complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0)
+    weakest = np.where(np.isposinf(amplitude), -1, standing[np.argmin(by_rock, axis=0)])
+    complete = np.asarray(critical.complete).reshape(-1, count).all(axis=0) & ~np.isnan(amplitude)
     return Unexceeded(*placed((np.asarray(durations), amplitude, by_rock, weakest, complete)))
 
 

@@ -51,6 +51,7 @@ class Critical(AbstractTable):
     - `complete`: whether every point that was looked at could be decided.
     - `names`, `derivative`: (..., ends, parameters) of `value` by the other parameters of the scene; the amplitude of
       a motion stands for its size, and is left out for critical amplitudes.
+    - `from_the_least`: whether the block overturns at the least value that was looked at already.
     """
 
     count: Int[Array, "..."]
@@ -62,11 +63,14 @@ class Critical(AbstractTable):
     derivative: Float[Array, "..."]
     complete: Bool[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
+    from_the_least: Bool[Array, "..."] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
 
     @property
     def lowest(self) -> Float[Array, "..."]:
-        """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none."""
-        return jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
+        """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none, not
+        a number where it overturns at the least that was looked at already: then it lies below."""
+        found = jnp.min(jnp.where(self.rising, self.value, jnp.inf), axis=-1, initial=jnp.inf)
+        return jnp.where(self.from_the_least, jnp.nan, found)
 
     @property
     def _columns(self):
@@ -75,7 +79,7 @@ class Critical(AbstractTable):
         each = {name: getattr(self, name) for name in ("intensity", "rising", "impacts", "balanced")}
         each |= {f"derivative.{name}": slope for name, slope in slopes}
         told = {name: Column(ends, values) for name, values in ({"value": self.value} | each).items()}
-        return told | {name: Column(scenes, getattr(self, name)) for name in ("count", "complete")}
+        return told | {name: Column(scenes, getattr(self, name)) for name in ("count", "complete", "from_the_least")}
 
 
 @arguments
@@ -263,7 +267,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
     def at(z, index):
         return run(_at, z, index)
 
-    brackets, complete = brackets_of(at, np.asarray(grid))
+    brackets, told = brackets_of(at, np.asarray(grid))
     ends = roots_of(at, brackets)
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
@@ -286,8 +290,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
         table[ends["index"], place] = values
         return table
 
-    told = {name: filled(name, values) for name, values in rows.items()}
-    return placed(told | {"count": count, "complete": complete})
+    return placed({name: filled(name, values) for name, values in rows.items()} | told | {"count": count})
 
 
 class _Wanted(eqx.Module):
@@ -326,5 +329,5 @@ def _lowest_of_one(index, scene) -> dict:
     def filled(name, values):
         return jnp.where(found.reshape(-1, *[1] * (values.ndim - 1)), values, _REST[name])
 
-    told = {name: filled(name, values) for name, values in rows.items()}
-    return told | {"count": found.sum(), "complete": ends["complete"]}
+    told = {name: ends[name] for name in ("complete", "from_the_least")} | {"count": found.sum()}
+    return {name: filled(name, values) for name, values in rows.items()} | told

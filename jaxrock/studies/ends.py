@@ -17,8 +17,9 @@ _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth
 _TIGHT = 4e-15  # width of a bracket, relative
 
 
-def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Intervals with one end each; and for every scene whether all points could be decided.
+def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Intervals with one end each; and for every scene whether all points could be decided (`complete`), and whether it
+    overturns at the first (`from_the_least`).
 
     An interval is halved where the verdict changes, until that is all that happens in it; and where an end may hide:
     the margin's tangents meet beyond zero or near it, or both sides overturn after different numbers of impacts (there
@@ -41,7 +42,8 @@ def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], 
         kept.append((index[single], *(x[:, single] for x in sides)))
         sides, index, depth = [x[:, more] for x in sides], index[more], depth[more]
     names = ("index", "z", "margin", "slope", "impacts")
-    return {name: np.concatenate([part[k] for part in kept], axis=-1) for k, name in enumerate(names)}, complete
+    told = {"complete": complete, "from_the_least": margin[:, 0] < 0}
+    return {name: np.concatenate([part[k] for part in kept], axis=-1) for k, name in enumerate(names)}, told
 
 
 def halved(numbers: ModuleType, sides: Sides, values: tuple, depth) -> tuple:

@@ -42,7 +42,8 @@ def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[
     """The `most` lowest ends, without derivatives.
 
     `at`: margin, its slope and impacts at one point. **Returns:** what `ends_of` tells of each, with `found`, whether
-    there is one, and `complete`, whether every point that was looked at could be decided.
+    there is one, `complete`, whether every point that was looked at could be decided, and `from_the_least`, whether it
+    overturns at the first.
     """
     many = jax.vmap(at)
     values = (grid, *many(grid))
@@ -71,7 +72,7 @@ def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[
     complete = ~jnp.isnan(values[1]).any()
     _, kept, complete = jax.lax.while_loop(unfinished, step, (line, kept, complete))
     sides = _closed(many, kept.sides, kept.here, grid[0])
-    return ends_of(jnp, sides) | {"found": kept.here, "complete": complete}
+    return ends_of(jnp, sides) | {"found": kept.here, "complete": complete, "from_the_least": values[1][0] < 0}
 
 
 def _closed(many: Callable, sides: Sides, here: Bool[Array, " n"], elsewhere: Float[Array, ""]) -> Sides:

@@ -56,7 +56,7 @@ def settled(stepper: TaylorStepper, state: State, glide: Glide, strongest: Scala
     """The state with what errors have grown to in a glide; `strongest`: acceleration of the ground [g]."""
     time = glide.time
     count = (state.steps - glide.steps).astype(time.dtype)
-    per_time = 1 / where(count > 0, time, 1.0)
+    per_time = 1 / where(time > 0, time, 1.0)  # there are pieces without a length
     largest = replace(state, opening=glide.opening, velocity=glide.speed)
     angle, velocity = rounded(stepper, largest, strongest, time / jnp.maximum(count, 1.0))
     least = 2 * stepper.rounding * stepper.scene.alpha
@@ -79,7 +79,7 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
     unnoted = reach.one_way | (reach.steady & quiet & ~state.beyond)
     escapes = state.beyond & (start.speed > 0) & (state.piece % _ESCAPES == 0)  # perhaps: now and then it is asked
     stays = (opening > 0) & ((opening >= moments.saddle) == state.beyond) & ~escapes
-    rocks = (state.side != 0) & ~state.uplifting & (reach.room > 0)
+    rocks = (state.side != 0) & ~state.uplifting
     sure = rocks & reach.holds & reach.no_faster(state.fastest) & unnoted & stays
     if scene.falls_flat:
         sure = sure & (opening < jnp.pi / 2)
