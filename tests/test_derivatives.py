@@ -696,6 +696,7 @@ def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
         np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)
 
 
+WAVES = np.sin(0.3 * np.arange(70))
 LAST = rk.RectangularPulse(-0.25, 0.4)
 TOGETHER = {
     "a pulse that begins where another ends": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b), 0.5),
@@ -707,6 +708,8 @@ TOGETHER = {
     ),
     "with the vertical motion": (lambda a, b: rk.SinePulse(0.4, a).with_vertical(rk.CosinePulse(0.2, b)), 0.6),
     "later": (lambda a, b: (rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b)).shifted(a), 0.6),
+    "beside a record": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b) + rk.Record(0.1 * WAVES, 0.02), 0.5),
+    "a record upward, too": (lambda a, b: rk.Record(0.4 * WAVES, a / 25).with_vertical(rk.Record(WAVES, b / 25)), 0.5),
 }
 
 
@@ -745,6 +748,32 @@ def test_a_history_where_knots_come_together():
         ends = [[rotations(x + way * each, *until) for way in (step, -step)] for each in jnp.eye(2)]
         differences = [(above - below) / (2 * step) for above, below in ends]
         np.testing.assert_allclose(jax.jacfwd(rotations)(x, *until), np.stack(differences, axis=1), atol=1e-5)
+
+
+def test_by_all_samples_where_all_knots_come_together():
+    """Two records of one step: in reverse mode by every number of both, of an outcome and a history, as forward."""
+    block = rk.Block(0.2, 2.0, 0.9)
+
+    def outcome(motion):
+        return rk.outcome(block, motion).max_rotation
+
+    def history(motion):
+        return rk.simulate(block, motion, duration=4.0)(jnp.array([1.0, 1.5]))[0].sum()
+
+    first, second = rk.Record(0.4 * WAVES, 0.02), rk.Record(0.2 * np.roll(WAVES, 7), 0.02)
+    for function, motion in (
+        (outcome, first + second),
+        (history, first + second),
+        (outcome, first.with_vertical(second)),
+    ):
+        found = jax.tree.leaves(jax.grad(function)(motion))
+        leaves, structure = jax.tree.flatten(motion)
+        assert [x.size for x in leaves] == [70, 1, 70, 1]
+        for k, at in ((0, 20), (1, 0), (2, 20), (3, 0)):
+            way = [np.zeros(x.shape) for x in leaves]
+            way[k].flat[at] = 1.0
+            _, change = jax.jvp(lambda *x: function(structure.unflatten(x)), leaves, way)  # noqa: B023
+            np.testing.assert_allclose(found[k].ravel()[at], change, rtol=1e-9)
 
 
 def test_nothing_is_lifted_between_knots_that_come_together():

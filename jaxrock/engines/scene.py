@@ -80,6 +80,7 @@ class Scene(eqx.Module):
     knots: Inexact[Array, " knots"]
     scales: Inexact[Array, " knots"] | None  # None: straight lines
     count: Int[Array, ""] | None  # of pieces before the end, where there may be some without length after it
+    following: Int[Array, " knots"] | None  # from each piece on the first that lasts; None: one after the other
     outlook: Outlook
     falls_flat: bool = eqx.field(static=True)
     first: Int[Array, ""] | None = None  # piece, where the motion is one of many that follow one another; None: 0
@@ -127,6 +128,7 @@ class Scene(eqx.Module):
             knots=knots,
             scales=None if motion.scales is None else _endless(motion.scales, None if stretch else count),
             count=count,
+            following=motion.following,
             outlook=Outlook.of(envelope, _least_threshold(moments, far)),
             falls_flat=model.falls_flat,
             first=None if stretch is None else stretch.first,
@@ -190,6 +192,10 @@ class Scene(eqx.Module):
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
         """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
         return jnp.minimum(self.outlook.after_quiet(piece), self.pieces)
+
+    def from_here(self, piece: Int[Array, ""]) -> Int[Array, ""]:
+        """This piece, or, where it does not last, the first after it that does."""
+        return piece if self.following is None else jnp.minimum(self.following[piece], self.pieces)
 
     def length(self, piece: Int[Array, ""]) -> Scalar:
         """How long a piece lasts [s]; the quiet after the motion has no end."""

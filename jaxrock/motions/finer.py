@@ -1,16 +1,20 @@
 """Two motions at once: where the pieces of each lie among the finer ones that end wherever a piece of either ends."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.motions.shaking import Bounds
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import count_below, count_up_to
 
 Scalar = Inexact[Array, ""]
+_FEW = 32  # pieces that are compared, one with all; more are sorted
 
 
 class Place(NamedTuple):
@@ -36,24 +40,33 @@ class Finer(NamedTuple):
         """Where they end, and the first begins [s]."""
         return jnp.sort(jnp.concatenate([self.first, self.second]))  # which keeps the order of those that are alike
 
-    def places(self, piece: Int[Array, ""]) -> tuple[Place, Place]:
-        """Where the two motions are in a finer piece."""
-        return self._places(piece, self.knots[piece], count_up_to, count_below)
+    @property
+    def _passed(self) -> Int[Array, " pieces"]:
+        """How many knots of the first motion come before each finer piece."""
+        first, second, begins = jax.lax.stop_gradient((self.first, self.second, self.knots[:-1, None]))
+        if begins.size > _FEW:
+            knots, is_first = jnp.concatenate([first, second]), jnp.arange(begins.size + 1) < first.size
+            return jnp.cumsum(jax.lax.sort((knots, is_first.astype(jnp.int32)), num_keys=1)[1][:-1])
+        up_to, below = (jnp.sum(each, axis=1, dtype=jnp.int32) for each in (first <= begins, second < begins))
+        return jnp.minimum(up_to, jnp.arange(1, begins.size + 1, dtype=jnp.int32) - below)
 
-    def _places(self, piece, begin, up_to: Callable, below: Callable) -> tuple[Place, Place]:
-        passed = jnp.minimum(up_to(self.first, begin), piece + 1 - below(self.second, begin))
+    @property
+    def following(self) -> Int[Array, " knots"] | None:
+        """For each finer piece, and for what comes after them, the first from there on that lasts; None: they are few,
+        and one after the other is as quick."""
+        knots = self.knots
+        return _following(knots) if knots.size > _FEW else None
+
+    def places(self, piece: Int[Array, "..."]) -> tuple[Place, Place]:
+        """Where the two motions are in finer pieces."""
+        passed = self._passed[piece]
         return _place(self.first, passed - 1), _place(self.second, piece - passed)
 
     def spread(self, *values: Inexact[Array, " _"] | None, quiet: float) -> list[Any]:
         """Values of the pieces of either motion (None: it has none) for the finer ones; `quiet` where it is still, and
         in pieces without a length, where both never are at once."""
         begins, lasting = self.knots[:-1], jnp.diff(self.knots) > 0
-        places = self._places(
-            jnp.arange(begins.size),
-            begins,
-            lambda knots, x: jnp.searchsorted(knots, x, side="right"),
-            lambda knots, x: jnp.searchsorted(knots, x, side="left"),
-        )
+        places = self.places(jnp.arange(begins.size))
         return [
             None if each is None else where(place.moving & lasting, each[place.piece], quiet)
             for place, each in zip(places, values)
@@ -73,6 +86,22 @@ class Finer(NamedTuple):
             terms = None if each is None else each(place.piece, begin - knots[place.piece] + local, unit, order)
             found.append(None if terms is None else [where(place.moving, u, 0.0) for u in terms])
         return found
+
+
+@jax.custom_jvp
+def _following(knots: Inexact[Array, " knots"]) -> Int[Array, " knots"]:
+    numbers = jnp.arange(knots.size, dtype=jnp.int32)
+    last = numbers[-1:]
+    lasting = where(jnp.diff(knots) > 0, numbers[:-1], last)
+    return jax.lax.cummin(jnp.concatenate([lasting, last]), reverse=True)
+
+
+@functools.partial(_following.defjvp, symbolic_zeros=True)
+def _(knots, changes):
+    # Of knots that come together one may go: a piece without a length has derivatives, and is not passed over.
+    still = isinstance(changes[0], SymbolicZero)
+    found = _following(*knots) if still else jnp.arange(knots[0].size, dtype=jnp.int32)
+    return found, np.zeros(found.shape, jax.dtypes.float0)
 
 
 def _place(knots: Inexact[Array, " knots"], piece: Int[Array, "..."]) -> Place:

@@ -55,6 +55,12 @@ class AbstractMotion(Owner):
         return None
 
     @property
+    def following(self) -> Int[Array, " knots"] | None:
+        """For each piece, and for what comes after the last, the first from there on that lasts; None: there is nothing
+        to pass over, or not much."""
+        return None
+
+    @property
     @abc.abstractmethod
     def scales(self) -> Inexact[Array, " pieces"] | None:
         """Time in which the acceleration of each piece changes [s]; infinite for a straight line. None: all are."""
@@ -183,6 +189,10 @@ class AtTheSameTimes(_Changed):
         return self.motion.lateness
 
     @property
+    def following(self) -> Int[Array, " knots"] | None:
+        return self.motion.following
+
+    @property
     def scales(self) -> Inexact[Array, " pieces"] | None:
         return self.motion.scales
 
@@ -238,6 +248,11 @@ class Shifted(_Changed):
         return self.motion.lateness
 
     @property
+    def following(self) -> Int[Array, " knots"] | None:
+        inner = self.motion.following
+        return None if inner is None else jnp.concatenate([jnp.zeros_like(inner[:1]), inner + 1])
+
+    @property
     def scales(self) -> Inexact[Array, " pieces"] | None:
         scales = self.motion.scales
         return None if scales is None else jnp.concatenate([jnp.full_like(scales[:1], jnp.inf), scales])
@@ -287,6 +302,10 @@ class _Together(AbstractMotion):
     @property
     def lateness(self) -> Scalar | None:
         return _lateness(self.knots, *self._both)
+
+    @property
+    def following(self) -> Int[Array, " knots"] | None:
+        return self._finer.following
 
     @property
     def scales(self) -> Inexact[Array, " pieces"] | None:

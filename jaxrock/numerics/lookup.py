@@ -1,7 +1,5 @@
 """Looking up a value by a number that differs from lane to lane."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Int, Shaped
@@ -23,23 +21,14 @@ def pick(values: Shaped[Array, " n"], index: Int[Array, ""] | int) -> Shaped[Arr
 
 def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Array, ""]:
     """How many of some sorted values are not larger than x; without derivatives."""
-    return _count(values, x, jnp.less_equal)
-
-
-def count_below(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Array, ""]:
-    """How many of some sorted values are smaller than x; without derivatives."""
-    return _count(values, x, jnp.less)
-
-
-def _count(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""], counts: Callable) -> Int[Array, ""]:
     values, x = jax.lax.stop_gradient((values, jnp.asarray(x)))
     if values.shape[0] <= _FEW:
-        return jnp.sum(counts(values, x), dtype=jnp.int32)
+        return jnp.sum(values <= x, dtype=jnp.int32)
 
     def halved(carry):
         low, high = carry
         middle = (low + high) >> 1
-        below = counts(values[middle], x)
+        below = values[middle] <= x
         return where(below, middle + 1, low), where(below, high, middle)
 
     ends = jnp.int32(0), jnp.int32(values.shape[0])

@@ -77,7 +77,8 @@ def onward(stepper: TaylorStepper, state: State, glide: Glide) -> tuple[State, G
     swing = reach.room * jnp.abs(start.speed)  # no turning point is further off
     quiet = where(reach.slows, start.opening + swing <= glide.low, start.opening - swing >= glide.high)
     unnoted = reach.one_way | (reach.steady & quiet & ~state.beyond)
-    escapes = state.beyond & (start.speed > 0) & (state.piece % _ESCAPES == 0)  # perhaps: now and then it is asked
+    asked = state.piece % _ESCAPES < (1 if scene.following is None else 2)  # of two pieces one may be passed over
+    escapes = state.beyond & (start.speed > 0) & asked  # perhaps: now and then
     stays = (opening > 0) & ((opening >= moments.saddle) == state.beyond) & ~escapes
     rocks = (state.side != 0) & ~state.uplifting
     sure = rocks & reach.holds & reach.no_faster(state.fastest) & unnoted & stays
