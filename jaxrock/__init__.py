@@ -25,6 +25,7 @@ from jaxrock._surface import shown as _shown
 from jaxrock.blocks import restitution as restitution
 from jaxrock.blocks.rigid import Block as Block
 from jaxrock.engines.taylor.careful import Series as Series
+from jaxrock.keeping.changes import changes as _changes
 from jaxrock.keeping.compiled import keep_compiled as keep_compiled
 from jaxrock.models.rigid import (
     Housner as Housner,
@@ -95,3 +96,6 @@ _NAMESPACES = """
 
 def __dir__() -> list[str]:
     return sorted({*_shown(globals(), *_NAMESPACES.split()), *_LATER, "Diffrax"})
+
+
+_changes()  # looks at what has been imported: what differs later was changed

@@ -206,3 +206,17 @@ def test_what_is_refused(choose, error, message):
 def test_a_suite_is_a_sequence():
     assert [motion.samples.size for motion in SUITE] == list(LENGTHS)
     assert SUITE[-1].samples.size == LENGTHS[-1] and MIXED[1].acceleration(0.125) == pytest.approx(0.4)
+
+
+def test_compiled_functions_do_not_see_names():
+    """One program serves records of all names: what reads the name finds none, where it would find the first one's."""
+    seen, records = [], [rk.Record([0.1, 0.2], 0.1, name) for name in ("first", "second")]
+
+    @jax.jit
+    def twice(record):
+        seen.append((record.name, record.origin.event))
+        return 2 * record.samples
+
+    for record in records:
+        twice(record)
+    assert seen == [("", "")] and [record.name for record in records] == ["first", "second"]

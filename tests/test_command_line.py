@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.command_line import output
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
@@ -190,6 +192,21 @@ def test_output_that_cannot_be_written(monkeypatch, capsys, words, error, status
     monkeypatch.setattr(sys, "stdout", Unwritable(error))
     assert main(words) == status
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize("kind", ["table", "figure"])
+def test_a_file_is_there_whole_or_not_at_all(monkeypatch, tmp_path, kind):
+    """The disk is full in the middle of it; the message says of which."""
+
+    def half(file, *_, **__):
+        Path(file).write_text("0.1,")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savetxt", half)
+    figure, path, report = types.SimpleNamespace(savefig=half), tmp_path / "map.png", output.Report("map", quiet=True)
+    with pytest.raises(OSError, match=r"map.png cannot be written: No space left on device"):
+        output.write_csv(report, path, "x", [1.0]) if kind == "table" else output.save(report, figure, path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_found_before_the_work(monkeypatch, capsys, at2, tmp_path):

@@ -14,9 +14,10 @@ import pytest
 
 import jaxrock as rk
 from jaxrock._arguments import path_of
+from jaxrock.command_line.main import main
+from jaxrock.engines import scene
 from jaxrock.keeping import facts, folder
 from jaxrock.sweeps.store import local
-from jaxrock.transforms import lowering
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 
@@ -233,14 +234,13 @@ def test_another_version_of_the_package_asks_anew(place, monkeypatch):
         jax.clear_caches()
         return float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **QUICK).max_rotation)
 
-    exports = []
-    exported = lowering._exported
-    monkeypatch.setattr(lowering, "_exported", lambda *given: exports.append(1) or exported(*given))
-    first = ask()
-    assert len(exports) == 1
-    assert ask() == first and len(exports) == 1
+    def exports():
+        return len(list((place / "lowered").iterdir()))
+
+    first, once = ask(), exports()
+    assert ask() == first and exports() == once > 0
     monkeypatch.setattr(facts, "versions", lambda: "another")
-    assert ask() == first and len(exports) == 2
+    assert ask() == first and exports() == 2 * once
 
 
 def test_settings_are_told_by_their_values():
@@ -252,8 +252,7 @@ def test_settings_are_told_by_their_values():
 
 def test_code_that_changed_since_it_was_imported_is_not_kept(monkeypatch):
     def asked():
-        facts.code.cache_clear()
-        facts.versions.cache_clear()
+        facts._on_disk.cache_clear()
         return facts.versions()
 
     known = asked()
@@ -263,6 +262,67 @@ def test_code_that_changed_since_it_was_imported_is_not_kept(monkeypatch):
     assert asked() == known
 
 
+def test_a_package_without_its_text_is_told_by_what_there_is(tmp_path):
+    for name, kept in {"text": "base.py", "compiled": "base.pyc", "archive": None}.items():
+        root = tmp_path / name
+        (root / "package" / "__pycache__").mkdir(parents=True)
+        (root / "package" / "__pycache__" / "base.cpython.pyc").touch()
+        if kept is None:
+            root = root / "whole.zip"
+            root.touch()
+        else:
+            (root / "package" / kept).touch()
+        assert [path for path, *_ in facts._files(root / "package")] == [root / "package" / kept if kept else root]
+
+
+def test_a_file_under_the_name_of_another_is_not_read(place):
+    for name in "ab":
+        folder.write("kind", name, name.encode())
+    os.replace(place / "kind" / "a", place / "kind" / "b")
+    assert folder.read("kind", "b") is None
+
+
+@pytest.mark.parametrize("said", ["off", "OFF", " off ", "0", "no", "False"])
+def test_nothing_is_kept_where_the_environment_says_so(monkeypatch, said):
+    monkeypatch.setenv("JAXROCK_CACHE", said)
+    assert folder.folder() is None
+
+
+@pytest.mark.parametrize("kind", ["a class", "a module", "code in place"])
+def test_what_is_patched_asks_anew_and_is_kept_for_nobody_else(place, monkeypatch, kind):
+    """A test that patches the package, a notebook that loads an edited module again."""
+
+    def ask():
+        jax.clear_caches()
+        return float(rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.5, 0.61), **QUICK).max_rotation)
+
+    def weaker(self, piece, local, unit, order):
+        return [0.5 * x for x in genuine(self, piece, local, unit, order)]
+
+    def patch(monkeypatch):
+        if kind == "a class":
+            monkeypatch.setattr(rk.SinePulse, "series", weaker)
+        elif kind == "a module":
+            monkeypatch.setattr(scene, "peak_bound", weaker)
+            monkeypatch.setattr(scene, "sum_of_series", weaker)
+        else:
+            monkeypatch.setattr(
+                rk.RickerPulse.series, "__code__", rk.RickerPulse.series.__code__.replace(co_firstlineno=1)
+            )
+
+    genuine, known = rk.SinePulse.series, facts.versions()
+    for first in ("patched", "as it is"):
+        monkeypatch.setenv("JAXROCK_CACHE", str(place / first))
+        answers = {}
+        for now in (first, *({"patched", "as it is"} - {first}), first):
+            with monkeypatch.context() as patched:
+                if now == "patched":
+                    patch(patched)
+                assert (facts.versions() == known) == (now == "as it is")
+                assert answers.setdefault(now, ask()) == ask()
+        assert (answers["patched"] != answers["as it is"]) == (kind == "a class")
+
+
 def test_a_folder_that_vanishes(place, monkeypatch):
     def gone(largest):
         raise FileNotFoundError
@@ -270,3 +330,18 @@ def test_a_folder_that_vanishes(place, monkeypatch):
     monkeypatch.setattr(folder, "prune", gone)
     folder.write("kind", "name", b"content")
     assert folder.read("kind", "name") == b"content"
+
+
+def test_what_cannot_be_deleted_is_said(place, capsys, tmp_path):
+    """Also where the folder is a link to another file system."""
+    (tmp_path / "elsewhere").mkdir()
+    place.parent.mkdir(exist_ok=True)
+    place.symlink_to(tmp_path / "elsewhere")
+    folder.write("kind", "name", b"content")
+    assert main(["cache", "--clear"]) == 0 and not folder.kept()
+    assert "1 compiled programs" in capsys.readouterr().out
+    folder.write("kind", "name", b"content")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as where nothing may be written
+        assert main(["cache", "--clear"]) == 2
+    assert "1 of 1 files" in capsys.readouterr().err and folder.kept()

@@ -255,3 +255,19 @@ def test_a_block_that_cannot_have_the_groups_is_refused():
     others = similarity.groups_of(rk.Block(0.3, 2.0, 0.85), rk.ExponentialPulse(0.5, 0.8, shape=1.0))
     with pytest.raises(ValueError, match=r"`form` must have the parameters \['shape'\] of the groups"):
         similarity.motion(others, rk.Block(0.3, 2.0, 0.85), rk.SinePulse)
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        (lambda: orientations.product(radius=0.5, gravity=-0.5, frequency=1), "`radius` must be a whole number"),
+        (lambda: orientations.product(rotation="1"), "`rotation` must be a whole number, but is '1'"),
+        (lambda: orientations.power("x", 0.5), "`exponent` must be a whole number, but is 0.5"),
+        (lambda: orientations.power("w", 2), "`orientation` must be"),
+        (lambda: orientations.of_series("z", [0.5]), "`exponent` must be a whole number"),
+    ],
+)
+def test_orientations_have_whole_powers(wrong, said):
+    """The root of g R has no orientation that anyone could tell."""
+    with pytest.raises(ValueError, match=said):
+        wrong()

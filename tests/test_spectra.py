@@ -315,3 +315,18 @@ def test_slopes_beside_a_point_that_overturns():
     differences = (peaks(at + 1e-6) - peaks(at - 1e-6)) / 2e-6
     for slopes in (jax.jacfwd(peaks)(at), jax.jacrev(peaks)(at)):
         np.testing.assert_allclose(slopes, jnp.where(jnp.isinf(found), 0.0, differences), rtol=1e-6, atol=1e-7)
+
+
+def test_numbers_of_single_precision_are_as_exact_as_they_are():
+    """Numbers that single precision holds exactly, among others of double precision: the same results to the bit."""
+    ratios, intensities, periods = np.array([2.0, 3.0]), np.array([1.5, 2.5]), np.array([2.0, 4.0])
+    exact, single = (
+        (
+            rk.overturning_map(ratios.astype(kind), intensities.astype(kind), alpha=0.2, **QUICK),
+            rk.rocking_spectrum(0.2, rk.SinePulse(0.5, 0.7), periods.astype(kind), **QUICK),
+        )
+        for kind in (np.float64, np.float32)
+    )
+    for a, b in zip(exact, single):
+        np.testing.assert_array_equal(a.margin, b.margin)
+        np.testing.assert_array_equal(a.max_rotation, b.max_rotation)

@@ -21,7 +21,10 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     size = sum(file.stat().st_size for file in files) / 2**20
     programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
     if arguments.clear:
-        shutil.rmtree(place, ignore_errors=True)
+        for each in place.iterdir() if place.is_dir() else ():  # which may be a link, and stays
+            shutil.rmtree(each, ignore_errors=True)
+        if left := [file for file in kept() if file.exists()]:
+            raise OSError(f"{len(left)} of {len(files)} files in {place} cannot be deleted, such as {left[0]}")
     report.results |= {"folder": str(place), "programs": programs, "mebibytes": size, "deleted": arguments.clear}
     report.say(f"{programs} compiled programs, {size:.1f} MiB, {'deleted from' if arguments.clear else 'in'} {place}")
 

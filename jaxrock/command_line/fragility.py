@@ -9,7 +9,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_description, add_restitution, check_points, check_range, model_of, number
-from jaxrock.command_line.output import Entry, Report, save, write_csv
+from jaxrock.command_line.output import Entry, Report, save, whole, write_csv
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +90,7 @@ def _write(
     header = f"{found.measure},lower,upper"
     write_csv(report, folder / "fragility.csv", header, found.levels, found.lower, found.upper)
     columns = found.table()
-    with (folder / "stripes.csv").open("w", newline="") as file:
+    with whole(folder / "stripes.csv") as aside, aside.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))

@@ -11,7 +11,7 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import check_points, check_range, extent_of, model_of, number, other_parameters
-from jaxrock.command_line.output import Report, plain
+from jaxrock.command_line.output import Report, plain, whole
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
@@ -171,13 +171,13 @@ def _write(
     """Tables and the figure; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / name for name in ("estimate.csv", "probabilities.csv", "region.csv", "region.png")]
-    with files[0].open("w") as file:
+    with whole(files[0]) as aside, aside.open("w") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
         for name, value, interval, open_ in _rows(estimate):
             ends = ",".join(f"{float(x):.6g}" for x in interval)
             flags = ",".join(str(int(x)) for x in open_)
             print(f"{name},{UNITS.get(name, '')},{float(value):.6g},{ends},{flags}", file=file)
-    with files[1].open("w") as file:
+    with whole(files[1]) as aside, aside.open("w") as file:
         shapes = _shapes(observations)
         print(f"name,{','.join(shapes)},observed,probability", file=file)
         known = np.asarray(observations.seen), np.asarray(estimate.probability)
@@ -188,17 +188,19 @@ def _write(
     rows, columns = np.meshgrid(*region.values, indexing="ij")
     header = ",".join(f"{name}_{UNITS.get(name, '')}" for name in region.names) + ",log_likelihood,allowed"
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
-    np.savetxt(files[2], np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
+    with whole(files[2]) as aside:
+        np.savetxt(aside, np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
     if wall is not None:
         files.append(folder / "unexceeded.csv")
-        with files[-1].open("w") as file:
+        with whole(files[-1]) as aside, aside.open("w") as file:
             print("duration_s,amplitude_g,rock,complete", file=file)
             columns = map(np.asarray, (wall.durations, wall.amplitude, wall.weakest, wall.complete))
             for duration, amplitude, rock, complete in zip(*columns):
                 name = _quoted(observations.names[int(rock)]) if rock >= 0 else ""
                 print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
     figure: Any = rk.plot.feasible_region(region, estimate, wall).figure
-    figure.savefig(files[3], dpi=150)
+    with whole(files[3]) as aside:
+        figure.savefig(aside, dpi=150, format="png")
     return files
 
 

@@ -20,7 +20,7 @@ from jaxrock.command_line.output import Entry, Report, check_surface, save, writ
 # Across and up, and whether they are those of single lobes; the range that is drawn, and what it is.
 _AXES = {
     "frequency_ratio": (False, (0.3, 8.0), "2 pi/period of the pulse over p"),
-    "intensity": (False, (1.02, 10.0), "peak acceleration over the uplift threshold"),
+    "intensity": (False, (1.02, 10.0), "peak acceleration (amplitude of the pulse) over the uplift threshold"),
     "pulse_duration": (
         True,
         (0.05, 8.0),

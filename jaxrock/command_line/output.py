@@ -4,12 +4,14 @@ import contextlib
 import json
 import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import jaxrock as rk
+from jaxrock._aside import written_aside
 
 
 class Entry(NamedTuple):
@@ -103,15 +105,27 @@ def plain(value: Any) -> Any:
 
 def write_csv(report: Report, path: Path, header: str, *columns) -> None:
     """Write columns of numbers, under a header of names with commas between them."""
-    np.savetxt(path, np.column_stack([np.asarray(c, dtype=float) for c in columns]), delimiter=",", header=header,
-               comments="", fmt="%.12g")  # fmt: skip
+    table = np.column_stack([np.asarray(column, dtype=float) for column in columns])
+    with whole(path) as aside:
+        np.savetxt(aside, table, delimiter=",", header=header, comments="", fmt="%.12g")
     report.wrote(path)
 
 
 def save(report: Report, figure, path: Path) -> None:
     """Write a figure."""
-    figure.savefig(path, dpi=150)
+    with whole(path) as aside:
+        figure.savefig(aside, dpi=150, format=path.suffix[1:])
     report.wrote(path)
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that is there whole or not at all; an error says which file it was."""
+    try:
+        with written_aside(path, replace=True, lasting=False) as aside:
+            yield aside
+    except OSError as error:
+        raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def check_surface(report: Report, status: rk.Status) -> None:

@@ -9,6 +9,7 @@ import enum
 import functools
 import hashlib
 import importlib.metadata
+import os
 import platform
 import sys
 import uuid
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._label import Label
+from jaxrock.keeping import changes
 from jaxrock.keeping.folder import name_of
 
 _OWN = __name__.split(".")[0]
@@ -32,32 +34,56 @@ class _Unknown(Exception):
     """Something that only tracing can tell."""
 
 
+_CHANGED = " with changes "
+_known: set[str] = set()  # what has been told while the package was as it was imported
+
+
 def facts(tree: Any) -> str | None:
-    """A text that two trees share if they are alike but for the numbers in their arrays; None: nobody can tell."""
+    """A text that two trees share if they are alike but for the numbers in their arrays, and the package is the same;
+    None: nobody can tell."""
     try:
-        return _told(tree)
+        told = _told(tree)
     except _Unknown:
         return None
+    # To look takes a thousandth of a second: at what is asked for the first time, and always once anything was changed.
+    if told in _known and not changes.any_seen():
+        return told
+    found = changes.changes()
+    if not found:
+        _known.add(told)
+    return f"{told}{_CHANGED}{found}" if found else told
 
 
-def _files() -> list[tuple[Path, int, int]]:
-    paths = sorted(Path(__file__).parents[1].rglob("*.py"))
-    return [(path, (about := path.stat()).st_mtime_ns, about.st_size) for path in paths]
+def still_hold(told: str) -> bool:
+    """Whether the package is as it was when these facts were told."""
+    found = changes.changes()
+    return f"{_CHANGED}{found}" in told if found else _CHANGED not in told
+
+
+def _files(root: Path = Path(__file__).parents[1]) -> list[tuple[Path, int, int]]:
+    """What the package is imported from: its modules, as text or compiled, or the archive that holds them."""
+    found = sorted(root.rglob("*.py")) or sorted(x for x in root.rglob("*.pyc") if x.parent.name != "__pycache__")
+    found = found or [x for x in root.parents if x.is_file()]
+    return [(path, (about := path.stat()).st_mtime_ns, about.st_size) for path in found]
 
 
 _AT_IMPORT = _files()
 
 
 @functools.cache
-def code() -> str:
-    """Digest of the package's own code; where the code on disk is not what this process has imported, something that is
-    never asked for again."""
-    if _files() != _AT_IMPORT:
+def _on_disk() -> str:
+    if not _AT_IMPORT or _files() != _AT_IMPORT:
         return uuid.uuid4().hex
     root = Path(__file__).parents[1]
     return name_of(
-        *(f"{path.relative_to(root)} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path, *_ in _AT_IMPORT)
+        *(f"{os.path.relpath(path, root)} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path, *_ in _AT_IMPORT)
     )
+
+
+def code() -> str:
+    """Digest of the package's own code, and of what has been changed in it since; where the code on disk is not what
+    this process has imported, something that is never asked for again."""
+    return _on_disk() + changes.changes()
 
 
 def version_of(name: str) -> str:
@@ -69,10 +95,13 @@ def version_of(name: str) -> str:
 
 
 @functools.cache
+def _stood_on() -> str:
+    return name_of(platform.machine(), platform.system(), platform.python_version(), *map(version_of, _VERSIONS))
+
+
 def versions() -> str:
     """Digest of the package's own code, the versions of what it stands on, and the kind of this machine."""
-    kind = (platform.machine(), platform.system(), platform.python_version())
-    return name_of(*kind, *map(version_of, _VERSIONS), code())
+    return name_of(_stood_on(), code())
 
 
 def settings() -> str:

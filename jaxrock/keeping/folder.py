@@ -1,7 +1,7 @@
 """The folder of what is kept: any number of processes may read and write it, and what is damaged is made again.
 
-A file begins with the digest of the rest, is written aside, and renamed: a reader finds all of it or nothing. When the
-folder has grown too large, what has not been used for longest goes first.
+A file begins with a digest of its name and the rest, is written aside, and renamed: a reader finds all of it or
+nothing. When the folder has grown too large, what has not been used for longest goes first.
 """
 
 import contextlib
@@ -17,14 +17,15 @@ from jaxrock._aside import written_aside
 LARGEST = 2**30  # bytes
 _OWN = "jaxrock-compiled"  # within a folder that the user names, where other things may lie: all of this may be deleted
 OF_JAX = "xla"  # the part that JAX looks after (see `compiled`)
+_OFF = ("off", "no", "none", "false", "0")
 _DIGEST = hashlib.sha256().digest_size
 _PATIENCE = 600  # seconds after which a file that was never finished is nobody's
 
 
 def folder() -> Path | None:
-    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that is `off`."""
-    said = os.environ.get("JAXROCK_CACHE", "")
-    if said == "off":
+    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that says `off`."""
+    said = os.environ.get("JAXROCK_CACHE", "").strip()
+    if said.lower() in _OFF:
         return None
     return Path(os.path.expanduser(said)) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
 
@@ -44,7 +45,7 @@ def read(kind: str, name: str) -> bytes | None:
         content = path.read_bytes()
     except OSError:
         return None
-    if content[:_DIGEST] != hashlib.sha256(content[_DIGEST:]).digest():
+    if content[:_DIGEST] != _digest(kind, name, content[_DIGEST:]):
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -61,11 +62,16 @@ def write(kind: str, name: str, content: bytes) -> None:
     try:
         (place / kind).mkdir(parents=True, exist_ok=True)
         with written_aside(place / kind / name, replace=True, lasting=False) as aside:
-            aside.write_bytes(hashlib.sha256(content).digest() + content)
+            aside.write_bytes(_digest(kind, name, content) + content)
     except OSError:
         return
     with contextlib.suppress(OSError):  # somebody may be deleting all of it
         prune(LARGEST)
+
+
+def _digest(kind: str, name: str, content: bytes) -> bytes:
+    """Of a file and its name: another's content is not taken for it."""
+    return hashlib.sha256(f"{kind}/{name}\n".encode() + content).digest()
 
 
 def prune(largest: int) -> None:

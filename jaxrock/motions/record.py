@@ -74,7 +74,8 @@ class Record(Straight):
     - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1. Or (..., n) of many records of one
       length, for use under `jax.vmap`.
     - `dt`: time between samples [s], positive.
-    - `name`: where it comes from; shown in tables and figures.
+    - `name`: where it comes from; shown in tables and figures. Compiled functions do not see it: one serves all names,
+      and a record that it returns has the name that the first one had.
     - `origin`: an `Origin`, what a file says of it; None: nothing.
 
     **Raises:** ValueError for samples that are not finite numbers, a column (n, 1) in place of them, or dt <= 0.
@@ -104,13 +105,17 @@ class Record(Straight):
 
     @property
     def name(self) -> str:
-        """Where the record comes from."""
-        return self.label.value[0]
+        """Where the record comes from; empty within `jax.jit` and the like, whose programs serve all names."""
+        return self._told[0]
 
     @property
     def origin(self) -> Origin:
-        """What its file says of it."""
-        return self.label.value[1]
+        """What its file says of it; empty where the name is."""
+        return self._told[1]
+
+    @property
+    def _told(self) -> tuple[str, Origin]:
+        return ("", Origin()) if is_traced(self.samples) else self.label.value
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:

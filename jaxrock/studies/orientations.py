@@ -11,9 +11,10 @@ angles and accelerations grow alike, which no orientation knows.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
-from jaxrock._checks import one_of
+from jaxrock._checks import one_of, shown
 
 __all__ = ["ORIENTATIONS", "QUANTITIES", "Quantity", "combined", "of_series", "power", "product"]
 
@@ -72,9 +73,12 @@ def combined(first: str, second: str) -> str:
 def power(orientation: str, exponent: int) -> str:
     """The orientation of a whole power: its own if that is odd, none if it is even.
 
+    **Raises:** ValueError for an exponent that is not whole: of a root of a square nothing tells which it is.
+
     **Source:** Dimitrakopoulos & DeJong (2012), equation 4.5.
     """
-    return one_of("orientation", orientation, ORIENTATIONS) if exponent % 2 else "0"
+    own = one_of("orientation", orientation, ORIENTATIONS)
+    return own if _whole("exponent", exponent) % 2 else "0"
 
 
 def of_series(orientation: str, exponents: Iterable[int]) -> str:
@@ -101,13 +105,19 @@ def product(**exponents: int) -> Quantity:
 
     **Returns:** a `Quantity`; where `is_pure`, the product is a dimensionless and orientationless group.
 
-    **Raises:** ValueError for other names.
+    **Raises:** ValueError for other names, and for exponents that are not whole numbers.
 
     **Source:** Dimitrakopoulos & DeJong (2012), equations 4.7 to 4.9.
     """
     length, time, orientation = 0, 0, "0"
     for name, exponent in exponents.items():
-        one = QUANTITIES[one_of("name", name, tuple(QUANTITIES))]
+        one, exponent = QUANTITIES[one_of("name", name, tuple(QUANTITIES))], _whole(name, exponent)
         length, time = length + exponent * one.length, time + exponent * one.time
         orientation = combined(orientation, power(one.orientation, exponent))
     return Quantity(length, time, orientation)
+
+
+def _whole(name: str, exponent: Any) -> int:
+    if isinstance(exponent, Real) and not isinstance(exponent, bool) and float(exponent).is_integer():
+        return round(float(exponent))
+    raise ValueError(f"Argument `{name}` must be a whole number, but is {shown(exponent)}.")

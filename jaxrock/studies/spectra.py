@@ -170,7 +170,9 @@ def self_similar_spectrum(
     **Arguments:**
 
     - `frequency_ratio`: (n,) values of omega/p [-], positive, omega = 2 pi/period of the pulse.
-    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive.
+    - `intensity`: (rows,) peak acceleration over the uplift threshold [-], positive. What is taken for the peak is the
+      pulse's `amplitude`: of a `MavroeidisPapageorgiouPulse`, and a `RickerPulse` with a `center` of its own, the peak
+      is lower (`rk.intensity.peak_acceleration`).
     - `pulse_duration`, `uplift_strength`: (n,) and (rows,) the same axes in other numbers, each in place of one of the
       two: p times the duration (or period) of the pulse, and uplift threshold over peak acceleration [-], positive.
     - `alpha`, `restitution`: of the block. In the linear model alpha plays no part.
@@ -350,16 +352,25 @@ def _kept(result: Outcome, block: Block) -> dict:
 
 def _under_motion(period, scene):
     alpha, restitution, motion, model, engine = scene
+    alpha, period = _in_one_precision(alpha, period, of=motion)
     block = Block(alpha, 2 * jnp.pi / period, restitution)
     return _kept(outcome(block, motion, model, engine=engine), block)
 
 
 def under_pulse(*point_and_scene) -> tuple[Outcome, Block]:
     """The outcome at one point, and the block: `(*parameters, intensity, ratio, scene)`."""
-    *parameters, intensity, ratio, (alpha, restitution, pulse, model, engine) = point_and_scene
+    *point, (alpha, restitution, pulse, model, engine) = point_and_scene
+    alpha, *parameters, intensity, ratio = _in_one_precision(alpha, *point)
     block = Block(alpha, jnp.ones_like(alpha), restitution)
     motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / ratio, *parameters)
     return outcome(block, motion, model, engine=engine), block
+
+
+def _in_one_precision(*numbers: Array, of: Any = ()) -> list[Array]:
+    """The numbers as precise as the most precise of them, and of what a tree holds: else what is made of one alone has
+    its digits, and no more."""
+    kind = jnp.result_type(*numbers, *jax.tree.leaves(of))
+    return [x.astype(kind) for x in numbers]
 
 
 def _under_pulse(*point_and_scene) -> dict:

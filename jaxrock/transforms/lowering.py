@@ -64,17 +64,18 @@ def _inlined(program: jax.export.Exported, context, leaves) -> Sequence:
 def _kept(lanes: Lanes, leaves) -> tuple[jax.export.Exported, list[str]] | None:
     """The same as it was exported, in this session or another, and the machine code that it calls; None where that
     cannot be."""
-    if lanes.recipe.facts is None or not lanes.on_cpu or lanes.portable or folder.folder() is None:
+    told = lanes.recipe.facts
+    if told is None or not lanes.on_cpu or lanes.portable or folder.folder() is None or not facts.still_hold(told):
         return None
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     name = folder.name_of(
-        facts.versions(), facts.settings(), lanes.machine, lanes.recipe.facts, lanes.own, lanes.size, lanes.threads,
+        facts.versions(), facts.settings(), lanes.machine, told, lanes.own, lanes.size, lanes.threads,
         [(x.shape, x.dtype) for x in shapes],
     )  # fmt: skip
     content = folder.read("lowered", name)
     if content is not None:
-        told, _, program = content.partition(b"\n")
-        codes = json.loads(told)
+        called, _, program = content.partition(b"\n")
+        codes = json.loads(called)
         if all(map(lanes.found, codes)):
             return jax.export.deserialize(bytearray(program)), codes
     _LOG.info("compiling, once for this machine")

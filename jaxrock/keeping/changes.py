@@ -1,0 +1,98 @@
+"""Whether the package is in this process still what it was: a test may patch it, a notebook load a module anew.
+
+What is kept on disk is found by names and by the digest of the package's files, which tell nothing of that.
+"""
+
+import hashlib
+import marshal
+import sys
+import types
+import uuid
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+_OWN, _OURS = __name__.split(".")[0], __name__.rpartition(".")[0]  # what is kept does not depend on how
+_PLAIN = (bool, int, float, str, bytes, type(None))
+
+
+class _Space(NamedTuple):
+    """The names of a module or of a class, as they were when they were first looked at."""
+
+    of: str
+    names: Mapping[str, Any]  # now
+    before: dict[str, Any]
+    many: int  # how many names there were
+    codes: list[tuple[str, types.FunctionType, types.CodeType]]  # of its functions, and of those within what wraps them
+
+    @classmethod
+    def at(cls, of: str, names: Mapping[str, Any]) -> "_Space":
+        before = {name: value for name, value in list(names.items()) if not name.startswith("__") or _function(value)}
+        functions = [(name, function) for name, value in before.items() if (function := _function(value)) is not None]
+        return cls(of, names, before, len(names), [(name, function, function.__code__) for name, function in functions])
+
+    def changed(self) -> list[str]:
+        """What differs now; a name that is new matters if it stands for a function, which may hide one of a base."""
+        names, before = self.names, self.before
+        found = [name for name, value in before.items() if names.get(name, self) is not value]
+        found += [name for name, function, code in self.codes if function.__code__ is not code]
+        if len(names) != self.many:
+            found += [name for name in names.keys() - before.keys() if _function(names[name])]
+        return [f"{self.of}.{name} {_digest(names.get(name, self))}" for name in found]
+
+
+_seen: dict[str, tuple[types.ModuleType, list[_Space]]] = {}
+_found: set[str] = set()
+
+
+def any_seen() -> bool:
+    """Whether `changes` has ever found any."""
+    return bool(_found)
+
+
+def changes() -> str:
+    """Digest of what differs in the package's modules from when this function first looked at them, which it does when
+    the package is imported; empty: nothing."""
+    found = []
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] != _OWN or name.startswith(_OURS) or not isinstance(module, types.ModuleType):
+            continue
+        known = _seen.get(name)
+        if getattr(module.__spec__, "_initializing", False):
+            continue  # another thread is importing it
+        if known is None:
+            _seen[name] = module, _spaces(module)
+        elif known[0] is not module:
+            found.append(f"{name} {_digest(module)}")
+        else:
+            for space in known[1]:
+                found += space.changed()
+    if not found:
+        return ""
+    told = hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()
+    _found.add(told)
+    return told
+
+
+def _spaces(module: types.ModuleType) -> list[_Space]:
+    names = vars(module)
+    own = [x for x in list(names.values()) if isinstance(x, type) and x.__module__ == module.__name__]
+    return [_Space.at(module.__name__, names), *(_Space.at(f"{x.__module__}.{x.__qualname__}", vars(x)) for x in own)]
+
+
+def _function(value: Any) -> types.FunctionType | None:
+    """The function that a value is, or wraps."""
+    while not isinstance(value, types.FunctionType):
+        if isinstance(value, property):
+            value = value.fget
+        elif isinstance(value, (type, types.ModuleType, *_PLAIN)):
+            return None
+        else:
+            value = getattr(value, "__wrapped__", None)  # a method of a class or a static one, what JAX compiles
+    return value
+
+
+def _digest(value: Any) -> str:
+    function = _function(value)
+    if function is not None:
+        return hashlib.sha256(marshal.dumps(function.__code__, 2)).hexdigest()
+    return repr(value) if isinstance(value, _PLAIN) else uuid.uuid4().hex  # of which nothing is ever asked for again
