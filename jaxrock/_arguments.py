@@ -37,6 +37,8 @@ def arguments(function: Taking) -> Taking:
     several = {each.name for each in parameters if each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
     checks = {name: check for name, check in checks.items() if name not in several}
     places = [(each.name, checks.get(each.name)) for each in parameters if each.kind <= each.POSITIONAL_OR_KEYWORD]
+    by_place = {each.name for each in parameters if each.kind is each.POSITIONAL_ONLY}  # another may have such a name
+    checks = {name: check for name, check in checks.items() if name not in by_place}
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:

@@ -160,6 +160,7 @@ def test_what_fills_a_batch_up_is_one_of_its_points():
         ({}, "needs at least one axis"),
         ({"alpha": 0.1}, "`alpha` must be a list of at least one number, but has shape"),
         ({"alpha": []}, "`alpha` must be a list of at least one number"),
+        ({"alpha": [[0.1, 0.2], [0.3]]}, r"`alpha` must be a list of numbers, but is \[\[0.1, 0.2\], \[0.3\]\]"),
         ({"alpha": [[0.1]]}, "`alpha` must be a list"),
         ({"alpha": ["a"]}, "`alpha` must be a list .* type <U1"),
         ({"alpha": [0.1], "p": [1.0, 2.0], "outer": False}, "one length, but alpha has 1, p has 2"),
@@ -172,6 +173,11 @@ def test_bad_axes_raise(arguments, message):
     function = (lambda **x: {"sum": x["sum"]}) if "sum" in arguments else simple
     with pytest.raises(ValueError, match=message):
         rk.sweep(function, **arguments)
+
+
+def test_an_axis_may_have_the_name_of_what_is_given_by_place():
+    grid = rk.sweep(lambda function: 2 * function, function=[1.0, 2.0], progress=False)
+    np.testing.assert_array_equal(grid.values, [2.0, 4.0])
 
 
 def test_values_out_of_range_raise():

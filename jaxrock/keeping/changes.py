@@ -11,7 +11,8 @@ import uuid
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-_OWN, _OURS = __name__.split(".")[0], __name__.rpartition(".")[0]  # what is kept does not depend on how
+_OWN = __name__.split(".")[0]
+_OTHERS = tuple(f"{_OWN}.{each}" for each in ("keeping", "sweeps", "plot", "command_line"))  # make no programs
 _PLAIN = (bool, int, float, str, bytes, type(None))
 
 
@@ -54,7 +55,7 @@ def changes() -> str:
     the package is imported; empty: nothing."""
     found = []
     for name, module in list(sys.modules.items()):
-        if name.partition(".")[0] != _OWN or name.startswith(_OURS) or not isinstance(module, types.ModuleType):
+        if name.partition(".")[0] != _OWN or name.startswith(_OTHERS) or not isinstance(module, types.ModuleType):
             continue
         known = _seen.get(name)
         if getattr(module.__spec__, "_initializing", False):

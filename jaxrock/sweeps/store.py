@@ -98,6 +98,17 @@ class Store:
             self._array(name)[...] = axes[name]
         return damaged + [self.path / name for name in lost]
 
+    def begun(self) -> list[int]:
+        """The blocks of which there is a record, good or not: to look for one after the other takes long where there
+        are many, and few of them are finished."""
+        root, found = self.path / RECORDS / "c", []
+        more = len(self._records.shape) - len(self._plan.blocks)
+        for folder, _, files in os.walk(root, onerror=_unless_missing):
+            index = Path(folder).relative_to(root).parts
+            if files and len(index) == len(self._plan.blocks) + more - 1 and all(map(str.isdecimal, index)):
+                found.append(int(np.ravel_multi_index(tuple(map(int, index[: 1 - more])), self._plan.blocks)))
+        return sorted(found)
+
     def look(self, number: int) -> tuple[bool, list[Path]]:
         """Whether a block is finished and good, and its files that are damaged."""
         leaves, damaged = self._read(number)
@@ -173,6 +184,11 @@ class Store:
         told = hashlib.sha256(f"{self._description.checksum} {number} {name} ".encode())
         told.update(leaf.tobytes())
         return np.frombuffer(told.digest(), np.uint8)
+
+
+def _unless_missing(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        raise error
 
 
 def listed(files: list[Path]) -> str:

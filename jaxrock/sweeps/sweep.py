@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
-from jaxrock._checks import check_unmasked, is_traced, native, placed
+from jaxrock._checks import check_unmasked, is_traced, native, placed, shown
 from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
 from jaxrock._tables import needed
@@ -82,7 +82,7 @@ def sweep(
 
     - `function`: called with one number for every axis, by name; returns an `Outcome` or any pytree of arrays. It is
       traced, as under `jax.vmap`.
-    - `axes`: (n,) values of each axis, at least one. Neighbours along the last axis are computed together. An axis may
+    - `axes`: (n,) values of each axis, at least one, by any name but those of the other arguments. Neighbours along the last axis are computed together. An axis may
       be a `Suite`: the function gets its motions, which share their samples, and their names are the axis.
     - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
     - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
@@ -171,7 +171,7 @@ def _there(store: Store) -> np.ndarray:
     own, count = process()
     found = np.zeros(store.count, np.uint8)
     damaged = []
-    for number in range(own, store.count, count):
+    for number in (each for each in store.begun() if each % count == own):
         good, files = store.look(number)
         damaged += files
         found[number] = 2 if files else good
@@ -189,7 +189,10 @@ def _there(store: Store) -> np.ndarray:
 
 def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
     check_unmasked(name, values)
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # lists of unlike lengths
+        raise ValueError(f"Argument `{name}` must be a list of numbers, but is {shown(values)}.") from error
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
