@@ -82,8 +82,9 @@ def sweep(
 
     - `function`: called with one number for every axis, by name; returns an `Outcome` or any pytree of arrays. It is
       traced, as under `jax.vmap`.
-    - `axes`: (n,) values of each axis, at least one, by any name but those of the other arguments. Neighbours along the last axis are computed together. An axis may
-      be a `Suite`: the function gets its motions, which share their samples, and their names are the axis.
+    - `axes`: (n,) values of each axis, at least one, by any name but those of the other arguments. Neighbours along the
+      last axis are computed together. An axis may be a `Suite`: the function gets its motions, which share their
+      samples, and their names are the axis.
     - `outer`: every combination of the axes (default), or the axes side by side, all of one length.
     - `store`: path of a Zarr store. Finished blocks are kept there: a sweep that was killed goes on where it was when
       it is called again. What is there is held against its checksums first; what is damaged is named in a warning, and
