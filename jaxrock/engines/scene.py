@@ -16,7 +16,7 @@ from jaxrock.engines.outlook import Outlook
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.models.equation import AbstractEquation, AbstractMoments
 from jaxrock.motions.joined_records import in_place as found_in_place, is_in_place
-from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.motion import AbstractMotion, is_of_several
 from jaxrock.motions.shaking import Shaking, sum_of_series
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.lookup import pick
@@ -104,7 +104,8 @@ class Scene(eqx.Module):
             count = stretch.end
         else:  # up to the last piece with a length: a late motion's knots may all be one number
             lasting = where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
-            count = jnp.max(lasting) if knots.size > _MANY else None
+            # Of motions that end together one may go on longer: what lies between their ends has slopes.
+            count = jnp.max(lasting) if knots.size > _MANY and not is_of_several(motion) else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."

@@ -382,3 +382,9 @@ class WithVertical(_Changed, _Together):
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         both = None, self.vertical.series
         return self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)[1]
+
+
+def is_of_several(motion: AbstractMotion) -> bool:
+    """Whether it is made of two motions at once, or more."""
+    parts = jax.tree.leaves(motion, is_leaf=lambda node: isinstance(node, _Together))
+    return any(isinstance(part, _Together) for part in parts)
