@@ -321,9 +321,12 @@ def test_components_that_began_at_other_times_as_cosmos_tells_it(file, comma):
         rk.motions.read_components([file(text("10.750"), "a.V2c"), file(text("20.750"), "b.V2c")])
 
 
-def test_a_component_that_says_it_points_downward_is_warned_of(file):
-    paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", "DWN"))]
-    with pytest.warns(UserWarning, match="vertical component says 'DWN', and is taken as it stands, positive upward"):
+@pytest.mark.parametrize("word", ["DWN", "D"])
+def test_a_component_that_says_it_points_downward_is_warned_of(file, word):
+    paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", word))]
+    with pytest.warns(
+        UserWarning, match=f"vertical component says '{word}', and is taken as it stands, positive upward"
+    ):
         found = rk.motions.read_components(paths)
     np.testing.assert_array_equal(found.vertical.samples, found.first.samples)
 
@@ -334,6 +337,48 @@ def test_two_components_and_columns_of_one_file(file):
     found = rk.motions.read_components(file(text), columns=(1, 2, 3), unit="g")
     np.testing.assert_allclose(found.second.samples, 2 * SAMPLES)
     np.testing.assert_allclose(found.vertical.samples, 3 * SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "titles, columns, order",
+    [
+        ("time [s],NS [g],EW [g],UD [g]", None, (1, 2, 3)),
+        ("time,NS,EW,UD", None, (1, 2, 3)),
+        ("# no titles", None, (1, 2, 3)),
+        ("time,UD,NS,EW", None, (2, 3, 1)),
+        ("time,UD,NS,EW", (1, 2, 3), (2, 3, 1)),
+        ("time [s],acc_z [g],acc_x [g],acc_y [g]", (1, 2, 3), (2, 3, 1)),
+        ("time,acc (Z),acc (N),acc (E)\ns,g,g,g", None, (2, 3, 1)),
+        ("time [s],Vertical acceleration [g],NS [g],EW [g]", (3, 1, 2), (3, 2, 1)),
+    ],
+)
+def test_titles_say_which_columns_are_components(file, titles, columns, order):
+    """Not the times, and the vertical one where it stands."""
+    factors = (1, 2, 3)
+    rows = (",".join([f"{0.02 * k:.2f}", *(repr(f * x) for f in factors)]) for k, x in enumerate(SAMPLES.tolist()))
+    path = file(f"{titles}\n" + "\n".join(rows) + "\n")
+    for given in ({}, {"dt": 0.02}):
+        found = rk.motions.read_components(path, unit="g", columns=columns, **given)
+        for part, column in zip((found.first, found.second, found.vertical), order):
+            np.testing.assert_allclose(part.samples, column * SAMPLES)
+        assert float(found.first.dt) == 0.02
+
+
+def test_columns_that_are_not_two_or_three_must_be_said(file):
+    text = "".join(f"{0.02 * k:.2f},{x}\n" for k, x in enumerate(SAMPLES))
+    with pytest.raises(
+        ValueError, match="`columns` must be given, because text file `motion.txt` has 2 columns, the f"
+    ):
+        rk.motions.read_components(file(text), unit="g")
+
+
+@pytest.mark.parametrize(
+    "name", ["D", "VRT", "VT", "V1", "UPDN", "UP-DN", "000V", "V", "VERT", "UP", "HNZ", "-UP", "Vertical"]
+)
+def test_names_of_vertical_components(file, name):
+    paths = [file(FILES["AT2"].text.replace("WAHO, 090", f"WAHO, {each}"), each) for each in ("000", name)]
+    with pytest.raises(ValueError, match="must hold two horizontal components, but .* are vertical"):
+        rk.motions.read_components(paths)
 
 
 @pytest.mark.parametrize(
