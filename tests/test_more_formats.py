@@ -82,6 +82,7 @@ def test_knet_takes_the_offset_off(file, name):
         ),
         (V1.replace(" 23 Acc", " 22 Acc"), "a.V1", "announces 22 samples, but 23 follow"),
         (V1.replace("units of g .", "units of g/10"), "a.V1", "line 12 states a peak of 0.[0-9]+ g, but the largest"),
+        (V1.replace("units of g .", "units of g/100"), "a.V1", "line 28 states the unit 'g/100'"),
         (V1.replace("units of g .", "units of counts ."), "a.V1", "line 28 states the unit 'counts'"),
         (V1.replace("at 200 pts", "at 0 pts"), "a.V1", "line 28 states 0 samples a second"),
         (V1[: V1.index(" 23 Acc")], "a.V1", "header must state 'No. of points' and 'Units"),
@@ -311,6 +312,32 @@ def test_components_are_known_by_what_they_say(file, order):
         np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
 
 
+def cosmos(direction, factor):
+    """A COSMOS record of one direction, as it stands in a file of several."""
+    lines = COSMOS.replace("\n", f"\nSta Chan  1: {direction}\n", 1).splitlines()
+    at = next(k for k, line in enumerate(lines) if "acceleration pts" in line)
+    values = [f"{factor * float(x):15.6e}" for x in lines[at + 1 : -1]]
+    text = "\n".join([*lines[: at + 1], *values, lines[-1]]) + "\n"
+    return text.replace(f"{np.abs(SAMPLES * CM).max():15.6f}", f"{np.abs(factor * SAMPLES * CM).max():15.6f}")
+
+
+def test_a_cosmos_file_of_several_records(file):
+    """`column` says which; velocities of a channel, which stand beside its accelerations, are none."""
+    others = cosmos("N", 1).replace("acceleration", "velocity")
+    path = file(cosmos("UP", 3) + cosmos("N", 1) + others + cosmos("E", 2))
+    for column, factor, name in ((None, 3, "UP"), (0, 3, "UP"), (1, 1, "N"), (2, 2, "E")):
+        record = rk.read_record(path, column=column)
+        np.testing.assert_allclose(record.samples, factor * SAMPLES, rtol=1e-5, atol=1e-7)
+        assert record.origin.component == name
+    with pytest.raises(ValueError, match="`column` must be 0 to 2, a channel of COSMOS file `motion.txt`, but is 3"):
+        rk.read_record(path, column=3)
+    found = rk.motions.read_components(path)
+    for part, factor in ((found.first, 1), (found.second, 2), (found.vertical, 3)):
+        np.testing.assert_allclose(part.samples, factor * SAMPLES, rtol=1e-5, atol=1e-7)
+    with pytest.raises(ValueError, match="announces 23 samples, but 22 follow"):
+        rk.read_record(file(cosmos("N", 1) + "\n".join(cosmos("E", 2).splitlines()[:-2]) + "\n"), column=1)
+
+
 @pytest.mark.parametrize("comma", [",", ""])
 def test_components_that_began_at_other_times_as_cosmos_tells_it(file, comma):
     def text(seconds):
@@ -467,6 +494,26 @@ def test_what_is_written_is_read_again(tmp_path):
     assert tuple(rk.read_record(path).origin)[:3] == origin[:3]
     rk.motions.write_csv(record, path, "cm/s2")
     np.testing.assert_allclose(rk.read_record(path).samples, SAMPLES, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["x UNITS OF CM/S2", "NPTS= 5, DT= .1", "VELOCITY TIME HISTORY", "5 POINTS OF ACCEL DATA EQUALLY SPACED AT 1 SEC"],
+)
+def test_a_name_that_looks_like_a_header_is_not_written(tmp_path, name):
+    """Or what was written is read again."""
+    for write in (rk.motions.write_at2, rk.motions.write_csv):
+        path = tmp_path / write.__name__
+        try:
+            write(rk.Record(SAMPLES, 0.005, name), path)
+        except ValueError as error:
+            assert "`record` must have a name that readers do not take for a header, but has" in str(error)
+            assert not path.exists()
+        else:
+            assert write is rk.motions.write_csv
+            found = rk.read_record(path)
+            np.testing.assert_allclose(found.samples, SAMPLES, rtol=1e-7)
+            assert float(found.dt) == 0.005
 
 
 @pytest.mark.parametrize("path", ["", "/"])

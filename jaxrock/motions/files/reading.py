@@ -77,7 +77,7 @@ def read_record(
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
       column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. What a header says
       of columns counts: units of times and accelerations, and which are times.
-      V1, V2: the channel (None: the first). The others hold one record.
+      V1, V2, COSMOS: the channel (None: the first). The others hold one record.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
     the file says of it. Its first sample is at time 0, whatever the times in the file. It warns of samples beyond 20 g,
@@ -92,6 +92,12 @@ def read_record(
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[format]
     return _record(path, chosen, chosen.read(path.name, lines, dt, unit, column))
+
+
+def accelerogram_of(name: str, lines: list[str]) -> tuple[str, Accelerogram]:
+    """The format of lines, and what they hold, where nothing is said beside them."""
+    chosen = _format_of(lines, "")
+    return chosen.name, chosen.read(name, lines, None, None, None)
 
 
 def component_columns(path: str | os.PathLike, format: str | None = None) -> tuple[int, ...]:

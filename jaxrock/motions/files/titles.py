@@ -39,7 +39,7 @@ _NO_DIRECTION = re.compile(r"\b(?:a|acc\w*|ground|motion|component|comp|sensor|o
 
 _BRACKETS = re.compile(r"\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\)|\{([^{}]*)\}|<([^<>]*)>")
 _BEFORE_BARE = re.compile(r"\s*[/:]\s*|\s+-\s+|[\s_]+(?:in[\s_]+)?")  # time_ms, t/ms, time in ms
-_SHORT = {"m", "v", "in"}  # other units that are as well words or directions, where no brackets are around them
+SHORT = {"m", "v", "in"}  # other units that are as well words or directions, where no brackets are around them
 _BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS = re.compile(r"(?<=[\])}>])\s+"), re.compile(r"\s+(?![\[({<])")
 _MARK, _RULE = re.compile(r"^(?:[#%!]|//)+\s*"), re.compile(r"[-=_*+|~.:,;#\s]+")
 _SAID = re.compile(
@@ -47,6 +47,8 @@ _SAID = re.compile(
     re.IGNORECASE,
 )
 _DIRECTION = re.compile(r"[NSEWUDVHXYZLTR]{1,3}\d?|[NSEWUD]-[NSEWUD]|\d{1,3}|up|down|vert\w*\.?", re.IGNORECASE)
+_VALUE = re.compile(r"(^|[\s=:])[-+\d.]+($|\s)")  # a number in what is no title then: `PGA = 0.3 g`
+_STATED = re.compile(r"[:=]\s*[-+.]?\d")
 _OR = " or else "  # between units of one title
 _LONG = 300  # characters of a title, and of a line of titles times ten
 
@@ -71,7 +73,7 @@ class Title(NamedTuple):
 
     def with_unit(self, unit: str) -> "Title":
         """The title with a unit from elsewhere; what stands in its brackets, such as (NS), is a word then."""
-        if not unit or _is_unit_of_any(self.unit):
+        if not unit or is_any_unit(self.unit):
             return self
         return Title(f"{self.word} {self.unit}".strip(), unit)
 
@@ -124,7 +126,7 @@ class Titles(NamedTuple):
         """What a title says of the direction of its sensor."""
         title = self._of(column)
         word = " ".join(_NO_DIRECTION.sub(" ", title.word.replace("_", " ")).split())
-        return word or (title.unit if _DIRECTION.fullmatch(title.unit) and not _is_unit_of_any(title.unit) else "")
+        return word or (title.unit if _DIRECTION.fullmatch(title.unit) and not is_any_unit(title.unit) else "")
 
     def _of(self, column: int) -> Title:
         return self.titles[column] if self.titles else Title()
@@ -186,7 +188,7 @@ def _with_units(name: str, number: int, titles, units: tuple[int, list[Title]] |
         found = found or tuple(Title() for _ in below)
         for above, under in zip(found, below):
             differs = above.unit != under.unit and not _same(above.unit, under.unit)
-            if differs and under.unit and _is_unit_of_any(above.unit):
+            if differs and under.unit and is_any_unit(above.unit):
                 stated = f"line {number} states the unit {above.unit!r}, but line {line} {under.unit!r}"
                 raise file_error(name, f"{stated}.")
         found = tuple(above.with_unit(under.unit) for above, under in zip(found, below))
@@ -202,14 +204,14 @@ def _said(lines: list[str], width: int) -> dict:
         if not begin:
             continue
         parts = [_inner(part) for part in re.split(r"[,;&\t]|\band\b", line[begin.end() :])]
-        words = [word for part in parts for word in ([part] if _is_unit_of_any(part) else map(_inner, part.split()))]
+        words = [word for part in parts for word in ([part] if is_any_unit(part) else map(_inner, part.split()))]
         titles = [Title("", word) for word in words]
         if len(words) == width > 1 and _only_units(titles):
             found.setdefault("columns", (number, titles))
             continue
         known = list(dict.fromkeys(word for word in words if is_unit(word)))
         times = list(dict.fromkeys(word for word in words if _seconds(word)))
-        other = [word for word in words if word not in times and _is_unit_of_any(word) and word.lower() not in _SHORT]
+        other = [word for word in words if word not in times and is_any_unit(word) and word.lower() not in SHORT]
         if len(known) == 1 or not known and other:
             found.setdefault("acceleration", (number, (known or other)[0]))
         if len(times) == 1 and (known or not other):
@@ -223,7 +225,8 @@ def _is_plain(titles: list[Title]) -> bool:
     return first in _COUNTS | _SPECTRUM or all(_DIRECTION.fullmatch(each.word) for each in titles)
 
 
-def _is_unit_of_any(word: str) -> bool:
+def is_any_unit(word: str) -> bool:
+    """Whether a word is a unit, of whatever."""
     return is_unit(word) or _seconds(word) or bool(_OTHER_UNIT.fullmatch(word[:_LONG]))
 
 
@@ -251,7 +254,7 @@ def _parted(line: str, width: int) -> list[list[Title]]:
         found.append(plain if _only_units(plain) else [t if t.word else Title(w) for t, w in zip(bracketed, words)])
         for mark in (_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS):
             titles = [_title(field) for field in mark.split(line)]
-            found += [titles] if titles[0].states_unit and not titles[0].bare else []
+            found += [titles] if titles[0].states_unit and not titles[0].bare and not _STATED.search(line) else []
     return found
 
 
@@ -268,9 +271,10 @@ def _title(field: str) -> Title:
     if not field:
         return Title()
     found = [(each, next((part for part in each.groups() if part), "").strip()) for each in _BRACKETS.finditer(field)]
+    found = [] if re.search(r"[)\]}>]\s*[:=]?\s*[-+.]?\d", field) else found  # a value follows: no title
     known = [(each, text) for each, text in found if is_unit(text) or _seconds(text)]
     other = [(each, text) for each, text in found if _OTHER_UNIT.fullmatch(text) and not is_unit(text)]
-    other = [(each, text) for each, text in other if not _seconds(text) and text.lower() not in _SHORT]
+    other = [(each, text) for each, text in other if not _seconds(text) and text.lower() not in SHORT]
     stated = known + other
     if len({text for _, text in stated}) > 1:
         return Title(_BRACKETS.sub(" ", field).strip(), _OR.join(text for _, text in stated))
@@ -286,11 +290,11 @@ def _bare(field: str) -> Title:
         return Title("", field, True)
     for mark in _BEFORE_BARE.finditer(field):
         word, unit = field[: mark.start()], field[mark.end() :]
-        named = word and not re.search(r"(^|[\s=])[-+\d.]+$", word) and (word + unit).lower() != "ns"
+        named = word and not _VALUE.search(word) and (word + unit).lower() != "ns"
         if named and (_is_bare(unit) or unit in ("G", "S") and re.fullmatch(r"acc\w*|t|time", word, re.IGNORECASE)):
             return Title(word, unit.replace("_", "/"), True)
     first, *within = field.split()
-    unit = next((word for word in within if len(word) > 1 and is_unit(word)), "")
+    unit = "" if _VALUE.search(field) else next((word for word in within if len(word) > 1 and is_unit(word)), "")
     return Title(" ".join([first, *(word for word in within if word != unit)]), unit, bool(unit))
 
 
@@ -299,4 +303,4 @@ def _is_bare(text: str) -> bool:
     text = text.replace("_", "/")
     if len(text) == 1:
         return text in "gs"  # G and S may be names
-    return is_unit(text) or _seconds(text) or bool(_OTHER_BARE.fullmatch(text)) and text.lower() not in _SHORT
+    return is_unit(text) or _seconds(text) or bool(_OTHER_BARE.fullmatch(text)) and text.lower() not in SHORT
