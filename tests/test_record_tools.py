@@ -72,6 +72,13 @@ def test_a_drift_is_taken_off_up_to_both_ends(drift, error, dt, corner):
     assert abs(straight(found).velocity[-1] - straight(ground).velocity[count - 1]) < 1e-3
 
 
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("dt", [DT, 0.001, 0.5])
+def test_few_samples_have_no_drift_either(count, dt):
+    found = rk.processing.fused(rk.Record(np.full(count, 0.02), DT), np.zeros(60), dt, corner=0.5)
+    np.testing.assert_allclose(found.samples, np.zeros(count), atol=1e-12)
+
+
 def test_noise_of_a_displacement_stays_small_at_both_ends():
     noisy = PLACE + NOISE.normal(0, 1e-4, TIME.size)
     found = rk.processing.fused(rk.Record(GROUND.samples + 0.02, DT), noisy, DT, corner=0.5)

@@ -292,7 +292,7 @@ def resampled(record: Record, dt: ArrayLike) -> Record:
     if new <= old * (1 + slack):
         time = new * np.arange(int(np.floor((samples.size - 1) * old / new * (1 + slack))) + 1)
         return _like(record, np.interp(time, old * np.arange(samples.size), samples), new)
-    ratio = Fraction(old / new).limit_denominator(1000)
+    ratio = Fraction(old / new).limit_denominator(10_000)
     if ratio == 0 or abs(float(ratio) * new / old - 1) > max(1e-9, slack):
         raise ValueError(f"Argument `dt` must be to the old step, {old:g} s, as small whole numbers are, but is {new}.")
     return _like(record, scipy.signal.resample_poly(samples, ratio.numerator, ratio.denominator), new)

@@ -30,9 +30,10 @@ def slow_difference(
     apart = _twice_integrated(samples, step, time) - other
     # Straight lines of acceleration, from rest.
     terms = np.stack([np.ones_like(time), (time / time[-1]) ** 2 / 2, (time / time[-1]) ** 3 / 6], axis=1)
-    _, constant, ramp = fit = np.linalg.lstsq(terms, apart, rcond=None)[0]
+    told = min(3, time.size)  # two samples tell no ramp
+    fit = np.concatenate([np.linalg.lstsq(terms[:, :told], apart, rcond=None)[0], np.zeros(3 - told)])
     rest = _second_difference(apart - terms @ fit, fine, 1 / corner)
-    line = (constant + ramp * time / time[-1]) / time[-1] ** 2
+    line = (fit[1] + fit[2] * time / time[-1]) / time[-1] ** 2
     slow = smoothed(rest, fine, corner, order, evenly) + line
     if step <= dt:
         return slow
