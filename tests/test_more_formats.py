@@ -82,6 +82,7 @@ def test_knet_takes_the_offset_off(file, name):
         ),
         (V1.replace(" 23 Acc", " 22 Acc"), "a.V1", "announces 22 samples, but 23 follow"),
         (V1.replace("units of g .", "units of g/10"), "a.V1", "line 12 states a peak of 0.[0-9]+ g, but the largest"),
+        (V1.replace("units of g .", "units of g/100"), "a.V1", "line 28 states the unit 'g/100'"),
         (V1.replace("units of g .", "units of counts ."), "a.V1", "line 28 states the unit 'counts'"),
         (V1.replace("at 200 pts", "at 0 pts"), "a.V1", "line 28 states 0 samples a second"),
         (V1[: V1.index(" 23 Acc")], "a.V1", "header must state 'No. of points' and 'Units"),
@@ -311,6 +312,32 @@ def test_components_are_known_by_what_they_say(file, order):
         np.testing.assert_allclose(part.samples, factor * one, rtol=1e-12)
 
 
+def cosmos(direction, factor):
+    """A COSMOS record of one direction, as it stands in a file of several."""
+    lines = COSMOS.replace("\n", f"\nSta Chan  1: {direction}\n", 1).splitlines()
+    at = next(k for k, line in enumerate(lines) if "acceleration pts" in line)
+    values = [f"{factor * float(x):15.6e}" for x in lines[at + 1 : -1]]
+    text = "\n".join([*lines[: at + 1], *values, lines[-1]]) + "\n"
+    return text.replace(f"{np.abs(SAMPLES * CM).max():15.6f}", f"{np.abs(factor * SAMPLES * CM).max():15.6f}")
+
+
+def test_a_cosmos_file_of_several_records(file):
+    """`column` says which; velocities of a channel, which stand beside its accelerations, are none."""
+    others = cosmos("N", 1).replace("acceleration", "velocity")
+    path = file(cosmos("UP", 3) + cosmos("N", 1) + others + cosmos("E", 2))
+    for column, factor, name in ((None, 3, "UP"), (0, 3, "UP"), (1, 1, "N"), (2, 2, "E")):
+        record = rk.read_record(path, column=column)
+        np.testing.assert_allclose(record.samples, factor * SAMPLES, rtol=1e-5, atol=1e-7)
+        assert record.origin.component == name
+    with pytest.raises(ValueError, match="`column` must be 0 to 2, a channel of COSMOS file `motion.txt`, but is 3"):
+        rk.read_record(path, column=3)
+    found = rk.motions.read_components(path)
+    for part, factor in ((found.first, 1), (found.second, 2), (found.vertical, 3)):
+        np.testing.assert_allclose(part.samples, factor * SAMPLES, rtol=1e-5, atol=1e-7)
+    with pytest.raises(ValueError, match="announces 23 samples, but 22 follow"):
+        rk.read_record(file(cosmos("N", 1) + "\n".join(cosmos("E", 2).splitlines()[:-2]) + "\n"), column=1)
+
+
 @pytest.mark.parametrize("comma", [",", ""])
 def test_components_that_began_at_other_times_as_cosmos_tells_it(file, comma):
     def text(seconds):
@@ -321,9 +348,12 @@ def test_components_that_began_at_other_times_as_cosmos_tells_it(file, comma):
         rk.motions.read_components([file(text("10.750"), "a.V2c"), file(text("20.750"), "b.V2c")])
 
 
-def test_a_component_that_says_it_points_downward_is_warned_of(file):
-    paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", "DWN"))]
-    with pytest.warns(UserWarning, match="vertical component says 'DWN', and is taken as it stands, positive upward"):
+@pytest.mark.parametrize("word", ["DWN", "D"])
+def test_a_component_that_says_it_points_downward_is_warned_of(file, word):
+    paths = [file(component(each), f"motion{k}") for k, each in enumerate(("N-S", "E-W", word))]
+    with pytest.warns(
+        UserWarning, match=f"vertical component says '{word}', and is taken as it stands, positive upward"
+    ):
         found = rk.motions.read_components(paths)
     np.testing.assert_array_equal(found.vertical.samples, found.first.samples)
 
@@ -334,6 +364,48 @@ def test_two_components_and_columns_of_one_file(file):
     found = rk.motions.read_components(file(text), columns=(1, 2, 3), unit="g")
     np.testing.assert_allclose(found.second.samples, 2 * SAMPLES)
     np.testing.assert_allclose(found.vertical.samples, 3 * SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "titles, columns, order",
+    [
+        ("time [s],NS [g],EW [g],UD [g]", None, (1, 2, 3)),
+        ("time,NS,EW,UD", None, (1, 2, 3)),
+        ("# no titles", None, (1, 2, 3)),
+        ("time,UD,NS,EW", None, (2, 3, 1)),
+        ("time,UD,NS,EW", (1, 2, 3), (2, 3, 1)),
+        ("time [s],acc_z [g],acc_x [g],acc_y [g]", (1, 2, 3), (2, 3, 1)),
+        ("time,acc (Z),acc (N),acc (E)\ns,g,g,g", None, (2, 3, 1)),
+        ("time [s],Vertical acceleration [g],NS [g],EW [g]", (3, 1, 2), (3, 2, 1)),
+    ],
+)
+def test_titles_say_which_columns_are_components(file, titles, columns, order):
+    """Not the times, and the vertical one where it stands."""
+    factors = (1, 2, 3)
+    rows = (",".join([f"{0.02 * k:.2f}", *(repr(f * x) for f in factors)]) for k, x in enumerate(SAMPLES.tolist()))
+    path = file(f"{titles}\n" + "\n".join(rows) + "\n")
+    for given in ({}, {"dt": 0.02}):
+        found = rk.motions.read_components(path, unit="g", columns=columns, **given)
+        for part, column in zip((found.first, found.second, found.vertical), order):
+            np.testing.assert_allclose(part.samples, column * SAMPLES)
+        assert float(found.first.dt) == 0.02
+
+
+def test_columns_that_are_not_two_or_three_must_be_said(file):
+    text = "".join(f"{0.02 * k:.2f},{x}\n" for k, x in enumerate(SAMPLES))
+    with pytest.raises(
+        ValueError, match="`columns` must be given, because text file `motion.txt` has 2 columns, the f"
+    ):
+        rk.motions.read_components(file(text), unit="g")
+
+
+@pytest.mark.parametrize(
+    "name", ["D", "VRT", "VT", "V1", "UPDN", "UP-DN", "000V", "V", "VERT", "UP", "HNZ", "-UP", "Vertical"]
+)
+def test_names_of_vertical_components(file, name):
+    paths = [file(FILES["AT2"].text.replace("WAHO, 090", f"WAHO, {each}"), each) for each in ("000", name)]
+    with pytest.raises(ValueError, match="must hold two horizontal components, but .* are vertical"):
+        rk.motions.read_components(paths)
 
 
 @pytest.mark.parametrize(
@@ -422,6 +494,26 @@ def test_what_is_written_is_read_again(tmp_path):
     assert tuple(rk.read_record(path).origin)[:3] == origin[:3]
     rk.motions.write_csv(record, path, "cm/s2")
     np.testing.assert_allclose(rk.read_record(path).samples, SAMPLES, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["x UNITS OF CM/S2", "NPTS= 5, DT= .1", "VELOCITY TIME HISTORY", "5 POINTS OF ACCEL DATA EQUALLY SPACED AT 1 SEC"],
+)
+def test_a_name_that_looks_like_a_header_is_not_written(tmp_path, name):
+    """Or what was written is read again."""
+    for write in (rk.motions.write_at2, rk.motions.write_csv):
+        path = tmp_path / write.__name__
+        try:
+            write(rk.Record(SAMPLES, 0.005, name), path)
+        except ValueError as error:
+            assert "`record` must have a name that readers do not take for a header, but has" in str(error)
+            assert not path.exists()
+        else:
+            assert write is rk.motions.write_csv
+            found = rk.read_record(path)
+            np.testing.assert_allclose(found.samples, SAMPLES, rtol=1e-7)
+            assert float(found.dt) == 0.005
 
 
 @pytest.mark.parametrize("path", ["", "/"])

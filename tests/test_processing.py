@@ -100,6 +100,39 @@ def test_cut_and_scaled():
     np.testing.assert_array_equal(do.scaled(SMOOTH, -2.0).samples, -2 * SMOOTH.samples)
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.005, 1 / 256, 1 / 300, 0.02])
+def test_single_precision_cuts_and_resamples_as_double_does(dt):
+    """Its time steps are off by a few times 1e-8, which is no reason to lose a sample."""
+    counts = []
+    for double in (True, False):
+        with jax.enable_x64(double):
+            record = rk.Record(np.arange(60_001) % 997, dt)
+            part = do.cut(record, 100 * dt, 200 * dt)
+            found = [np.asarray(part.samples), np.asarray(do.cut(record, end=1 / 3).samples)]
+            steps = (dt / 2, dt / 4, dt / 5, 1.25 * dt, 2 * dt, 2.5 * dt, dt * 4 / 3, round(1.333 * dt, 12))
+            found += [np.asarray(do.resampled(record, step).samples) for step in steps]
+            counts.append([each.size for each in found])
+            np.testing.assert_array_equal(found[0], np.arange(100, 201))
+    assert counts[0] == counts[1]
+    assert counts[0][0] == 101 and counts[0][2] == 120_001
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_displacement_is_differentiated_in_the_precision_that_was_given(dtype):
+    """Without double precision in JAX, too: what is rounded to single precision has a noisy second derivative."""
+    time = 0.001 * np.arange(5001)
+    place = (0.1 * (1 - np.cos(2 * time))).astype(dtype)
+    with jax.enable_x64(False):
+        of_place = do.from_displacement(place, 0.001)
+        of_velocity = do.from_velocity(0.2 * np.sin(2 * time), 0.001)
+        fused = do.fused(rk.Record(0.4 / G * np.cos(2 * time), 0.001), place.tolist(), 0.001)
+    exact = 0.4 / G * np.cos(2 * time)
+    error = np.abs(np.asarray(of_place.samples) - exact).max() / exact.max()
+    assert error < 1e-4 if dtype == np.float64 else error > 1e-2
+    np.testing.assert_allclose(of_velocity.samples, exact, atol=1e-5 * exact.max())
+    np.testing.assert_allclose(fused.samples[:-10], exact[:-10], atol=1e-3 * exact.max())
+
+
 @pytest.mark.parametrize(
     "step",
     [

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize
 
 import jaxrock as rk
@@ -47,6 +48,42 @@ def test_two_bad_sensors_make_a_good_one():
     alone = rk.processing.from_displacement(noisy, DT)
     errors = [np.std(np.asarray(each.samples - GROUND.samples)[100:-100]) for each in (alone, found)]
     assert errors[0] > 1.0 and errors[1] < 2e-3
+
+
+@pytest.mark.parametrize(
+    "drift, error",
+    [
+        pytest.param(lambda t: 0.02 + 0 * t, 1e-5, id="constant"),
+        pytest.param(lambda t: 0.002 * t - 0.01, 1e-5, id="ramp"),
+        pytest.param(lambda t: 0.01 * np.cos(0.15 * t), 5e-4, id="wave"),
+    ],
+)
+@pytest.mark.parametrize("dt, corner", [(DT, 0.5), (0.001, 0.5), (0.007, 0.3), (0.05, 0.5)])
+def test_a_drift_is_taken_off_up_to_both_ends(drift, error, dt, corner):
+    """All of it: it came back over the last 1/corner, and left the ground moving at the end."""
+    time = DT * np.arange(1501)
+    ground = rk.Record(0.2 * np.sin(2 * np.pi * 0.8 * time) * np.exp(-(((time - 7) / 2) ** 2)), DT)
+    fine = dt * np.arange(int(15 / dt + 1e-9) + 1)
+    place = CubicHermiteSpline(time, straight(ground).displacement, straight(ground).velocity)(fine)
+    found = rk.processing.fused(rk.Record(ground.samples + drift(time), DT), place, dt, corner=corner)
+    count = found.samples.size
+    assert count == (1501 if 15 / dt == round(15 / dt) else 1500)
+    np.testing.assert_allclose(found.samples, ground.samples[:count], atol=error if dt <= DT else 5e-4)
+    assert abs(straight(found).velocity[-1] - straight(ground).velocity[count - 1]) < 1e-3
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("dt", [DT, 0.001, 0.5])
+def test_few_samples_have_no_drift_either(count, dt):
+    found = rk.processing.fused(rk.Record(np.full(count, 0.02), DT), np.zeros(60), dt, corner=0.5)
+    np.testing.assert_allclose(found.samples, np.zeros(count), atol=1e-12)
+
+
+def test_noise_of_a_displacement_stays_small_at_both_ends():
+    noisy = PLACE + NOISE.normal(0, 1e-4, TIME.size)
+    found = rk.processing.fused(rk.Record(GROUND.samples + 0.02, DT), noisy, DT, corner=0.5)
+    np.testing.assert_allclose(found.samples, GROUND.samples, atol=3e-4)
+    assert abs(straight(found).velocity[-1] - straight(GROUND).velocity[-1]) < 3e-3
 
 
 def test_fast_noise_of_a_displacement_does_not_come_back_as_slow():

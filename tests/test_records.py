@@ -72,6 +72,7 @@ AT2 = TITLES + UNIT + COUNTS + BODY
         ),
         pytest.param(AT2.replace("OF G", "OF G. FILTER POINTS: HP=0.2 Hz LP=15.0 Hz"), id="filter after the unit"),
         pytest.param(AT2.replace("OF G", "OF (g)"), id="unit in brackets"),
+        pytest.param("SUCH THAT DISPLACEMENT TIME HISTORY ENDS AT 0\n" + AT2, id="a word of displacement"),
     ],
 )
 def test_at2(file, content):
@@ -94,9 +95,15 @@ def test_at2(file, content):
         ("m/sec/sec", 9.80665),
     ],
 )
-def test_at2_in_other_units(file, unit, per_g):
-    content = AT2.replace("OF G", f"OF {unit}").replace(BODY, rows(SAMPLES * per_g, "%16.8E", 5))
+@pytest.mark.parametrize(
+    "told",
+    ["ACCELERATION TIME SERIES IN UNITS OF {}", "ACCELERATION TIME HISTORY IN {}", "ACCELERATION TIME HISTORY ({})"],
+)
+def test_at2_in_other_units(file, unit, per_g, told):
+    content = AT2.replace(UNIT, told.format(unit) + "\n").replace(BODY, rows(SAMPLES * per_g, "%16.8E", 5))
     np.testing.assert_allclose(read_record(file(content)).samples, SAMPLES, rtol=1e-7)
+    with pytest.raises(ValueError, match="Argument `unit` must agree with file"):
+        read_record(file(content), unit="g" if per_g != 1 else "m/s2")
 
 
 @pytest.mark.parametrize(
@@ -110,6 +117,15 @@ def test_at2_in_other_units(file, unit, per_g):
         pytest.param(TITLES + UNIT + "NPTS= 0, DT= .01 SEC\n", "announces 0 samples", id="zero announced"),
         pytest.param(AT2.replace("OF G", "OF CM/S"), r"line 3 states the unit 'CM/S'", id="velocity"),
         pytest.param(AT2.replace("OF G", "OF G/10"), r"line 3 states the unit 'G/10'", id="unknown unit"),
+        pytest.param(AT2.replace("OF G", "OF G * 0.001"), r"line 3 states the unit 'G \* 0.001'", id="a factor"),
+        pytest.param(AT2.replace("OF G", "OF G X 10^-3"), r"line 3 states the unit 'G X 10\^-3'", id="a power"),
+        pytest.param(AT2.replace("IN UNITS OF G", "IN MG"), "line 3 states the unit 'MG'", id="thousandths"),
+        pytest.param(
+            AT2.replace("ACCELERATION TIME SERIES IN UNITS OF G", "VELOCITY TIME HISTORY IN G"),
+            "line 3 states velocity, but samples must be accelerations",
+            id="velocity in g",
+        ),
+        pytest.param(AT2.replace(".00500 SEC", "200 HZ"), "line 4 states DT in 'HZ', but it must be a time", id="rate"),
         pytest.param(AT2.replace("IN UNITS OF G", ""), "`unit` must be given for file `motion.txt`", id="no unit"),
         pytest.param(AT2.replace(".00500", "0.000"), "time step of 0 s, which is not positive", id="zero dt"),
         pytest.param(AT2.replace(".00500", "-.005"), "time step of -0.005 s", id="negative dt"),
@@ -194,6 +210,7 @@ V2 = channel()
         pytest.param(V2.replace("\n", "\r\n") + "\x1a" * 40, id="CRLF and DOS end of file"),
         pytest.param(channel(announce=", in cm/sec2. (8f10.3)").lower(), id="later CSMIP"),
         pytest.param(channel(announce=", in cm/sec2. (8f11.6)", form="%11.6f"), id="width stated"),
+        pytest.param(channel(announce="in units of cm/sec2. (8f11.6)", form="%11.6f"), id="in units of"),
         pytest.param(
             V2.replace("OF ACCEL DATA", "OF ACC DATA").replace("(UNITS: CM/SEC/SEC)", "IN UNITS CM/SEC/SEC"), id="USC"
         ),
@@ -255,6 +272,16 @@ def test_v2_channels_of_acceleration_only(file):
 def test_v2_errors(file, content, error):
     with pytest.raises(ValueError, match=error):
         read_record(file(content))
+
+
+@pytest.mark.parametrize("announce, form", [("(8f10.3)", "%10.3f"), (", (8f11.6)", "%11.6f"), ("", "%10.3f")])
+def test_v2_without_unit_takes_the_argument(file, announce, form):
+    path = file(channel(announce=announce, form=form))
+    np.testing.assert_allclose(read_record(path, unit="cm/s2").samples, SHAKE / PER_G, atol=1e-7)
+    with pytest.raises(
+        ValueError, match="Argument `unit` must be given for file `motion.txt`, whose header states non"
+    ):
+        read_record(path)
 
 
 def test_v2_without_block_is_recognised_by_its_suffix(file):
@@ -374,7 +401,7 @@ def test_a_title_of_one_column_states_its_unit(file):
 
 @pytest.mark.parametrize(
     "title",
-    ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],x [g],a", "Sta A (NS) motion (corrected)"],
+    ["time,acceleration", "t [s],a [filtered]", "a record [g]", "t [s],a (090)", "Sta A (NS) motion (corrected)"],
 )
 def test_other_titles_state_no_unit(file, title):
     path = file(f"{title}\n{PAIRS}")
@@ -397,6 +424,109 @@ def test_unit_of_times_is_in_their_title(file, unit, seconds):
     np.testing.assert_allclose(record.dt, seconds * usual.dt, rtol=1e-12)
     with pytest.raises(ValueError, match="Argument `dt` must agree with file"):
         read_record(file(f"t ({unit}),a [g]\n{PAIRS}"), dt=3 * seconds * usual.dt)
+
+
+IN_MS = "".join(f"{20 * k},{a}\n" for k, a in enumerate(SAMPLES))
+
+
+@pytest.mark.parametrize(
+    "header, per_g",
+    [
+        ("time_ms,acc (g)", 1.0),
+        ("Time/ms,acc/g", 1.0),
+        ("t/ms,a/(m/s^2)", 9.80665),
+        ("Time in ms,acc (g)", 1.0),
+        ("Time ms;Acc cm/s2", 980.665),
+        ("TIME MS,ACC G", 1.0),
+        ('"Time [ms]","Acc [g]"', 1.0),
+        ("time_ms acc_m_s2", 9.80665),
+        ("time,acc\nms,cm/s2", 980.665),
+        ("time acc\n(ms) (cm/s2)", 980.665),
+        ("time,acc (NS)\nms,g", 1.0),
+        ("time [ms],acc [g]\n# station X", 1.0),
+        ("time [ms],acc [g]\n-----,-----", 1.0),
+        ("time [ms],acc {cm/s2}", 980.665),
+        ("time [ms],acc [g] corrected", 1.0),
+        ("time [ms],acc [cm·s⁻²]", 980.665),
+        ("# Units: ms, cm/s2", 980.665),
+        ("# Times in ms\n# Units: cm/s2\ntime,acc", 980.665),
+    ],
+)
+def test_units_of_a_header_wherever_they_stand(file, header, per_g):
+    """In words, beside a slash, in a line of their own, above a comment or a rule: a factor of 1000 or 981 each."""
+    separator = next((mark for mark in ",;" if mark in header.splitlines()[-1]), ",")
+    path = file(f"{header}\n{IN_MS.replace(',', separator)}")
+    record = read_record(path)
+    np.testing.assert_allclose(record.samples, SAMPLES / per_g)
+    np.testing.assert_allclose(record.dt, 0.02, rtol=1e-12)
+    with pytest.raises(ValueError, match="Argument `unit` must agree with file"):
+        read_record(path, unit="g" if per_g != 1 else "cm/s2")
+
+
+@pytest.mark.parametrize(
+    "header, message",
+    [
+        ("time [ms],acc [g],note", "line 1 has 3 titles, but 2 columns of numbers follow"),
+        ("time,acc,note\nms,g,-", "line 2 has 3 titles, but 2 columns"),
+        ("t [ms],acc [g]\ns,g", "line 1 states the unit 'ms', but line 2 's'"),
+        ("t [ms],acc [g]\n# Units: cm/s2", "line 1 states the unit 'g', but line 2 'cm/s2'"),
+        ("# Units: counts", "line 1 states the unit 'counts', but accelerations must be in g"),
+        (
+            "acc [g],time [s]",
+            "`column` must be a column of accelerations, but column 1 of text file `motion.txt` holds",
+        ),
+        ("time [ms],acc (g) [cm/s2]", "states the unit 'g or else cm/s2'"),
+        ("time [0.01 s],acc [g]", "titles column 0 'time \\[0.01 s\\]'"),
+    ],
+)
+def test_a_header_that_is_not_clear_is_refused(file, header, message):
+    with pytest.raises(ValueError, match=message):
+        read_record(file(f"{header}\n{IN_MS}"), unit="g")
+
+
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "[g/10]", "[0.1 g]", "[10^-3 g]", "[percent g]", "[% of g]", "[cm/ss]", "[cmps2]", "[cm/sq.s]", "[cm/(s*s)]",
+        "[cm/s2 x 10]", "in mg", "/mg", "_counts",
+    ],
+)  # fmt: skip
+def test_a_part_of_g_is_not_g(file, unit):
+    with pytest.raises(
+        ValueError, match="line 1 states the unit|must agree with file `motion.txt`, which is in 'cm/s2'"
+    ):
+        read_record(file(f"time [ms],acc {unit}\n{IN_MS}"), unit="g")
+
+
+@pytest.mark.parametrize("line", ["PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal"])
+@pytest.mark.parametrize("titles", ["", "time,acc\n", "time,acc [g]\n"])
+def test_a_value_in_a_header_is_no_title(file, line, titles):
+    np.testing.assert_array_equal(read_record(file(f"# {line}\n{titles}{PAIRS}"), unit="g").samples, SAMPLES)
+    np.testing.assert_array_equal(read_record(file(f"{titles}# {line}\n{PAIRS}"), unit="g").samples, SAMPLES)
+    if not titles:
+        np.testing.assert_array_equal(read_record(file(f"# {line}\n{ONE_COLUMN}"), unit="g", dt=1).samples, SAMPLES)
+
+
+def test_a_title_beside_an_empty_last_field_is_passed_over(file):
+    path = file("time [ms],acc [g],note\n" + IN_MS.replace("\n", ",\n"))
+    np.testing.assert_array_equal(read_record(path).samples, SAMPLES)
+
+
+def test_a_long_step_of_times_without_a_unit_is_warned_of(file):
+    path = file(f"time,acc\n{IN_MS}")
+    with pytest.warns(UserWarning, match="`motion.txt` does not say in what its times are: .* time step is 20 s, long"):
+        read_record(path, unit="g")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_record(path, unit="g", dt=20.0)
+        read_record(file(f"time [s],acc\n{IN_MS}"), unit="g")
+
+
+@pytest.mark.parametrize("header, dt", [("time [s],NS,UD", 0.3), ("time,NS,UD", 0.3), ("# no titles", 0.02)])
+def test_times_are_no_accelerations(file, header, dt):
+    table = "".join(f"{t:.2f},{a},{2 * a}\n" for t, a in zip(TIMES, SAMPLES))
+    with pytest.raises(ValueError, match="`column` must be a column of accelerations, but column 0 of text file"):
+        read_record(file(f"{header}\n{table}"), column=0, dt=dt, unit="g")
 
 
 @pytest.mark.parametrize("title", ["frequency [Hz]", "period [s]", "Period", "NS [g]", "t [Hz]"])
@@ -513,13 +643,17 @@ def test_many_columns_without_times(file):
         ),
         pytest.param("t [s];a [g]\n0;0,1e-3\n", {}, "line 2 holds decimal commas", id="decimal commas below titles"),
         pytest.param("0\t0,1\n", {}, "line 1 holds decimal commas", id="decimal commas and tabs"),
+        pytest.param("0,123\n-0,456\n0,789\n", {"dt": 0.01}, "line 1 holds decimal commas", id="decimal commas alone"),
+        pytest.param(
+            "0,123\n-0,456\n0,789\n", {"dt": 0.01, "column": 1}, "line 1 holds decimal commas", id="the same, column 1"
+        ),
         pytest.param("0.00 1_0\n0.01 1_1\n", {}, "line 1 holds more than numbers", id="underscores"),
         pytest.param("time,acceleration\n", {}, "no line holds columns of numbers", id="header only"),
         pytest.param("0.0,0.1\n", {}, "has one row only, so its times give no time step", id="one row"),
-        pytest.param("0,1\n0,2\n", {}, "the times in column 0 do not increase", id="constant times"),
+        pytest.param("0,1.0\n0,2.0\n", {}, "the times in column 0 do not increase", id="constant times"),
         pytest.param("1700000000 1\n1700000000.01 2\n1700000000.03 3\n", {}, "not equally spaced", id="epoch times"),
         pytest.param("0.00 1\n0.00 2\n0.01 3\n0.01 4\n0.02 5\n", {}, "not equally spaced", id="times too coarse"),
-        pytest.param("1,1\n0,2\n", {}, "the times in column 0 do not increase", id="times that fall"),
+        pytest.param("1,1.0\n0,2.0\n", {}, "the times in column 0 do not increase", id="times that fall"),
         pytest.param(
             PAIRS.replace("0.06,-0.04\n", ""),
             {},
@@ -741,9 +875,15 @@ ESM = ESM_HEADER + "".join(f"{x:.6f}\n" for x in ESM_SAMPLES)
 
 
 @pytest.mark.parametrize(
-    "content", [ESM, ESM.rstrip(), ESM.replace("\n", "\r\n"), ESM.replace("PGA_CM/S^2: -2.500000\n", "")],
-    ids=["as it is", "no end of line", "CRLF", "no peak"],
-)  # fmt: skip
+    "content",
+    [
+        pytest.param(ESM, id="as it is"),
+        pytest.param(ESM.rstrip(), id="no end of line"),
+        pytest.param(ESM.replace("NDATA", "DURATION_S: 0.025\nNDATA"), id="duration"),
+        pytest.param(ESM.replace("\n", "\r\n"), id="CRLF"),
+        pytest.param(ESM.replace("PGA_CM/S^2: -2.500000\n", ""), id="no peak"),
+    ],
+)
 def test_esm(file, content):
     record = read_record(file(content, "motion.ASC"))
     np.testing.assert_allclose(record.samples, np.array(ESM_SAMPLES) / (100 * STANDARD_GRAVITY), rtol=1e-15)
@@ -757,6 +897,12 @@ def test_esm(file, content):
         (ESM.replace("NDATA: 5", "NDATA: 6"), {}, "announces 6 samples, but 5 follow"),
         (ESM.replace("NDATA: 5", "NDATA:"), {}, "must state a number as NDATA, but states ''"),
         (ESM.replace("0.005000", "0"), {}, "which is not positive"),
+        (ESM.replace("cm/s^2", "g"), {}, "line 9 states a peak of 2.5 cm/s2, but the largest sample is 2451"),
+        (
+            ESM.replace("NDATA", "DURATION_S: 0.025\nNDATA").replace(".005000", ".050000"),
+            {},
+            "line 6 states 0.025 s, but",
+        ),
         (ESM.replace("ACCELERATION", "VELOCITY"), {}, "line 10 states velocity"),
         (ESM.replace("cm/s^2", "cm/s"), {}, "line 8 states the unit 'cm/s'"),
         (ESM.replace("1.250000", "1.25OOOO"), {}, "line 13 should hold samples"),

@@ -15,13 +15,16 @@ from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import finite, scalar, shown
 from jaxrock._described import described
 from jaxrock.motions.files.parsing import PER_G
-from jaxrock.motions.files.reading import read_record
+from jaxrock.motions.files.reading import component_columns, read_record
 from jaxrock.motions.files.traces import record_of_trace
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record
 
-_DOWN = re.compile(r"\W*D(OW|W)N\W*", re.IGNORECASE)
-_VERTICAL = re.compile(r"\W*(U(P|D|-D|P-DOWN|P/DOWN)?|D(OW|W)N|V(ER\w*)?|..?Z|Z)\W*", re.IGNORECASE)
+_DOWN = re.compile(r"\W*D((OW|W)?N)?\W*", re.IGNORECASE)
+# Of PEER also VRT, VT, V1, UPDN and 000V.
+_VERTICAL = re.compile(
+    r"\W*(U(P|D|-D|P[-/ ]?(DN|DWN|DOWN))?\d?|D((OW|W)?N)?|\d*V(ER\w*|R?T)?\d?|..?Z|Z)\W*", re.IGNORECASE
+)
 
 
 class Components(eqx.Module):
@@ -103,7 +106,8 @@ def read_components(
     **Arguments:**
 
     - `paths`: two or three files, one for each component; or one file that holds them all.
-    - `columns`: of one file, which of its columns or channels, two or three; None: the first three.
+    - `columns`: of one file, which of its columns or channels, two or three; None: the first three, or of text
+      all beside a first one of times.
     - `given`: `format`, `dt` and `unit`, as in `read_record`.
 
     Which component is vertical the files say (UP, UD, Z, ...); where they do not, it is the last of three.
@@ -114,7 +118,8 @@ def read_components(
     as `Components`.
     """
     if isinstance(paths, (str, os.PathLike)):
-        records = [read_record(paths, column=int(column), **given) for column in (columns or (0, 1, 2))]
+        chosen = component_columns(paths, given.get("format")) if columns is None else columns
+        records = [read_record(paths, column=int(column), **given) for column in chosen]
     elif columns is not None:
         raise ValueError("Argument `columns` must be None where there is a file for each component.")
     elif not isinstance(paths, Sequence) or len(paths) not in (2, 3):

@@ -4,17 +4,18 @@ baseline, taper, filter, resample, cut, scale. Known records only: NumPy and Sci
 Every function gives a new `Record` that keeps the name and the origin.
 """
 
-from collections.abc import Callable
 from fractions import Fraction
 from typing import Annotated
 
+import jax
 import numpy as np
 import scipy.interpolate
 import scipy.signal
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least, known, word_of
 from jaxrock._checks import (
+    Range,
     Values,
     check_known,
     delay,
@@ -27,8 +28,10 @@ from jaxrock._checks import (
 )
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.motions.filters import LOWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.record import Record
+from jaxrock.motions.two_sensors import slow_difference, spline_of_displacement
 
 __all__ = [
     "baseline_corrected", "cut", "filtered", "from_displacement", "from_velocity", "fused", "resampled",
@@ -46,67 +49,36 @@ _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 def _samples(record: Record) -> tuple[np.ndarray, float]:
     check_single(record=record)
     check_known(record=record)
-    return np.asarray(record.samples, float), float(record.dt)
+    return np.asarray(record.samples, float), _decimal(record.dt)
 
 
-def _number(name: str, value: Inexact[Array, "..."]) -> float:
-    check_known(**{name: value})
-    return float(scalar(name, value))
+def _decimal(number: ArrayLike) -> float:
+    """A number as it was meant: 0.01 in single precision is 0.009999999776, and that no time fits."""
+    return float(str(np.asarray(number)[()]))
+
+
+def _number(name: str, value: ArrayLike, allowed: Range) -> float:
+    """The one number that an argument is, after a check; in all digits that were given."""
+    checked = allowed(name, value)
+    check_known(**{name: checked})
+    scalar(name, checked)
+    # In all digits that were given, of which JAX may keep half.
+    return _decimal(checked if isinstance(value, jax.Array) else value)
+
+
+def _slack(record: Record) -> float:
+    """By how much a ratio of times may be off, through rounding of the time step."""
+    return max(1e-12, 4 * float(np.finfo(np.asarray(record.dt).dtype).eps))
 
 
 def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Record:
     return Record(samples, record.dt if dt is None else dt, record.name, record.origin)
 
 
-def _smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, beyond: Callable) -> np.ndarray:
-    """After a low-pass without delay; `beyond(values, room)`: with so many more at either end."""
-    return values if corner is None else _butterworth(values, dt, None, corner, order, True, beyond)
-
-
-def _at_rest(values: np.ndarray, room: int) -> np.ndarray:
-    """Rest before and after."""
-    return np.pad(values, room)
-
-
-# What a ground at rest at first does, mirrored in time before it begins, and turned about its end after it. A mirror
-# image keeps the velocity at zero under a filter without delay; if the ground only rested before, it would jump.
-
-
-def _of_displacement(values: np.ndarray, room: int) -> np.ndarray:
-    last = values.size - 1
-    turns, place = np.divmod(np.abs(np.arange(-room, values.size + room)), 2 * last)
-    turned = 2 * values[-1] - values[np.minimum(2 * last - place, last)]
-    found = np.where(place <= last, values[np.minimum(place, last)], turned)
-    return np.where(turns % 2 == 0, found, 2 * values[-1] - found)
-
-
-def _of_velocity(values: np.ndarray, room: int) -> np.ndarray:
-    return np.pad(values, room, "reflect", reflect_type="odd")
-
-
-def _of_acceleration(values: np.ndarray, room: int) -> np.ndarray:
-    """The second derivative of `_of_displacement`."""
-    return _of_displacement(np.append(values[:-1], 0.0), room)
-
-
-def _butterworth(values, dt, low, high, order, zero_phase, beyond: Callable = _at_rest) -> np.ndarray:
-    edges = [edge for edge in (low, high) if edge is not None]
-    kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
-    sections = scipy.signal.butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / dt, output="sos")
-    if not zero_phase:
-        return scipy.signal.sosfilt(sections, values)
-    room = int(min(max(_ROOM * values.size, 100_000), np.ceil(3 * order / (min(edges) * dt))))
-    return scipy.signal.sosfiltfilt(sections, beyond(values, room), padtype=None)[room : room + values.size]
-
-
-_ROOM = 8  # in lengths of what is filtered: beyond either end no more, unless that is little
-_LOWEST = 1e-6  # corner over sampling rate: of lower ones coefficients of filters lose their digits, and at last all
-
-
 def _corner(name: str, value: float | None, dt: float) -> float | None:
-    if value is not None and value < _LOWEST / dt:
+    if value is not None and value < LOWEST / dt:
         raise ValueError(
-            f"Argument `{name}` must be at least a millionth of the sampling rate, {_LOWEST / dt:g} Hz, but is {value}."
+            f"Argument `{name}` must be at least a millionth of the sampling rate, {LOWEST / dt:g} Hz, but is {value}."
         )
     if value is not None and not value < 0.5 / dt:
         raise ValueError(
@@ -120,10 +92,13 @@ Order = Annotated[int, at_least(1, 20)]
 
 
 def _series(name: str, values: Values, dt: ArrayLike, unit: str) -> tuple[np.ndarray, float]:
-    array = np.asarray(strength(name, values), float)
+    checked = strength(name, values)
+    check_known(**{name: checked})
+    # In all digits that were given: a second derivative of what is rounded to single precision is noise.
+    array = np.asarray(checked if isinstance(values, jax.Array) else values, float)
     if array.ndim != 1 or array.size < 4:
         raise ValueError(f"Argument `{name}` must be a list of at least 4 samples, but has shape {array.shape}.")
-    return array * _UNITS[unit], _number("dt", size("dt", dt))
+    return array * _UNITS[unit], _number("dt", dt, size)
 
 
 @arguments
@@ -149,19 +124,14 @@ def from_displacement(
     - `name`: of the record.
 
     **Returns:** a `Record`: the second derivative of the cubic spline through the samples, which is at rest at first
-    and straight between samples. So integrated twice it comes back to every sample. Over 9.81 m/s^2.
+    and straight between samples. So integrated twice it comes back to every sample. Over 9.81 m/s^2. All is done in
+    double precision; samples that are given in single precision (arrays of JAX, where that is its precision) are noisy.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
     values, dt = _series("displacement", displacement, dt, unit)
-    values = _smoothed(values - values[0], dt, _corner("corner", corner, dt), order, _of_displacement)
-    return Record(_spline(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
-
-
-def _spline(displacement: np.ndarray, dt: float) -> scipy.interpolate.CubicSpline:
-    """Through samples of a ground that is at rest at first."""
-    time = dt * np.arange(displacement.size)
-    return scipy.interpolate.CubicSpline(time, displacement, bc_type=((1, 0.0), "not-a-knot"))
+    values = smoothed(values - values[0], dt, _corner("corner", corner, dt), order, of_displacement)
+    return Record(spline_of_displacement(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
 
 
 @arguments
@@ -188,7 +158,7 @@ def from_velocity(
     **Raises:** ValueError for arguments outside their ranges.
     """
     values, dt = _series("velocity", velocity, dt, unit)
-    values = _smoothed(values, dt, _corner("corner", corner, dt), order, _of_velocity)
+    values = smoothed(values, dt, _corner("corner", corner, dt), order, of_velocity)
     spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
     return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
 
@@ -215,9 +185,9 @@ def fused(
     - `corner`: of the Butterworth filters of this `order`, run forwards and backwards [Hz]: below, the displacement is
       believed, above, the accelerometer. Below half of both sampling rates.
 
-    **Returns:** a `Record` of the accelerometer's time step: the record, and after a low-pass what the second
-    derivative of the displacement's spline differs from it. Low-pass and high-pass add to one: what both agree on stays
-    as it is.
+    **Returns:** a `Record` of the accelerometer's time step: the record without a low-pass of what it differs by from
+    the second derivative of the displacement's spline. What both agree on stays as it is, a constant and a ramp of the
+    baseline go altogether, and other differences go on evenly beyond both ends.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -225,15 +195,13 @@ def fused(
     """
     samples, step = _samples(record)
     values, dt = _series("displacement", displacement, dt, unit)
-    corner = _corner("corner", corner, max(step, dt))
-    count = min(samples.size, int(np.floor((values.size - 1) * dt / step * (1 + 1e-12))) + 1)
-    # Both end there, so that what lies beyond is the same of both.
-    last = max(4, int(np.ceil((count - 1) * step / dt * (1 - 1e-12))) + 1)
+    _corner("corner", corner, max(step, dt))
+    slack = _slack(record)
+    count = min(samples.size, int(np.floor((values.size - 1) * dt / step * (1 + slack))) + 1)
+    last = max(4, int(np.ceil((count - 1) * step / dt * (1 - slack))) + 1)
     samples, values = samples[:count], values[:last] - values[0]
-    smooth = _spline(_smoothed(values, dt, corner, order, _of_displacement), dt)
-    slow = smooth(step * np.arange(count), 2) / GRAVITY
-    # Filtered before it is differentiated, at its own rate: fast noise would come back as slow.
-    return _like(record, samples - _smoothed(samples, step, corner, order, _of_acceleration) + slow)
+    drift = slow_difference(GRAVITY * samples, step, values, dt, corner, order)
+    return _like(record, samples - drift / GRAVITY)
 
 
 @arguments
@@ -272,7 +240,7 @@ def tapered(record: Record, seconds: ArrayLike) -> Record:
     **Raises:** ValueError for arguments outside their ranges.
     """
     samples, dt = _samples(record)
-    seconds, whole = _number("seconds", not_negative("seconds", seconds)), (samples.size - 1) * dt
+    seconds, whole = _number("seconds", seconds, not_negative), (samples.size - 1) * dt
     if 2 * seconds > whole:
         raise ValueError(f"Argument `seconds` must be at most half the record, {whole / 2:g} s, but is {seconds}.")
     return _like(record, samples * scipy.signal.windows.tukey(samples.size, 2 * seconds / whole if whole else 0.0))
@@ -300,7 +268,7 @@ def filtered(
         raise ValueError("Arguments `low` and `high` must not both be None.")
     if low is not None and high is not None and low >= high:
         raise ValueError(f"Argument `high` must be above `low`, {low} Hz, but is {high}.")
-    return _like(record, _butterworth(samples, dt, low, high, order, zero_phase))
+    return _like(record, butterworth(samples, dt, low, high, order, zero_phase))
 
 
 @arguments
@@ -313,17 +281,19 @@ def resampled(record: Record, dt: ArrayLike) -> Record:
 
     **Returns:** a `Record`. With a shorter step it lies on the old one's straight lines; with a step that is a whole
     number of times shorter it is the same motion. With a longer step it has passed a linear-phase low-pass below half
-    the new sampling rate first (`scipy.signal.resample_poly`).
+    the new sampling rate first (`scipy.signal.resample_poly`); the ground rests before and after, so that samples at
+    the ends of a record which does not begin or end at zero are smaller.
 
     **Raises:** ValueError for arguments outside their ranges, or a longer step that is no ratio of small numbers.
     """
     samples, old = _samples(record)
-    new = _number("dt", size("dt", dt))
-    if new <= old:
-        time = new * np.arange(int(np.floor((samples.size - 1) * old / new * (1 + 1e-12))) + 1)
+    new = _number("dt", dt, size)
+    slack = _slack(record)
+    if new <= old * (1 + slack):
+        time = new * np.arange(int(np.floor((samples.size - 1) * old / new * (1 + slack))) + 1)
         return _like(record, np.interp(time, old * np.arange(samples.size), samples), new)
-    ratio = Fraction(old / new).limit_denominator(1000)
-    if ratio == 0 or abs(float(ratio) * new / old - 1) > 1e-9:
+    ratio = Fraction(old / new).limit_denominator(10_000)
+    if ratio == 0 or abs(float(ratio) * new / old - 1) > max(1e-9, slack):
         raise ValueError(f"Argument `dt` must be to the old step, {old:g} s, as small whole numbers are, but is {new}.")
     return _like(record, scipy.signal.resample_poly(samples, ratio.numerator, ratio.denominator), new)
 
@@ -341,9 +311,10 @@ def cut(record: Record, begin: ArrayLike = 0.0, end: ArrayLike | None = None) ->
     **Raises:** ValueError for a part without samples.
     """
     samples, dt = _samples(record)
-    begin = _number("begin", delay("begin", begin))
-    end = (samples.size - 1) * dt if end is None else _number("end", delay("end", end))
-    first, last = int(np.ceil(begin / dt - 1e-9)), int(np.floor(min(end / dt, samples.size) + 1e-9))
+    begin = _number("begin", begin, delay)
+    end = (samples.size - 1) * dt if end is None else _number("end", end, delay)
+    slack = 1e-9 + _slack(record) * np.array([begin, end]) / dt
+    first, last = int(np.ceil(begin / dt - slack[0])), int(np.floor(min(end / dt + slack[1], samples.size)))
     part = samples[first : last + 1]
     if last < first or part.size == 0:
         raise ValueError(f"Arguments `begin` and `end` must leave a sample, but are {begin:g} and {end:g} s.")
@@ -377,8 +348,8 @@ def scaled(
         raise ValueError("Just one of the arguments `factor`, `acceleration` and `velocity` must be given.")
     ((name, value),) = given.items()
     if name == "factor":
-        return _like(record, samples * _number(name, any_factor(name, value)))
-    value = _number(name, positive(name, value))
+        return _like(record, samples * _number(name, value, any_factor))
+    value = _number(name, value, positive)
     peak = float((peak_acceleration if name == "acceleration" else peak_velocity)(record))
     if not peak > 0:
         raise ValueError("Argument `record` must move, but does not.")

@@ -9,16 +9,21 @@ from jaxrock.motions.files.parsing import (
     agreed_step,
     agreed_unit,
     announced_samples,
+    is_unit,
     no_column,
     plain_numbers,
     to_float,
 )
-from jaxrock.motions.files.titles import SECONDS
+from jaxrock.motions.files.titles import SECONDS, SHORT, is_any_unit
 from jaxrock.motions.record import Origin
 
-_UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)", re.IGNORECASE)
+_UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)(.*)", re.IGNORECASE)
+_UNIT_ALONE = re.compile(r"(?:\bIN\b|[(\[])\s*[(\[]?\s*([^\s,;()\[\]]+)(.*)", re.IGNORECASE)
+_TIMES = re.compile(r"\s*[)\]]?\s*(?:[*×/^]|X\s*[-+.\d]|TIMES\b|DIVIDED\b)", re.IGNORECASE)  # a factor beside a unit
+_OTHER_KIND = re.compile(r"^\s*(VELOCITY|DISPLACEMENT)\s+(?:TIME|HISTORY|SERIES|IN\s+UNITS)\b", re.IGNORECASE)
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
 _STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})\s*([A-Zµμ]*)", re.IGNORECASE)
+_RATE = re.compile(rf"(?<![A-Z])DT\s*=?\s*{NUMBER}\s*(K?HZ|SPS|SAMPLES|POINTS|PTS|1/S)", re.IGNORECASE)
 _BEFORE = re.compile(rf"^\s*(\d+)[\s,]+({NUMBER})[\s,]+NPTS[\s,]+DT\b", re.IGNORECASE)
 
 _MANY = 50  # lines that tell how numbers are printed
@@ -42,6 +47,7 @@ class AT2(AbstractFormat):
         if last is None:
             raise file_error(name, "no header line states NPTS and DT, as an AT2 file must.")
         count, step = _counts(lines[last])
+        _check_kind(name, lines[: last + 1])
         steps = _steps(lines[last])
         if len(set(steps)) > 1:
             raise file_error(name, f"line {last + 1} states time steps of {steps[0]:g} and {steps[1]:g} s.")
@@ -49,13 +55,37 @@ class AT2(AbstractFormat):
         if again:
             raise file_error(name, f"line {again[0] + 1} announces samples once more: one record to a file.")
         dt = agreed_step(name, dt, step)
-        at = next((number for number in range(last + 1) if _UNIT.search(lines[number])), None)
-        unit = agreed_unit(name, (at or 0) + 1, unit, "" if at is None else _UNIT.search(lines[at])[1])
+        at, written = next(((n, found) for n in range(last + 1) if (found := _unit_in(lines[n]))), (None, ""))
+        unit = agreed_unit(name, (at or 0) + 1, unit, written)
         samples = announced_samples(name, lines, last + 1, count, _numbers, plain_numbers)
         check_end(name, lines, _printed(lines[last + 1 :]), by_program=True)
         # Event, station and component stand above the unit; the first line only names the database.
         title = " ".join(lines[at - 1].split()) if at is not None and at >= 2 else ""
         return Accelerogram(samples, dt, unit, title, _origin(title))
+
+
+def _check_kind(name: str, header: list[str]) -> None:
+    """Refuse what is said to be no acceleration, and a sampling rate in place of a time step."""
+    for number, line in enumerate(header, 1):
+        kind, rate = _OTHER_KIND.search(line), _RATE.search(line)
+        if kind:
+            raise file_error(name, f"line {number} states {kind[1].lower()}, but samples must be accelerations.")
+        if rate:
+            raise file_error(name, f"line {number} states DT in {rate[1]!r}, but it must be a time step.")
+
+
+def _unit_in(line: str) -> str:
+    """The unit that a line of the header states, with a factor beside it, which makes it another; or nothing."""
+    found = _UNIT.search(line)
+    for alone in () if found else _UNIT_ALONE.finditer(line):
+        sure = is_any_unit(alone[1]) and alone[1].lower() not in SHORT and alone[1].lower() not in SECONDS
+        # A word such as G is a unit beside the word acceleration only.
+        if sure and (is_unit(alone[1]) and len(alone[1]) > 1 or re.search(r"\bACC", line, re.IGNORECASE)):
+            found = alone
+            break
+    if not found:
+        return ""
+    return found[1] + (found[2].rstrip() if _TIMES.match(found[2]) else "")
 
 
 def _origin(title: str) -> Origin:

@@ -1,6 +1,7 @@
 """Columns of text, separated by commas, semicolons, tabs or blanks, with or without times and lines of a header."""
 
 import re
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,12 +9,12 @@ import numpy as np
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, to_float
-from jaxrock.motions.files.titles import Titles
+from jaxrock.motions.files.titles import Titles, titles_of
+from jaxrock.motions.record import Origin
 
 _COMMA = r"[-+]?\d+(?:,\d+)?(?:[EeDd][-+]?\d+)?"
 _DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d){_COMMA}(?:[;\s]+{_COMMA})+[;\s]*")
 _FIELD = re.compile(NUMBER + r"|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
-_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS = re.compile(r"(?<=[\])])\s+"), re.compile(r"\s+(?![\[(])")
 
 
 class Columns(AbstractFormat):
@@ -38,14 +39,18 @@ class Columns(AbstractFormat):
             others = " nor ".join(each.name.upper() for each in self.with_headers)
             raise file_error(name, f"no line holds columns of numbers, and it is neither {others}.")
         width = table.shape[1]
+        _check_commas(name, lines, table, numbers)
         if column is None and width > 2 or column is not None and column >= width:
             allowed = f"be 0 to {width - 1}, the column of accelerations in text file `{name}`"
             raise ValueError(f"Argument `column` must {allowed}, but is {column}.")
         chosen = width - 1 if column is None else column
-        titles = _titles(lines, numbers[0] - 1, width)
-        written = titles.unit_of(chosen)
+        titles = _titles(name, lines, numbers[0], width)
+        if titles.is_time(chosen) or chosen == 0 < width - 1 and dt is not None and _are_times(table[:, 0], dt):
+            holds = f"be a column of accelerations, but column {chosen} of text file `{name}` holds times"
+            raise ValueError(f"Argument `column` must {holds}.")
+        line, written = titles.unit_of(name, chosen)
         if written:
-            unit = agreed_unit(name, titles.line, unit, written)
+            unit = agreed_unit(name, line, unit, written)
         if unit is None:
             allowed = "be 'g', 'm/s2' or 'cm/s2'"
             raise ValueError(f"Argument `unit` must {allowed} for text file `{name}`, which states none, but is None.")
@@ -53,27 +58,63 @@ class Columns(AbstractFormat):
         # Beside `column` and `dt`, column 0 may hold accelerations too; only times never fall.
         rising = times[-1] > times[0] and (np.diff(times) >= 0).all()
         if chosen > 0 and (column is None or dt is None or rising):
-            seconds = titles.seconds(name, times)
-            if seconds is not None:
-                dt = agreed_step(name, dt, float(f"{seconds * _step(name, times, numbers, printed):.12g}"))
+            dt = _step_of(name, titles, table[:, 0], numbers, printed, dt)
         if dt is None:
             raise ValueError(f"Argument `dt` must be given for text file `{name}`, which has no times, but is None.")
-        return Accelerogram(table[:, chosen], dt, unit, "")
+        return Accelerogram(table[:, chosen], dt, unit, "", Origin(component=titles.direction(chosen)))
+
+    def components(self, name, lines):
+        table, numbers, _ = _table(name, lines)
+        if not numbers:
+            return super().components(name, lines)  # which `read` refuses
+        width = table.shape[1]
+        titles = _titles(name, lines, numbers[0], width)
+        first = int(titles.is_time(0) or titles.counts(0) or _are_times(table[:, 0]))
+        if width - first not in (2, 3):
+            held = f"text file `{name}` has {width} columns" + (", the first of times" if first else "")
+            raise ValueError(f"Argument `columns` must be given, because {held}, but is None.")
+        return tuple(range(first, width))
 
 
-def _titles(lines: list[str], first: int, width: int) -> Titles:
-    """What is written above the `first` line of numbers, if it has a title for each column."""
-    number = next((k for k in range(first, 0, -1) if lines[k - 1].strip()), 0)
-    parted = _parted(lines[number - 1].lstrip("# ")) if number else []
-    return Titles(number, next((fields for fields in parted if len(fields) == width), []))
+_LONG_STEP = 0.2  # [s]; accelerations are sampled more often, and a step of 5 ms that is read as one of s is 5
 
 
-def _parted(line: str) -> list[list[str]]:
-    """A line of titles in fields, in all ways in which it may be meant: titles hold blanks, and units in brackets."""
-    line = line.strip()
-    tabs = [[field.strip() for field in line.split("\t")]] if "\t" in line else []
-    by_brackets = [mark.split(line) for mark in (_BEHIND_BRACKETS, _NOT_BEFORE_BRACKETS)]
-    return [*tabs, _fields(line), *(fields for fields in by_brackets if Titles(0, fields).state_units)]
+def _step_of(name: str, titles: Titles, times: np.ndarray, numbers, printed, dt: float | None) -> float | None:
+    """The time step of the first column, which agrees with `dt` if that is given [s]; `dt` where it counts samples."""
+    seconds = titles.seconds(name, times)
+    if seconds is None:
+        return dt
+    factor, stated = seconds
+    step = agreed_step(name, dt, float(f"{factor * _step(name, times, numbers, printed):.12g}"))
+    if dt is None and not stated and step > _LONG_STEP:
+        told = f"File `{name}` does not say in what its times are: taken for seconds, the time step is {step:g} s"
+        warnings.warn(f"{told}, long for accelerations. Are they in ms? A title `time [ms]` says so.", stacklevel=5)
+    return step
+
+
+def _are_times(values: np.ndarray, dt: float | None = None) -> bool:
+    """Whether numbers rise evenly, by `dt` if that is given, as times do."""
+    steps = np.diff(values)
+    step = dt or (float(np.median(steps)) if steps.size else 0.0)
+    return steps.size > 1 and step > 0 and bool((np.abs(steps - step) <= 0.01 * step).all())
+
+
+def _titles(name: str, lines: list[str], first: int, width: int) -> Titles:
+    """What is written above line number `first`, of numbers."""
+    return titles_of(name, lines[: first - 1], width, lines[first - 1].rstrip().endswith((",", ";")))
+
+
+_ONE_COMMA = re.compile(r"\s*[-+]?\d+,\d+(?:[EeDd][-+]?\d+)?\s*")
+
+
+def _check_commas(name: str, lines: list[str], table: np.ndarray, numbers: Sequence[int]) -> None:
+    """Refuse numbers with decimal commas, one to a line, that look like two columns of whole numbers."""
+    if table.shape[1] != 2 or not _ONE_COMMA.fullmatch(lines[numbers[0] - 1]):
+        return
+    rising = len(table) > 1 and (np.diff(table[:, 0]) > 0).all()
+    if not rising and all(_ONE_COMMA.fullmatch(lines[number - 1].split("#")[0]) for number in numbers):
+        text = lines[numbers[0] - 1].strip()
+        raise file_error(name, f"line {numbers[0]} holds decimal commas, which must be points: {text[:60]!r}.")
 
 
 def _fields(line: str) -> list[str]:

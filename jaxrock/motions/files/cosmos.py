@@ -1,8 +1,9 @@
-"""COSMOS, the format of strong-motion centres for one channel a file: V1 (uncorrected) and V2 (also V2c)."""
+"""COSMOS, the format of strong-motion centres, mostly for one channel a file: V1 (uncorrected) and V2 (also V2c)."""
 
 import re
 
 from jaxrock._text import check_end, file_error
+from jaxrock.motions.files.csmip import chosen_channel
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import (
     agreed_step,
@@ -10,7 +11,6 @@ from jaxrock.motions.files.parsing import (
     announced_columns,
     check_peak,
     fixed_numbers,
-    no_column,
 )
 from jaxrock.motions.record import Origin
 
@@ -23,6 +23,7 @@ _DATA = re.compile(
 _FIRST = re.compile(r"^\s*(RAW|UNCORRECTED|CORRECTED|RESPONSE)\b.*\(\s*FORMAT\s+V?\d", re.IGNORECASE)
 _SPECTRA = re.compile(r"^\s*RESPONSE\b.*\(\s*FORMAT\s+V?\d", re.IGNORECASE)
 _REALS = re.compile(r"^\s*(\d+)\s+Real-header values follow.*?\(\s*\d*F(\d+)\.\d+", re.IGNORECASE)
+_ACCELERATION = re.compile(r"(uncor\w*\s+|raw\s+)?accel", re.IGNORECASE)
 _STEP, _PEAK, _UNKNOWN = 61, 63, -999.0  # places in the real header: time step [ms], largest sample
 
 
@@ -43,19 +44,20 @@ class COSMOS(AbstractFormat):
         return any(_FIRST.match(line) for line in lines[:3]) and any(map(_DATA.match, lines[:400]))
 
     def read(self, name, lines, dt, unit, column):
-        no_column(name, column, "COSMOS")
-        at = next((number for number, line in enumerate(lines) if _DATA.match(line)), None)
-        if at is None and is_spectra(lines):
+        records = _records(lines)
+        if not records and is_spectra(lines):
             raise file_error(
                 name, "holds response spectra (COSMOS V3), but no accelerations: read the record's V2 file."
             )
-        if at is None:
+        if not records:
             raise file_error(name, "no line announces 'acceleration pts', as a COSMOS file must.")
+        start, at, end = records[chosen_channel(name, "COSMOS", column, len(records))]
+        lines = lines[:end]
         count, what, seconds, written, per_line, width = _DATA.match(lines[at]).groups()
-        if not re.match(r"(uncor\w*\s+|raw\s+)?accel", what, re.IGNORECASE):
+        if not _ACCELERATION.match(what):
             raise file_error(name, f"line {at + 1} announces {what.lower()}, but samples must be accelerations.")
         unit = agreed_unit(name, at + 1, unit, written)
-        reals = _reals(name, lines)
+        reals = _reals(name, lines, start)
         step = reals[_STEP] / 1000
         # The line says it again, in whole seconds.
         if abs(int(count) * step - float(seconds)) > 1 + 0.01 * float(seconds):
@@ -67,14 +69,25 @@ class COSMOS(AbstractFormat):
             check_end(name, lines, [line[-width:] for line in lines[at + 1 :] if line.strip()], by_program=True)
         if unit == "cm/s2" and reals[_PEAK] != _UNKNOWN:
             check_peak(name, at + 1, reals[_PEAK], samples, "the header")
-        origin = _origin(lines[:at])
+        origin = _origin(lines[start:at])
         title = ", ".join(filter(None, (origin.event, origin.station, origin.component)))
         return Accelerogram(samples, agreed_step(name, dt, step), unit, title, origin)
 
 
-def _reals(name: str, lines: list[str]) -> list[float]:
-    """The real header."""
-    at, found = next(((n, found) for n, line in enumerate(lines) if (found := _REALS.match(line))), (0, None))
+def _records(lines: list[str]) -> list[tuple[int, int, int]]:
+    """Where each record of accelerations begins, announces its samples and ends; where there are none, of anything."""
+    starts = [number for number, line in enumerate(lines) if _FIRST.match(line)]
+    found = {number: said[2] for number, line in enumerate(lines) if (said := _DATA.match(line))}
+    chosen = [number for number, what in found.items() if _ACCELERATION.match(what)] or list(found)
+    begins = [max((start for start in starts if start < at), default=0) for at in chosen]
+    ends = [min((other for other in (*starts, *found) if other > at), default=len(lines)) for at in chosen]
+    return list(zip(begins, chosen, ends))
+
+
+def _reals(name: str, lines: list[str], start: int) -> list[float]:
+    """The real header of the record that begins at a line."""
+    numbered = enumerate(lines[start:], start)
+    at, found = next(((n, found) for n, line in numbered if (found := _REALS.match(line))), (0, None))
     if found is None:
         raise file_error(name, "no line announces 'Real-header values', as a COSMOS file must.")
     count, width = map(int, found.groups())

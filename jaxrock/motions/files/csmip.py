@@ -24,7 +24,7 @@ from jaxrock.motions.record import Origin
 # ", in cm/sec2. (8f10.6)" and those of USC "IN UNITS CM/SEC/SEC".
 _CHANNEL = re.compile(
     rf"^\s*(\d+)\s+POINTS OF ACC\w*\s+DATA,?\s+EQUALLY SPACED AT\s*({NUMBER})\s*SEC(?:ONDS?)?[\s.,]*"
-    r"\(?\s*(?:IN\s+)?(?:UNITS\s*[:=]?\s*)?([^\s,;()]*)[\s).]*(?:\(\s*\d*[FEG](\d+)\.\d+\s*\))?",
+    r"\(?\s*(?:IN\s+)?(?:UNITS\s*(?:[:=]|OF\b)?\s*)?(?!\d*[FEG]\d)([^\s,;()]*)[\s).]*(?:\(\s*\d*[FEG](\d+)\.\d+\s*\))?",
     re.IGNORECASE,
 )
 

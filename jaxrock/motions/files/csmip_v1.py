@@ -52,7 +52,7 @@ class CSMIPUncorrected(AbstractFormat):
         block = _samples(name, lines, announced) if announced is not None else _pairs(name, lines, at)
         if channel == len(starts) - 1:
             check_last_columns(name, lines, block.start, block.width)
-        unit = agreed_unit(name, block.line, unit, _TENTHS.sub("g", block.unit))
+        unit = agreed_unit(name, block.line, unit, "g" if _TENTHS.fullmatch(block.unit) else block.unit)
         samples = block.samples / 10 if _TENTHS.fullmatch(block.unit) else block.samples
         _check_peak(name, lines, at, samples, unit)
         if block.times is None:

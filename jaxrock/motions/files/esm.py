@@ -8,6 +8,7 @@ from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import (
     NUMBER,
+    PER_G,
     agreed_step,
     agreed_unit,
     announced_samples,
@@ -20,6 +21,7 @@ from jaxrock.motions.record import Origin
 
 _KEY = re.compile(r"([A-Z][A-Z0-9_/^]*):\s*(.*)")
 _STEP, _COUNT, _KIND, _UNIT, _PEAK = "SAMPLING_INTERVAL_S", "NDATA", "DATA_TYPE", "UNITS", "PGA_CM/S^2"
+_DURATION = "DURATION_S"
 
 
 class ESM(AbstractFormat):
@@ -39,6 +41,7 @@ class ESM(AbstractFormat):
             raise file_error(name, f"line {header[_KIND][0]} states {kind.lower()}, but samples must be accelerations.")
         at, written = header.get(_UNIT, (0, ""))
         dt, unit = agreed_step(name, dt, step), agreed_unit(name, at, unit, written)
+        _check_duration(name, header, step, int(count))
         start = max(line for line, _ in header.values())
         samples = announced_samples(name, lines, start, int(count), _number, plain_numbers)
         printed = [line.strip() for line in (*lines[start : start + 60], *lines[max(start + 60, len(lines) - 60) :])]
@@ -75,5 +78,14 @@ def _number(line: str) -> list[float] | None:
 def _check_peak(name: str, header: dict, samples: np.ndarray, unit: str) -> None:
     """The largest sample is the peak that the header states."""
     line, value = header.get(_PEAK, (0, ""))
-    if unit == "cm/s2" and re.fullmatch(NUMBER, value):
-        check_peak(name, line, to_float(value), samples)
+    if re.fullmatch(NUMBER, value):
+        check_peak(name, line, to_float(value), samples * (PER_G["cm/s2"] / PER_G[unit]))
+
+
+def _check_duration(name: str, header: dict, step: float, count: int) -> None:
+    """So many samples take what the header states as their duration [s]."""
+    line, value = header.get(_DURATION, (0, ""))
+    if re.fullmatch(NUMBER, value) and abs(count * step - to_float(value)) > 2 * step + 0.01 * to_float(value):
+        raise file_error(
+            name, f"line {line} states {value} s, but {count} samples {step:g} s apart take {count * step:g}."
+        )

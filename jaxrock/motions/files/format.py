@@ -48,3 +48,7 @@ class AbstractFormat(abc.ABC):
         **Raises:** ValueError, with file and line, for a file that is damaged; ValueError for an argument that is
         missing, of no use for the format, or contradicted by the file.
         """
+
+    def components(self, name: str, lines: list[str]) -> tuple[int, ...]:
+        """Which of the columns or channels of a file are the components of one record: the first three."""
+        return (0, 1, 2)

@@ -15,8 +15,8 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, the g of accelerograms (not `rigid.GRAVITY`
 PER_G = {"g": 1.0, "m/s2": STANDARD_GRAVITY, "cm/s2": 100 * STANDARD_GRAVITY}
 _SPELLINGS = (
     {"g": "g"}
-    | dict.fromkeys(["m/s2", "m/s/s", "m s-2"], "m/s2")
-    | dict.fromkeys(["cm/s2", "cm/s/s", "cm s-2", "gal", "gals"], "cm/s2")
+    | dict.fromkeys(["m/s2", "m/s/s", "m s-2", "mps2"], "m/s2")
+    | dict.fromkeys(["cm/s2", "cm/s/s", "cm s-2", "cmps2", "gal", "gals"], "cm/s2")
 )
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 
@@ -41,12 +41,18 @@ def agreed_step(name: str, given: float | None, stated: float) -> float:
 
 
 def _spelling(written: str) -> str:
-    return re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s").replace("²", "2")
+    text = re.sub(r"\^|\*\*", "", written.lower().rstrip(".")).replace("sec", "s").replace("²", "2")
+    return re.sub(r"m\s*[.·⋅ ]\s*s\s*[-−⁻]\s*2$", "m s-2", text)
+
+
+def unit_named(written: str) -> str | None:
+    """The unit of acceleration, one of `PER_G`, that a word names; None for other words."""
+    return _SPELLINGS.get(_spelling(written))
 
 
 def is_unit(written: str) -> bool:
     """Whether a word is a unit of acceleration."""
-    return _spelling(written) in _SPELLINGS
+    return unit_named(written) is not None
 
 
 def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
@@ -56,7 +62,7 @@ def agreed_unit(name: str, line: int, given: str | None, written: str) -> str:
             told = f"Argument `unit` must be given for file `{name}`, whose header states none, but is None."
             raise ValueError(told)
         return given
-    stated = _SPELLINGS.get(_spelling(written))
+    stated = unit_named(written)
     if stated is None:
         known = "g, m/s2, cm/s2 or gal"
         raise file_error(name, f"line {line} states the unit {written!r}, but accelerations must be in {known}.")

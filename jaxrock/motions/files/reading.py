@@ -75,11 +75,13 @@ def read_record(
     - `unit`: of the accelerations in the file, "g", "m/s2" or "cm/s2". Needed for text; elsewhere it
       must agree with the header.
     - `column`: counted from 0. Text: the column of accelerations, needed when there are more than two;
-      column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls.
-      V1, V2: the channel (None: the first). The others hold one record.
+      column 0 then holds the times, unless `column` is 0, or `dt` is given and column 0 also falls. What a header says
+      of columns counts: units of times and accelerations, and which are times.
+      V1, V2, COSMOS: the channel (None: the first). The others hold one record.
 
     **Returns:** a `Record` in units of g = 9.80665 m/s^2, named after the header (or the file); its `origin` is what
-    the file says of it. Its first sample is at time 0, whatever the times in the file. It warns of samples beyond 20 g.
+    the file says of it. Its first sample is at time 0, whatever the times in the file. It warns of samples beyond 20 g,
+    and of times without a unit that are more than 0.2 s apart.
 
     **Raises:** OSError if the file cannot be opened; ValueError, with file and line, for one that is
     empty, binary or damaged; ValueError for an argument that is missing, not allowed, of no use for
@@ -90,6 +92,20 @@ def read_record(
     lines = text_lines(path)
     chosen = _format_of(lines, path.suffix) if format is None else FORMATS[format]
     return _record(path, chosen, chosen.read(path.name, lines, dt, unit, column))
+
+
+def accelerogram_of(name: str, lines: list[str]) -> tuple[str, Accelerogram]:
+    """The format of lines, and what they hold, where nothing is said beside them."""
+    chosen = _format_of(lines, "")
+    return chosen.name, chosen.read(name, lines, None, None, None)
+
+
+def component_columns(path: str | os.PathLike, format: str | None = None) -> tuple[int, ...]:
+    """Which columns or channels of a file are the components of one record, where nobody says: no times among them."""
+    path = path_of("path", path)
+    lines = text_lines(path)
+    chosen = _format_of(lines, path.suffix) if format is None else FORMATS[_known_format("format", format)]
+    return chosen.components(path.name, lines)
 
 
 def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
