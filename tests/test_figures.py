@@ -1,5 +1,7 @@
 """Figures show what they are given: the data in the axes, of results that are made by hand."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -236,6 +238,38 @@ def test_a_spectrum_may_have_a_logarithmic_axis():
         assert axis.get_ylim()[0] == 0
         axis.set_yscale("log")
         assert 0 < axis.get_ylim()[0] < 0.5 < axis.get_ylim()[1]
+
+
+def test_a_spectrum_leaves_out_what_was_not_computed():
+    """Gaps with a cross: numbers there are those of a part of the motion, and no verdicts, whatever they say."""
+    status = jax.vmap(lambda bad: rk.Status.where(bad, rk.Status.step_budget_exhausted, rk.Status.successful))(
+        jnp.array([False, False, True, True])
+    )
+    found = spectrum_of([False, True, True, False], [1.0, 2.0, 3.0, 4.0])
+    for axis in rk.plot.spectrum(eqx.tree_at(lambda x: x.status, found, status)):
+        assert axis.lines[0].get_ydata()[0] == 0.5 and np.isnan(axis.lines[0].get_ydata()[1:]).all()
+        (crosses,) = (line for line in axis.lines if line.get_marker() == "x")
+        assert crosses.get_xdata().tolist() == [3.0, 4.0] and crosses.get_label() == "not computed"
+        assert [(patch.get_x(), patch.get_width()) for patch in axis.patches] == [(1.5, 1.0)]
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_spectrum_of_none_that_rocks_starts_at_zero(lost):
+    peaks = jnp.full(2, jnp.inf if lost else 0.0)
+    found = spectrum_of([lost, lost], [1.0, 2.0])
+    for axis in rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks))):
+        assert axis.get_ylim() == (0, 1)
+
+
+def test_the_legend_of_many_intensities_lies_beside_the_curves():
+    lost = np.zeros((8, 3), bool)
+    found = eqx.tree_at(
+        lambda x: x.intensity, spectrum_of(lost, [1.0, 2.0, 3.0]), jnp.arange(1.0, 9), is_leaf=lambda x: x is None
+    )
+    axis, _ = rk.plot.spectrum(found)
+    axis.figure.canvas.draw()
+    legend = axis.get_legend().get_window_extent()
+    assert legend.x0 >= axis.get_window_extent().x1 and legend.x1 <= axis.figure.bbox.x1
 
 
 def wrong_figures():
