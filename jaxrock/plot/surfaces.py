@@ -115,8 +115,8 @@ def overturning(
     - `by_duration`: uplift strength over pulse duration, as single-lobe pulses are drawn, in place of intensity over
       frequency ratio.
     - `exact`: whether borders are drawn where they are (`overturning_borders`: islands and gaps too, whatever the grid;
-      pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map,
-      if they take half a million scenes at most.
+      pixels remain where islands are too many, or the search failed) or pixels alone; None: borders where the series
+      engine solves the map, if they take half a million scenes at most.
     - `safe`: whether survivors are coloured, with a scale beside the axis.
     - `progress`: whether to draw a progress bar while borders are looked for; None: on a terminal, if it takes long.
 
@@ -196,6 +196,8 @@ def borders(
 ) -> "Axes":
     """Draw the borders of an overturning map alone: to lay several over each other.
 
+    Those in the ranges that `overturning_borders` calls crowded are not all drawn; then the log says so.
+
     **Arguments:**
 
     - `result`: as in `overturning`.
@@ -216,7 +218,10 @@ def borders(
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     label = line.pop("label", None)
     ends = [edge(np.asarray(result.intensity)) for edge in (np.min, np.max)]
-    for region in overturning_borders(result, progress=progress).regions:
+    found = overturning_borders(result, progress=progress)
+    if found.crowded.size:
+        _LOG.info("borders are left out where islands are too many, or the search failed (`Borders.crowded`)")
+    for region in found.regions:
         for edge in (region.lower, region.upper):
             inside = (edge > ends[0] * (1 + 1e-12)) & (edge < ends[1] * (1 - 1e-12))
             if inside.any():  # not the edge of the map
