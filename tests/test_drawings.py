@@ -104,6 +104,27 @@ def test_the_motion_is_drawn_below(motion, symbol):
 
 
 @pytest.mark.parametrize(
+    "motion",
+    [0.7 * rk.SinePulse(0.5, 1.0), rk.MavroeidisPapageorgiouPulse(0.5, 1.0, 1.5, 1.0), rk.Record([0.1, 0], 0.1)],
+)
+def test_a_peak_that_is_no_amplitude_is_not_called_so(motion):
+    (below,) = rk.plot.scene(BLOCK, motion).child_axes
+    assert " $a_g$" not in words(below) and " peak" in words(below)
+
+
+@pytest.mark.parametrize("block", [rk.Block(0.05, 2.0), rk.Block(0.2, 2.0), rk.Block(0.9, 2.0), ROCK])
+def test_a_scene_is_in_its_figure(block):
+    """With all its words, from the first picture on."""
+    axis = rk.plot.scene(block, PULSE)
+    figure = axis.figure
+    figure.canvas.draw()
+    (below,) = axis.child_axes
+    for box in (axis.get_tightbbox(), below.get_tightbbox(), below.xaxis.label.get_window_extent()):
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
+
+
+@pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: rk.plot.scene(BLOCK, rotation=2.0), r"Argument `rotation` must be in \[-pi/2, pi/2\]"),
