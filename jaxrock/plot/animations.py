@@ -230,8 +230,9 @@ def _gif_writer(interval: float):
 
     class Writer(PillowWriter):
         def finish(self) -> None:
-            kept: list[Any] = self._frames[::every]
-            due = np.append(np.arange(len(kept)) * every, len(self._frames)) * interval
+            frames: list[Any] = vars(self)["_frames"]
+            kept = frames[::every]
+            due = np.append(np.arange(len(kept)) * every, len(frames)) * interval
             lasts = np.maximum(10 * np.diff(np.round(due / 10)), 20).astype(int).tolist()
             kept[0].save(self.outfile, save_all=True, append_images=kept[1:], duration=lasts, loop=0)
 
