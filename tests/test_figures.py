@@ -153,18 +153,22 @@ def test_feasible_region():
 
 
 def test_a_wall_lies_along_the_axes_of_its_region():
-    """Whichever of the two is drawn upward; over other parameters it has no place."""
+    """Whichever of the two is drawn upward, with gaps where not all is known; over other parameters it has no place."""
     amplitude, period, likelihood = jnp.array([0.1, 1.0]), jnp.array([0.2, 2.0]), jnp.zeros((2, 2))
     wall = rk.inverse.Unexceeded(
-        jnp.array([0.5, 1.5]), jnp.array([0.3, 0.4]), jnp.ones((1, 2)), jnp.zeros(2, int), jnp.ones(2, bool)
+        jnp.array([0.5, 1.5, 1.8]), jnp.array([0.3, 0.4, 0.5]), jnp.ones((1, 3)), jnp.zeros(3, int), jnp.arange(3) < 2
     )
 
     def drawn(names, values):
         region = rk.inverse.FeasibleRegion(names, values, likelihood, likelihood > -1)
         return rk.plot.feasible_region(region, wall=wall).lines[0].get_xydata()
 
-    np.testing.assert_allclose(drawn(("amplitude", "period"), (amplitude, period)), [[0.5, 0.3], [1.5, 0.4]])
-    np.testing.assert_allclose(drawn(("duration", "amplitude"), (period, amplitude)), [[0.3, 0.5], [0.4, 1.5]])
+    np.testing.assert_allclose(
+        drawn(("amplitude", "period"), (amplitude, period)), [[0.5, 0.3], [1.5, 0.4], [1.8, np.nan]]
+    )
+    np.testing.assert_allclose(
+        drawn(("duration", "amplitude"), (period, amplitude)), [[0.3, 0.5], [0.4, 1.5], [np.nan] * 2]
+    )
     for names in (("shape", "duration"), ("amplitude", "phase"), ("duration", "period")):
         with pytest.raises(ValueError, match=f"Argument `wall` must be None for a region over {names[0]} and"):
             drawn(names, (amplitude, period))

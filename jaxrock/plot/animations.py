@@ -66,10 +66,11 @@ def animate(
     body = Body.of(_drawn(response, block), model, _edges(response))
     count = int(np.ceil(duration * fps / rate)) + 1
     time = np.minimum(np.arange(count) * rate / fps, duration)
-    rotation, bending = body.lying(np.asarray(response(time)[0])), [None] * count
+    turned, bending = np.asarray(response(time)[0]), [None] * count
+    rotation = body.lying(turned)
     if isinstance(response, FlexibleResponse):
         alpha, heights = float(response.scene.block.alpha), body.heights
-        lean = np.sin(rotation) if response.scene.block.rotations == "finite" else rotation
+        lean = np.sin(turned) if response.scene.block.rotations == "finite" else turned
         bending = np.asarray(response.column(time)) - np.cos(alpha) * lean[:, None] * heights
     parts = _Parts(response, body, rate, rotation)
     last = fps  # pictures of the verdict: for a second

@@ -7,7 +7,7 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED, draw_cells, figure, in_order, limits_of, log_ticks
+from jaxrock.plot.style import GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,8 +22,8 @@ def feasible_region(
     **Arguments:**
 
     - `region`: a `FeasibleRegion`, its first parameter upward; both axes logarithmic if all values are positive.
-    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded, over an amplitude and a duration or period;
-      None leaves them out.
+    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded, over an amplitude and a duration or period,
+      with gaps where not all could be decided; None leaves them out.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
@@ -42,7 +42,7 @@ def feasible_region(
     if min(below.shape) > 1:  # a line of cells has no border
         axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
     if curve is not None:
-        axis.plot(*curve, color=RED, linewidth=1, label="up to here all that stand, stand")
+        broken_curve(axis, *curve, color=RED, linewidth=1, label="up to here all that stand, stand")
     ends = limits_of(columns), limits_of(rows)
     if estimate is not None and set(region.names) <= set(estimate.names):
         place = [float(estimate[name]) for name in region.names[::-1]]
@@ -63,16 +63,15 @@ def _label(name: str) -> str:
 
 
 def _along(wall: Unexceeded, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    """A wall over the second of two parameters and the first."""
-    curve = {"amplitude": np.asarray(wall.amplitude)} | dict.fromkeys(
-        ("duration", "period"), np.asarray(wall.durations)
-    )
+    """A wall over the second of two parameters and the first; what could not all be decided is no number."""
+    known = np.where(np.asarray(wall.complete), np.asarray(wall.amplitude), np.nan)
+    curve = {"amplitude": known} | dict.fromkeys(("duration", "period"), np.asarray(wall.durations))
     if "amplitude" not in names or not set(names) <= set(curve):
         raise ValueError(
             f"Argument `wall` must be None for a region over {names[0]} and {names[1]}: it is an amplitude over a "
             "duration or a period."
         )
-    return curve[names[1]], curve[names[0]]
+    return curve[names[1]], np.where(np.isfinite(known), curve[names[0]], np.nan)
 
 
 @figure(1)
