@@ -153,6 +153,36 @@ def test_map_with_borders(surface, regions):
     assert len(legends) == 2  # the map's, and that of the curves
 
 
+@pytest.fixture(scope="module")
+def too_few_steps():
+    """A map whose columns cannot be searched: what a search asks takes more steps than a verdict."""
+    grid, engine = (np.linspace(0.5, 8, 20), np.linspace(1.05, 9, 20)), rk.Series(max_steps=15)
+    return rk.overturning_map(*grid, alpha=0.2, restitution=0.95, engine=engine, progress=False)
+
+
+def test_columns_without_a_result_are_drawn_by_pixels(too_few_steps, caplog):
+    """They were taken for safe ones, although the map itself has its verdicts."""
+    found = rk.studies.overturning_borders(too_few_steps)
+    assert not found.regions and (found.crowded[0, 0], found.crowded[-1, 1]) == (0.5, 8)
+    state = np.asarray(too_few_steps.state)
+    assert (state >= 0).all() and (state > 0).sum() > 200
+    shown = rk.plot.overturning(too_few_steps).collections[-1].get_array()
+    np.testing.assert_array_equal(np.ma.filled(shown, 0), state)
+    with caplog.at_level("INFO", "jaxrock"):
+        rk.plot.borders(too_few_steps)
+    assert "borders are left out" in caplog.text
+
+
+def test_columns_that_the_map_contradicts_are_crowded(surface):
+    """One point of the map has another verdict than the borders around it."""
+    assert not rk.studies.overturning_borders(surface).crowded.size
+    row, column = np.argwhere(np.asarray(surface.state) == 0)[0]
+    other = dataclasses.replace(surface, state=surface.state.at[row, column].set(2))
+    place = float(surface.frequency_ratio[column])
+    crowded = rk.studies.overturning_borders(other).crowded
+    assert crowded.size and (np.min(abs(crowded - place), axis=1) == 0).all()
+
+
 def test_survivors_are_coloured_up_to_the_border(surface):
     """By their peaks, and pixels of overturned blocks beside survivors, of which the border leaves a part, too."""
     axis = rk.plot.overturning(surface, exact=False)

@@ -1,11 +1,14 @@
 """Drawings are to scale, at any rotation; films show the response and its verdict."""
 
 import importlib.util
+import re
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.patches import Polygon
+from PIL import Image
 from scipy.integrate import quad
 
 import jaxrock as rk
@@ -101,6 +104,27 @@ def test_the_motion_is_drawn_below(motion, symbol):
 
 
 @pytest.mark.parametrize(
+    "motion",
+    [0.7 * rk.SinePulse(0.5, 1.0), rk.MavroeidisPapageorgiouPulse(0.5, 1.0, 1.5, 1.0), rk.Record([0.1, 0], 0.1)],
+)
+def test_a_peak_that_is_no_amplitude_is_not_called_so(motion):
+    (below,) = rk.plot.scene(BLOCK, motion).child_axes
+    assert " $a_g$" not in words(below) and " peak" in words(below)
+
+
+@pytest.mark.parametrize("block", [rk.Block(0.05, 2.0), rk.Block(0.2, 2.0), rk.Block(0.9, 2.0), ROCK])
+def test_a_scene_is_in_its_figure(block):
+    """With all its words, from the first picture on."""
+    axis = rk.plot.scene(block, PULSE)
+    figure = axis.figure
+    figure.canvas.draw()
+    (below,) = axis.child_axes
+    for box in (axis.get_tightbbox(), below.get_tightbbox(), below.xaxis.label.get_window_extent()):
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
+
+
+@pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: rk.plot.scene(BLOCK, rotation=2.0), r"Argument `rotation` must be in \[-pi/2, pi/2\]"),
@@ -172,6 +196,54 @@ def test_each_side_has_its_own_threshold_and_saddle():
     np.testing.assert_allclose(points, [1.0, -2.0])
 
 
+def test_both_saddles_of_an_asymmetric_block_are_seen():
+    """And the manifolds that begin upright."""
+    block = rk.blocks.AsymmetricBlock(0.15, 0.3, 2.0)
+    response = rk.simulate(block, rk.SinePulse(0.2, 0.1), rk.Linear(), duration=0.5)
+    axis = rk.plot.phase(response)
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    assert left < -2 and 1 < right < 2.1
+    ends = [
+        abs(line.get_ydata()[0]) for line in axis.lines if line.get_color() == "#b3352c" and line.get_marker() != "o"
+    ]
+    assert len(ends) == 4 and -low == high > max(ends) > 1
+
+
+def test_a_vertical_acceleration_moves_the_threshold():
+    """What presses the block down holds it: the block lifts where the ground's acceleration passes the line."""
+    motion = rk.SinePulse(0.4, 1.0).with_vertical(rk.SinePulse(0.5, 0.5))
+    response = rk.simulate(BLOCK, motion, rk.Linear(), duration=1.5)
+    axis = rk.plot.history(response)[2]
+    lines = {line.get_label(): line for line in axis.lines}
+    time, vertical = lines["vertical"].get_xydata().T
+    np.testing.assert_allclose(vertical, motion.vertical.acceleration(time), atol=1e-12)
+    level = lines["uplift threshold"].get_ydata()
+    np.testing.assert_allclose(level, -float(BLOCK.alpha) * (1 + vertical))
+    begun = time[np.flatnonzero(np.asarray(response(time)[0]))[0]]
+    passed = time[np.flatnonzero(np.asarray(motion.acceleration(time)) > -level)[0]]
+    np.testing.assert_allclose(begun, passed, atol=2e-3)
+
+
+def test_a_response_without_a_result_is_called_so(response):
+    failed = rk.simulate(BLOCK, PULSE, rk.Linear(), duration=3.0, engine=rk.Series(max_steps=3))
+    said = "no result: the step budget was used up before the motion ended"
+    assert rk.plot.history(failed)[0].get_title() == rk.plot.phase(failed).get_title() == said
+    assert rk.plot.history(response)[0].get_title() == rk.plot.phase(response).get_title() == ""
+    film = started(rk.plot.animate(failed, fps=10, speed=10.0))
+    film._func(100)
+    axis = film._fig.axes[0]
+    assert " ".join(axis.get_title().split()).endswith(said)
+    box, whole = axis.title.get_window_extent(), film._fig.bbox
+    assert box.x0 > 0 and box.y1 < whole.y1 and box.x1 < film._fig.axes[1].get_window_extent().x0
+
+
+@pytest.mark.parametrize("draw", [rk.plot.history, rk.plot.phase, rk.plot.animate])
+def test_many_responses_are_in_no_figure(draw):
+    many = jax.vmap(lambda x: rk.simulate(BLOCK, rk.SinePulse(x, 1.0), rk.Linear(), duration=1.0))(np.array([0.3, 0.4]))
+    with pytest.raises(ValueError, match="holds many scenes"):
+        draw(many)
+
+
 def test_another_block_is_not_drawn(response):
     with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose alpha and p are"):
         rk.plot.animate(response, rk.Block(0.3, 2.0))
@@ -186,6 +258,43 @@ def test_films_are_written(kind, response, tmp_path):
     rk.plot.save_animation(film, path, dpi=30)
     start = path.read_bytes()[:15]
     assert start.startswith(b"GIF89a") if kind == "gif" else start == b"<!DOCTYPE html>"
+
+
+@pytest.mark.parametrize("fps", [7, 30, 60])
+def test_a_film_lasts_as_long_as_it_should(fps, response, tmp_path):
+    """Pictures of a GIF last whole hundredths of a second, and two at least, which all viewers keep."""
+    film = rk.plot.animate(response, fps=fps, speed=30.0)
+    rk.plot.save_animation(film, tmp_path / "film.gif", dpi=10)
+    with Image.open(tmp_path / "film.gif") as picture:
+        lasts = []
+        for number in range(picture.n_frames):
+            picture.seek(number)
+            lasts.append(picture.info["duration"])
+    assert abs(sum(lasts) / 1000 - (np.ceil(0.1 * fps) + 1 + fps) / fps) < 0.021
+    assert min(lasts) >= 20
+    rk.plot.save_animation(film, tmp_path / "film.html", dpi=10)
+    (step,) = re.findall(r"new Animation\(frames, img_id, slider_id, ([\d.]+)", (tmp_path / "film.html").read_text())
+    assert abs(float(step) - 1000 / fps) <= 0.5
+
+
+@pytest.mark.parametrize("block", [rk.Block(0.6, 2.0, 0.5), rk.blocks.AsymmetricBlock.from_corners(
+    [0.3, 0.1], [-0.2, 0.0], [0.0, 0.6], 0.5), rk.blocks.AsymmetricBlock.from_corners(
+    [0.3, 0.0], [-0.2, 0.15], [0.0, 0.6], 0.5)])  # fmt: skip
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_fallen_block_lies_on_the_ground_in_the_picture(block, way):
+    response = rk.simulate(block, rk.SinePulse(2.5 * way, 1.5), duration=6.0)
+    assert response.overturned
+    film = started(rk.plot.animate(response, block, fps=10, speed=1.0))
+    axis = film._fig.axes[0]
+    for number in range(62):
+        film._func(number)
+        outline, _, _ = drawn(axis)
+        (left, right), (_, high) = axis.get_xlim(), axis.get_ylim()
+        assert left < outline[:, 0].min() and outline[:, 0].max() < right and outline[:, 1].max() < high
+    body = Body.of(block, rk.Housner())
+    level = np.interp(outline[:, 0], [body.left[0], body.right[0]], [body.left[1], body.right[1]])
+    over = outline[:, 1] - level
+    assert abs(over.min()) < 1e-9 and (over < 1e-9).sum() >= 2  # on one of its sides
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")

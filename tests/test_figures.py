@@ -1,12 +1,18 @@
 """Figures show what they are given: the data in the axes, of results that are made by hand."""
 
+from dataclasses import fields
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 
 import jaxrock as rk
 from jaxrock.closed_form import sine_pulse, single_lobe
+from jaxrock.inverse.search import Trace
 from jaxrock.motions.pulses import PULSES, UNITS
 from jaxrock.studies.saved_outcomes import an_outcome
 from jaxrock.studies.sensitivities import Slopes, SlopeStatus
@@ -33,6 +39,14 @@ def test_tornado():
     axis = rk.plot.tornado(sensitivity_of([-2.0, 0.5]))
     assert [bar.get_width() for bar in axis.patches] == [0.5, -2.0]  # the largest on top, which is last
     assert [label.get_text() for label in axis.get_yticklabels()] == ["amplitude", "alpha"]
+
+
+def test_a_tornado_of_a_block_that_overturns_says_so():
+    """It was an empty frame."""
+    told = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.SinePulse(1.4, 0.9), rk.Linear())
+    with pytest.raises(ValueError, match="Argument `sensitivity` must have .* 'max_rotation', .*: draw its `margin`"):
+        rk.plot.tornado(told)
+    assert len(rk.plot.tornado(told, "margin").patches) == len(told.names)
 
 
 def test_sensitivity_map():
@@ -63,6 +77,15 @@ def test_critical():
         "overturns above: after impacts": [[0.5, 1.5]],
         "safe again above": [[0.5, 2.0]],
     }
+    maps = {patch.get_label(): patch.get_facecolor() for patch in rk.plot.overturning(
+        map_of([[0, 1], [0, 2]], [1.0, 2.0], [2.0, 3.0])).get_legend().get_patches()}  # fmt: skip
+    colors = {line.get_label().split(": ")[-1]: to_rgba(line.get_color()) for line in axis.lines}
+    assert colors["without impact"] == maps["overturned without impact"]
+    assert colors["after impacts"] == maps["overturned after impacts"]
+    assert axis.get_xlabel() and rk.plot.critical([0.5, 0.7], ends, label="period [s]").get_xlabel() == "period [s]"
+    part = eqx.tree_at(lambda x: x.complete, ends, jnp.array([True, False]))
+    (cross,) = (line for line in rk.plot.critical([0.5, 0.7], part).lines if line.get_marker() == "x")
+    assert cross.get_label() == "not all computed" and cross.get_xdata().tolist() == [0.7]
 
 
 def test_broken_curves():
@@ -89,6 +112,9 @@ def test_sine_regions():
     axis = rk.plot.sine_regions(0.9, frequency_ratio=np.geomspace(1.0, 4.0, 8))
     (curve,) = (line for line in axis.lines if line.get_label() == "case 2: no impact")
     np.testing.assert_allclose(curve.get_ydata(), sine_pulse.no_impact_limit(curve.get_xdata()))
+    over = rk.plot.overturning(map_of([[0, 1], [0, 2]], [1.0, 2.0], [2.0, 3.0]))
+    words = over.get_ylabel()
+    assert rk.plot.sine_regions(0.9, over, frequency_ratio=np.geomspace(1.0, 4.0, 8)).get_ylabel() == words
 
 
 def test_found_record():
@@ -106,6 +132,11 @@ def test_found_record():
         np.testing.assert_allclose(line.get_xydata(), np.stack([[0.0, 0.5, 1.0, 1.5], expected], axis=1))
     np.testing.assert_allclose(between.lines[0].get_ydata(), change, atol=1e-16)
     np.testing.assert_allclose(spectra.lines[1].get_xydata(), [[0.5, 0.1], [1.0, 0.0]], atol=1e-16)
+    long = eqx.tree_at(lambda x: x.start, found, rk.Record(start.samples, 0.5, "a station, " * 20))
+    axis = rk.plot.found_record(long)[0]
+    axis.figure.canvas.draw()
+    box, whole = axis.title.get_window_extent(), axis.figure.bbox
+    assert 0 < box.x0 and box.x1 < whole.x1 and box.y1 < whole.y1
 
 
 def test_feasible_region():
@@ -119,6 +150,64 @@ def test_feasible_region():
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
     assert float(axis.collections[0].get_array().max()) == 0.0
     np.testing.assert_allclose(axis.lines[0].get_ydata(), 0.5)
+
+
+def test_a_wall_lies_along_the_axes_of_its_region():
+    """Whichever of the two is drawn upward, with gaps where not all is known; over other parameters it has no place."""
+    amplitude, period, likelihood = jnp.array([0.1, 1.0]), jnp.array([0.2, 2.0]), jnp.zeros((2, 2))
+    wall = rk.inverse.Unexceeded(
+        jnp.array([0.5, 1.5, 1.8]), jnp.array([0.3, 0.4, 0.5]), jnp.ones((1, 3)), jnp.zeros(3, int), jnp.arange(3) < 2
+    )
+
+    def drawn(names, values):
+        region = rk.inverse.FeasibleRegion(names, values, likelihood, likelihood > -1)
+        return rk.plot.feasible_region(region, wall=wall).lines[0].get_xydata()
+
+    np.testing.assert_allclose(
+        drawn(("amplitude", "period"), (amplitude, period)), [[0.5, 0.3], [1.5, 0.4], [1.8, np.nan]]
+    )
+    np.testing.assert_allclose(
+        drawn(("duration", "amplitude"), (period, amplitude)), [[0.3, 0.5], [0.4, 1.5], [np.nan] * 2]
+    )
+    for names in (("shape", "duration"), ("amplitude", "phase"), ("duration", "period")):
+        with pytest.raises(ValueError, match=f"Argument `wall` must be None for a region over {names[0]} and"):
+            drawn(names, (amplitude, period))
+
+
+@pytest.mark.parametrize(("inside", "labels"), [(True, ["most likely"]), (False, [])])
+def test_a_cross_outside_of_a_region_is_not_listed(inside, labels):
+    values, likelihood = (jnp.array([0.1, 1.0]), jnp.array([0.2, 2.0])), jnp.zeros((2, 2))
+    region = rk.inverse.FeasibleRegion(("amplitude", "period"), values, likelihood, likelihood > -1)
+    estimate = an_estimate(("amplitude", "period"), [0.5, 1.0 if inside else 3.0])
+    axis = rk.plot.feasible_region(region, estimate)
+    assert axis.get_legend_handles_labels()[1] == labels
+    alone = rk.plot.search(estimate)
+    assert (alone.get_ylabel(), alone.get_xlabel()) == ("amplitude [g]", "period [s]")
+
+
+def an_estimate(names, values):
+    """With these parameters, and a search of no steps."""
+    zero = jnp.zeros(())
+    trace = Trace(jnp.full((1, 1, len(names)), jnp.nan), jnp.full((1, 1), jnp.nan))
+    numbers = {each.name: zero for each in fields(rk.inverse.Estimate)}
+    own = {"names": names, "values": jnp.asarray(values), "trace": trace, "open": jnp.zeros((2, 2), bool)}
+    told = {"responses": 0, "remarks": (), "status": rk.inverse.EstimateStatus.successful}
+    return rk.inverse.Estimate(**numbers | own | told)
+
+
+def test_ticks_of_many_decades_do_not_overlap():
+    figure, (few, many) = plt.subplots(2, 1, figsize=(5.5, 4))
+    few.set(xscale="log", xlim=(0.1, 90)), many.set(xscale="log", xlim=(1e-3, 100))
+    shown = []
+    for axis in (few, many):
+        rk.plot.log_ticks(axis)
+        figure.canvas.draw()
+        boxes = [x.get_window_extent() for x in axis.get_xticklabels() if x.get_text()]
+        assert all(a.x1 < b.x0 for a, b in zip(boxes, boxes[1:]))
+        (left, right), places = axis.get_xlim(), axis.get_xticks()
+        shown.append(places[(places >= left) & (places <= right)].tolist())
+    assert shown[0] == pytest.approx([0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50])
+    assert shown[1] == pytest.approx([1e-3, 1e-2, 0.1, 1, 10, 100])
 
 
 def maps_of(rows, columns):
@@ -236,6 +325,38 @@ def test_a_spectrum_may_have_a_logarithmic_axis():
         assert axis.get_ylim()[0] == 0
         axis.set_yscale("log")
         assert 0 < axis.get_ylim()[0] < 0.5 < axis.get_ylim()[1]
+
+
+def test_a_spectrum_leaves_out_what_was_not_computed():
+    """Gaps with a cross: numbers there are those of a part of the motion, and no verdicts, whatever they say."""
+    status = jax.vmap(lambda bad: rk.Status.where(bad, rk.Status.step_budget_exhausted, rk.Status.successful))(
+        jnp.array([False, False, True, True])
+    )
+    found = spectrum_of([False, True, True, False], [1.0, 2.0, 3.0, 4.0])
+    for axis in rk.plot.spectrum(eqx.tree_at(lambda x: x.status, found, status)):
+        assert axis.lines[0].get_ydata()[0] == 0.5 and np.isnan(axis.lines[0].get_ydata()[1:]).all()
+        (crosses,) = (line for line in axis.lines if line.get_marker() == "x")
+        assert crosses.get_xdata().tolist() == [3.0, 4.0] and crosses.get_label() == "not computed"
+        assert [(patch.get_x(), patch.get_width()) for patch in axis.patches] == [(1.5, 1.0)]
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_spectrum_of_none_that_rocks_starts_at_zero(lost):
+    peaks = jnp.full(2, jnp.inf if lost else 0.0)
+    found = spectrum_of([lost, lost], [1.0, 2.0])
+    for axis in rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks))):
+        assert axis.get_ylim() == (0, 1)
+
+
+def test_the_legend_of_many_intensities_lies_beside_the_curves():
+    lost = np.zeros((8, 3), bool)
+    found = eqx.tree_at(
+        lambda x: x.intensity, spectrum_of(lost, [1.0, 2.0, 3.0]), jnp.arange(1.0, 9), is_leaf=lambda x: x is None
+    )
+    axis, _ = rk.plot.spectrum(found)
+    axis.figure.canvas.draw()
+    legend = axis.get_legend().get_window_extent()
+    assert legend.x0 >= axis.get_window_extent().x1 and legend.x1 <= axis.figure.bbox.x1
 
 
 def wrong_figures():

@@ -56,6 +56,9 @@ def test_free_rocking_without_errors_is_recovered():
     assert found.agreement == 1
     assert found["restitution"] == found.values[2] == float(found.block.restitution)
     assert len(rk.plot.history_fit(found, TIME)) == 2
+    for time, words in ((TIME[:-1], "be of the"), (TIME[::-1], "increase"), (TIME[0], "be of the")):
+        with pytest.raises(ValueError, match=f"Argument `time` must {words}"):
+            rk.plot.history_fit(found, time)
     two_sided = eqx.tree_at(lambda fit: fit.block, found, rk.blocks.AsymmetricBlock(ALPHA, 1.2 * ALPHA, P))
     assert len(rk.plot.history_fit(two_sided, TIME)) == 2
     # Mirrored, it is the same block from the other side.

@@ -127,6 +127,15 @@ def test_polar_plot():
     plt.close("all")
 
 
+def test_words_of_a_polar_plot_do_not_overlap():
+    axis = rk.plot.slenderness(rk.blocks.Rock.from_mesh(rounded(), tolerance=0.02), points=12)[0]
+    axis.figure.canvas.draw()
+    words = [axis.get_legend(), *axis.get_yticklabels(), *axis.get_xticklabels()]
+    boxes = [each.get_window_extent() for each in words]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    plt.close("all")
+
+
 def leaning():
     mesh = box()
     mesh.apply_transform([[1, 0, 0.5, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

@@ -97,8 +97,10 @@ def with_fewer_points(notebook):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_what_readers_see(path):
-    """Sizes are stated once, data stand in files, and what was drawn is kept."""
-    code = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    """A title, sizes that are stated once, data in files, and what was drawn."""
+    cells = nbformat.read(path, as_version=4).cells
+    assert cells[0].cell_type == "markdown" and cells[0].source.startswith("# ")
+    code = [cell for cell in cells if cell.cell_type == "code"]
     text = "\n".join(cell.source for cell in code)
     assert "environ" not in text
     for name in FEWER:

@@ -3,6 +3,7 @@
 import html
 import importlib.util
 import shutil
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,11 +20,10 @@ from jaxrock.models.rigid import Housner
 from jaxrock.models.rolling import RollingMoments
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes
 from jaxrock.plot.drawings import draw, draw_ground
-from jaxrock.plot.responses import acceleration_of
+from jaxrock.plot.responses import acceleration_of, why_not
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 from jaxrock.responses.own_block import check_own
-from jaxrock.status import Status
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -50,7 +50,7 @@ def animate(
       block. An asymmetric block must be given.
     - `model`: a `Spring`, whose column is drawn then. Edges on which a block rolls are known.
     - `speed`: seconds of the response per second of the film, positive; None: 1, or what makes it last 20 s.
-    - `fps`: pictures per second, at least 1.
+    - `fps`: pictures per second, in [1, 240].
 
     **Returns:** a `matplotlib.animation.FuncAnimation`. `save_animation` writes it; in a notebook
     `IPython.display.HTML(film.to_jshtml())` shows it.
@@ -60,18 +60,20 @@ def animate(
     """
     from matplotlib.animation import FuncAnimation
 
+    response.trajectory.check_single()
     duration = float(response.duration)
     rate = max(1.0, duration / _LONGEST) if speed is None else float(scalar("speed", size("speed", speed)))
     body = Body.of(_drawn(response, block), model, _edges(response))
     count = int(np.ceil(duration * fps / rate)) + 1
     time = np.minimum(np.arange(count) * rate / fps, duration)
-    rotation, bending = np.asarray(response(time)[0]), [None] * count
+    turned, bending = np.asarray(response(time)[0]), [None] * count
+    rotation = body.lying(turned)
     if isinstance(response, FlexibleResponse):
         alpha, heights = float(response.scene.block.alpha), body.heights
-        lean = np.sin(rotation) if response.scene.block.rotations == "finite" else rotation
+        lean = np.sin(turned) if response.scene.block.rotations == "finite" else turned
         bending = np.asarray(response.column(time)) - np.cos(alpha) * lean[:, None] * heights
-    parts = _Parts(response, body, rate)
-    last = min(fps, 20)  # pictures of the verdict
+    parts = _Parts(response, body, rate, rotation)
+    last = fps  # pictures of the verdict: for a second
 
     def show(number: int) -> list:
         k = min(number, count - 1)
@@ -81,7 +83,6 @@ def animate(
 
 
 def _drawn(response: Response | FlexibleResponse, block: AnyBlock | None) -> AnyBlock:
-    response.trajectory.check_single()
     if isinstance(response, FlexibleResponse):
         return response.scene.block
     if isinstance(block, FlexibleBlock):
@@ -103,10 +104,19 @@ def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
     return here.edge, there.edge
 
 
+def _room(body: Body, rotation: np.ndarray) -> tuple[float, float, float]:
+    """How far a body comes to the left, to the right and upward [m]; of a block that stands, as far to either side."""
+    known = rotation[np.isfinite(rotation)]
+    turns = np.quantile(known, np.linspace(0, 1, 100)) if known.size else np.zeros(1)
+    places = np.concatenate([body.pose(float(turn)).outline for turn in turns])
+    reach = body.size, *abs(places[:, 0])
+    return -max(reach), max(reach), max(body.size, places[:, 1].max())
+
+
 class _Parts:
     """The figure of a film, and what moves in it."""
 
-    def __init__(self, response: Response | FlexibleResponse, body: Body, rate: float):
+    def __init__(self, response: Response | FlexibleResponse, body: Body, rate: float, rotation: np.ndarray):
         import matplotlib.pyplot as plt
 
         self.response, self.rate = response, rate
@@ -114,12 +124,14 @@ class _Parts:
             [["scene", "rotation"], ["scene", "ground"]], figsize=(8, 4), width_ratios=(1.1, 1), layout="constrained"
         )
         scene, size = axes["scene"], body.size
-        scene.set(xlim=(-1.1 * size, 1.1 * size), ylim=(-0.25 * size, 1.1 * size), aspect="equal")
+        left, right, high = _room(body, rotation)
+        scene.set(xlim=(1.1 * left, 1.1 * right), ylim=(-0.25 * size, 1.1 * high), aspect="equal")
         scene.set_axis_off()
         draw_ground(scene, body)
         self.outline, self.column, self.masses = draw(scene, body, body.pose(0.0))
         (self.flash,) = scene.plot([], [], "*", color=RED, markersize=16, zorder=5)
-        self.words = scene.set_title("", fontsize=10)
+        self.verdict = textwrap.fill(why_not(response.status) or ("overturns" if response.overturned else "stands"), 42)
+        self.words = scene.set_title("\n" * self.verdict.count("\n") + "\n.", fontsize=10)  # room for what will be said
         peak = float(np.max(np.asarray(self._motion.bounds)))
         self.reach = 0.8 * size / max(peak, 1e-12)
         self.arrow = scene.quiver(
@@ -129,9 +141,6 @@ class _Parts:
         self.cursors = self._histories(axes["rotation"], axes["ground"])
         self.figure.canvas.draw()
         self.figure.set_layout_engine("none")  # where things are is found once, not for every picture
-        fallen = not bool(np.asarray(response.status == Status.successful))
-        self.verdict = ("no result: see its status" if fallen
-                        else "overturns" if bool(response.overturned) else "stands")  # fmt: skip
 
     @property
     def _motion(self):
@@ -165,8 +174,8 @@ class _Parts:
         hit = count > 0 and time - self.impacts[count - 1] < _FLASH * self.rate and not over
         self.flash.set_data(*([[x] for x in shapes.pivot] if hit else ([], [])))
         faster = "" if self.rate == 1 else f", {self.rate:.3g} times as fast"
-        said = f": {self.verdict}" if over else ""
-        self.words.set_text(f"{time:.2f} s{faster}, {count} impact{'' if count == 1 else 's'}{said}")
+        said = self.verdict if over else "\n" * self.verdict.count("\n")
+        self.words.set_text(f"{time:.2f} s{faster}, {count} impact{'' if count == 1 else 's'}\n{said}")
         self.words.set_color(RED if over and self.verdict != "stands" else "black")
         return [self.outline, self.column, self.masses, self.flash, self.words, self.arrow, *self.cursors]
 
@@ -177,6 +186,10 @@ def save_animation(
 ) -> None:
     """Write a film as its file's name says: GIF, HTML that plays by itself, or MP4.
 
+    It lasts as long as its pictures per second say. Those of a GIF last whole hundredths of a second in turn, and two
+    at least, as viewers slow others down: of more than 50 per second some are left out. Those of HTML last whole
+    thousandths.
+
     **Arguments:**
 
     - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4.
@@ -186,15 +199,16 @@ def save_animation(
     `pip install "jaxrock[film]"`.
     """
     import matplotlib
-    from matplotlib.animation import FFMpegWriter, PillowWriter
+    from matplotlib.animation import FFMpegWriter
 
-    source: Any = film.event_source
-    fps, path = 1000 / source.interval, Path(path)
+    own: Any = film
+    interval, path = own._interval, Path(path)  # that of `event_source` is cut to whole milliseconds
     kind = path.suffix.lower()
     if kind == ".gif":
-        film.save(path, writer=PillowWriter(fps=fps), dpi=dpi)
+        film.save(path, writer=_gif_writer(interval), dpi=dpi)
     elif kind == ".html":
-        with_size = film.to_jshtml(fps=fps, embed_frames=True)
+        # 1000 // fps is what a picture lasts.
+        with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
         title = html.escape(path.stem)
         path.write_text(f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}", encoding="utf-8")
     elif kind == ".mp4":
@@ -204,9 +218,26 @@ def save_animation(
                     "Argument `path` must end with .gif or .html, as .mp4 needs the program ffmpeg, which is not "
                     'there: install it, or `pip install "jaxrock[film]"`.'
                 )
-            film.save(path, writer=FFMpegWriter(fps=fps), dpi=dpi)
+            film.save(path, writer=FFMpegWriter(fps=round(1000 / interval, 6)), dpi=dpi)
     else:
         raise ValueError(f"Argument `path` must end with .gif, .html or .mp4, but is {str(path)!r}.")
+
+
+def _gif_writer(interval: float):
+    """A writer of pictures that are due every so many milliseconds: each lasts until the next one is due, to 10 ms."""
+    from matplotlib.animation import PillowWriter
+
+    every = int(np.ceil(20 / interval - 1e-9))
+
+    class Writer(PillowWriter):
+        def finish(self) -> None:
+            frames: list[Any] = vars(self)["_frames"]
+            kept = frames[::every]
+            due = np.append(np.arange(len(kept)) * every, len(frames)) * interval
+            lasts = np.maximum(10 * np.diff(np.round(due / 10)), 20).astype(int).tolist()
+            kept[0].save(self.outfile, save_all=True, append_images=kept[1:], duration=lasts, loop=0)
+
+    return Writer(fps=1000 / interval)
 
 
 def _ffmpeg() -> str:

@@ -101,6 +101,18 @@ class Body(NamedTuple):
         rolled = np.hypot(*(self.centre - corner)) * float(self.edges[0 if side > 0 else 1].length(abs(rotation)))
         return corner + np.array([side * rolled, 0.0])
 
+    def lying(self, rotation: np.ndarray) -> np.ndarray:
+        """Rotations [rad] as they are drawn: a block that has fallen, by a quarter of a turn, lies on its side, also
+        where that leans. One that rolls is left as it is."""
+        if self.edges is not None:
+            return rotation
+        for side, corner in ((1, self.right), (-1, self.left)):
+            across, up = side * (self.outline[:, 0] - corner[0]), self.outline[:, 1] - corner[1]
+            ahead = up > 1e-9 * self.size
+            end, turn = np.arctan2(up[ahead], across[ahead]).min(), side * rotation
+            rotation = side * np.where(turn > np.pi / 2 - 1e-9, end, np.minimum(turn, end))
+        return rotation
+
     @property
     def size(self) -> float:
         """Largest distance from the origin [m]."""

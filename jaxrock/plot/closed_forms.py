@@ -93,7 +93,8 @@ def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ra
     }
     for name, (curve, color, style) in curves.items():
         axis.plot(*_to_its_tips(curve, ratio), color=color, linestyle=style, linewidth=1.2, label=name)
-    axis.set(xlabel=r"frequency ratio $\omega/p$", ylabel="intensity $a_g/g\\alpha$")
+    axis.set_xlabel(axis.get_xlabel() or r"frequency ratio $\omega/p$")  # a map below has its own words
+    axis.set_ylabel(axis.get_ylabel() or "intensity $a_g/g\\alpha$")
     before = axis.get_legend()
     axis.legend(loc="upper left" if before is None else "lower right", fontsize=7)
     if before is not None:

@@ -62,15 +62,13 @@ def scene(
     **Source:** Voyagaki et al. (2012), figure 2.1; Dimitrakopoulos & DeJong (2012), figure 1; Diamantopoulos &
     Fragiadakis (2017), figures 1, 2, 4, 6, 8 and 10.
     """
-    import matplotlib.pyplot as plt
-
     rotation = float(scalar("rotation", _turn("rotation", rotation)))
     bent = float(scalar("bending", strength("bending", bending)))
     if bent and not isinstance(block, FlexibleBlock):
         raise ValueError(f"Argument `bending` must be zero for a {type(block).__name__}, which does not bend.")
     body = Body.of(block, model)
     if axis is None:
-        _, axis = plt.subplots(figsize=(5, 5 if motion is None else 6.5), layout="constrained")
+        axis = _axis_over(motion)
     column = None
     if bent and isinstance(block, FlexibleBlock):
         shape = unit_column(block.masses).shapes[:, 0]
@@ -89,6 +87,18 @@ def scene(
     axis.set_axis_off()
     if motion is not None:
         _motion(axis.inset_axes((0.1, -0.36, 0.8, 0.28)), motion)
+    return axis
+
+
+def _axis_over(motion: AbstractMotion | None) -> "Axes":
+    """A new axis, with room for a motion below it: a share of the axis, which constrained layouts cut off."""
+    import matplotlib.pyplot as plt
+
+    if motion is None:
+        return plt.subplots(figsize=(5, 5), layout="constrained")[1]
+    figure, axis = plt.subplots(figsize=(5, 6.5))
+    figure.subplots_adjust(left=0.06, right=0.94, bottom=0.33, top=0.98)
+    axis.set_anchor("N")
     return axis
 
 
@@ -233,8 +243,10 @@ def _motion(axis: "Axes", motion: AbstractMotion) -> None:
     axis.spines[["top", "right"]].set_visible(False)
     peak = values[np.argmax(np.abs(values))]
     axis.axhline(peak, color=SAND, linewidth=0.8, linestyle="--")
-    axis.text(time[-1], peak, r" $a_g$", va="center", fontsize=10)
     names = list(declared(type(motion))) if isinstance(motion, AbstractPulse) else []
+    amplitude = abs(float(getattr(motion, names[0]))) if names else np.inf
+    is_peak = abs(abs(peak) - amplitude) < 0.01 * amplitude < np.inf  # as far as samples tell
+    axis.text(time[-1], peak, r" $a_g$" if is_peak else " peak", va="center", fontsize=10)
     symbol = {"duration": "$t_d$", "period": "$T_p$"}.get(names[1]) if len(names) > 1 else None
     if symbol:
         extent = float(getattr(motion, names[1]))

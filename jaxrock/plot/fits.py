@@ -1,5 +1,6 @@
 """Figures of fits to measured histories, and of records that were looked for."""
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -21,13 +22,20 @@ def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" 
 
     **Arguments:**
 
-    - `fit`: result of `fit_history`; `time`: (n,) of the measurements [s].
+    - `fit`: result of `fit_history`; `time`: (n,) of the measurements, increasing [s].
     - `axes`: two matplotlib axes; None makes a figure.
 
     **Returns:** the axes.
+
+    **Raises:** ValueError for other times than of the measurements: another number of them, or not increasing.
     """
     import matplotlib.pyplot as plt
 
+    time, count = np.asarray(time), fit.residuals.size
+    if time.shape != (count,):
+        raise ValueError(f"Argument `time` must be of the {count} measurements, but has the shape {time.shape}.")
+    if not (np.diff(time) > 0).all():
+        raise ValueError("Argument `time` must increase, as the measurements do, but does not.")
     if axes is None:
         _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 4), layout="constrained", height_ratios=(2, 1))
     alpha = float(fit.block.alpha if isinstance(fit.block, Block) else min(fit.block.alpha1, fit.block.alpha2))
@@ -64,7 +72,7 @@ def found_record(found: FoundRecord, axes: "Sequence[Axes] | None" = None) -> "S
     frequency = np.fft.rfftfreq(before.size, dt)[1:]
     for samples, color in ((before, GREY), (change, RED)):
         axes[2].loglog(frequency, dt * np.abs(np.fft.rfft(samples))[1:], color=color, linewidth=0.5)
-    axes[0].set_title(found.start.name, fontsize=8)
+    axes[0].set_title(textwrap.fill(found.start.name or "", 95), fontsize=8)
     large = time[np.abs(change) > 0.02 * np.abs(change).max()]
     if large.size:  # elsewhere there is nothing to see
         around = 0.5 * (large[-1] - large[0]) + 10 * dt

@@ -7,7 +7,7 @@ import numpy as np
 from jaxrock.inverse.estimate import Estimate
 from jaxrock.inverse.feasible import FeasibleRegion, Unexceeded
 from jaxrock.motions.pulses import UNITS
-from jaxrock.plot.style import GREY, RED, draw_cells, figure, in_order, limits_of, log_ticks
+from jaxrock.plot.style import GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,13 +22,17 @@ def feasible_region(
     **Arguments:**
 
     - `region`: a `FeasibleRegion`, its first parameter upward; both axes logarithmic if all values are positive.
-    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded; None leaves them out.
+    - `estimate`: its cross; `wall`: the amplitudes that are not exceeded, over an amplitude and a duration or period,
+      with gaps where not all could be decided; None leaves them out.
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
+
+    **Raises:** ValueError for a `wall` over other parameters.
     """
     import matplotlib.pyplot as plt
 
+    curve = None if wall is None else _along(wall, region.names)
     if axis is None:
         _, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
     (rows, up), (columns, across) = map(in_order, region.values)
@@ -37,20 +41,37 @@ def feasible_region(
     axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
     if min(below.shape) > 1:  # a line of cells has no border
         axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
-    if wall is not None:
-        axis.plot(wall.durations, wall.amplitude, color=RED, linewidth=1, label="up to here all that stand, stand")
+    if curve is not None:
+        broken_curve(axis, *curve, color=RED, linewidth=1, label="up to here all that stand, stand")
+    ends = limits_of(columns), limits_of(rows)
     if estimate is not None and set(region.names) <= set(estimate.names):
-        axis.plot(estimate[region.names[1]], estimate[region.names[0]], "k+", markersize=9, label="most likely")
+        place = [float(estimate[name]) for name in region.names[::-1]]
+        inside = all(low <= x <= high for x, (low, high) in zip(place, ends))
+        axis.plot(*place, "k+", markersize=9, label="most likely" if inside else None)
     for values, scale in ((rows, axis.set_yscale), (columns, axis.set_xscale)):
         if values.min() > 0:
             scale("log")
     log_ticks(axis)
-    axis.set(xlim=limits_of(columns), ylim=limits_of(rows))
-    labels = [f"{name} [{UNITS[name]}]" if name in UNITS else name for name in region.names]
-    axis.set(ylabel=labels[0], xlabel=labels[1])
-    if wall is not None or estimate is not None:
+    axis.set(xlim=ends[0], ylim=ends[1], ylabel=_label(region.names[0]), xlabel=_label(region.names[1]))
+    if axis.get_legend_handles_labels()[0]:
         axis.legend(frameon=False, fontsize=8)
     return axis
+
+
+def _label(name: str) -> str:
+    return f"{name} [{UNITS[name]}]" if name in UNITS else name
+
+
+def _along(wall: Unexceeded, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    """A wall over the second of two parameters and the first; what could not all be decided is no number."""
+    known = np.where(np.asarray(wall.complete), np.asarray(wall.amplitude), np.nan)
+    curve = {"amplitude": known} | dict.fromkeys(("duration", "period"), np.asarray(wall.durations))
+    if "amplitude" not in names or not set(names) <= set(curve):
+        raise ValueError(
+            f"Argument `wall` must be None for a region over {names[0]} and {names[1]}: it is an amplitude over a "
+            "duration or a period."
+        )
+    return curve[names[1]], np.where(np.isfinite(known), curve[names[0]], np.nan)
 
 
 @figure(1)
@@ -75,7 +96,7 @@ def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes
     if region is not None:
         feasible_region(region, estimate, axis=axis)
     else:
-        axis.set(ylabel=names[0], xlabel=names[1])
+        axis.set(ylabel=_label(names[0]), xlabel=_label(names[1]))
     rows, columns = (np.asarray(estimate.trace.values)[..., estimate.names.index(name)] for name in names)
     for row, column in zip(rows.T, columns.T):
         here = np.flatnonzero(~np.isnan(row))

@@ -1,9 +1,11 @@
 """Figures of one response: history, and orbit in the phase plane."""
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxrock.flexible.response import FlexibleResponse
@@ -11,6 +13,7 @@ from jaxrock.models.coefficients import Coefficients
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 from jaxrock.responses.history import Response
+from jaxrock.status import Status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +22,38 @@ if TYPE_CHECKING:
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
     """Ground acceleration at times [g]."""
     return np.asarray(motion.acceleration(time))
+
+
+@jax.jit
+def _vertical(motion: AbstractMotion, time: jax.Array) -> jax.Array:
+    knots = motion.knots
+
+    def at(t):
+        piece = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+        series = motion.vertical_series(piece, t - knots[piece], jnp.ones_like(t), 0)
+        return jnp.where((t >= 0) & (t < knots[-1]), series[0], 0.0)
+
+    return jax.vmap(at)(time)
+
+
+def vertical_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray | None:
+    """Vertical acceleration at times (n,) [g], positive upward; None: the ground has none."""
+    if motion.vertical_bounds is None:
+        return None
+    return np.asarray(_vertical(motion, jnp.asarray(time, motion.knots.dtype)))
+
+
+def why_not(status: Status) -> str:
+    """What is said of a response without a result: "no result", and why, in a few words; otherwise nothing."""
+    if bool(np.asarray(status == Status.successful)):
+        return ""
+    reason = re.split("[,:.]", Status[status])[0]
+    return f"no result: {reason[0].lower()}{reason[1:]}"
+
+
+def _say_why_not(axis: "Axes", status: Status) -> None:
+    if said := why_not(status):
+        axis.set_title(said, color=RED, fontsize=9)
 
 
 def _ink() -> str:
@@ -41,6 +76,9 @@ def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None" = None) -> "Sequence[Axes]":
     """Draw rotation over alpha, velocity over p alpha and ground acceleration against time, impacts marked.
 
+    A vertical acceleration is drawn beside the horizontal one, and changes the threshold; a response without a result
+    is called so above.
+
     **Arguments:**
 
     - `response`: result of `simulate`; of a flexible block the displacement of its top, and the part of it that is
@@ -49,11 +87,15 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
 
     **Returns:** the three axes. Of an asymmetric block alpha is the smaller slenderness angle, and each way has its own
     threshold.
+
+    **Raises:** ValueError for the response of many scenes.
     """
     import matplotlib.pyplot as plt
 
+    response.trajectory.check_single()
     if axes is None:
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 6), layout="constrained")
+    _say_why_not(axes[0], response.status)
     if isinstance(response, FlexibleResponse):
         return _bending_history(response, axes)
     scene = response.scene
@@ -66,9 +108,15 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
+    vertical = vertical_of(scene.motion, time)
+    if vertical is not None:
+        axes[2].plot(time, vertical, color=GREY, linewidth=0.6, label="vertical")
     for side, moments in zip((1, -1), scene.both_moments):  # positive acceleration lifts it to side -1
-        label = "uplift threshold" if side > 0 else None
-        axes[2].axhline(-side * float(moments.threshold), color=SAND, linewidth=0.9, label=label)
+        label, level = "uplift threshold" if side > 0 else None, -side * float(moments.threshold)
+        if vertical is None:
+            axes[2].axhline(level, color=SAND, linewidth=0.9, label=label)
+        else:  # what presses the block down holds it, too
+            axes[2].plot(time, level * (1 + vertical), color=SAND, linewidth=0.9, label=label)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
     axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     axes[2].set_ylabel("ground\nacceleration [g]")
@@ -102,13 +150,14 @@ def _manifolds(moments: Coefficients, opening):
     return jax.vmap(moments.manifold)(opening)
 
 
-def _manifold(axis: "Axes", moments: Coefficients, side: int, alpha: float) -> None:
-    """The stable manifold of the upright saddle of a side, and the unstable one, dotted."""
+def _manifold(axis: "Axes", moments: Coefficients, side: int, alpha: float) -> float:
+    """The stable manifold of the upright saddle of a side, and the unstable one, dotted; and the speed upright."""
     opening = np.linspace(0, 2 * max(1.0, float(moments.saddle) / alpha), 101)
     manifold = np.asarray(_manifolds(moments, opening * alpha)) / alpha
     label = "stable manifold" if side > 0 else None
     axis.plot(side * opening, side * manifold, color=RED, linewidth=1, label=label)
     axis.plot(side * opening, -side * manifold, color=RED, linewidth=0.7, linestyle=":")
+    return abs(float(manifold[0]))
 
 
 @figure(1)
@@ -123,7 +172,7 @@ def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> 
     **Returns:** the axis. Without forcing, a block outside the band between the manifolds overturns. Of an `Equation`,
     which is functions, the equilibria are drawn alone.
 
-    **Raises:** ValueError for the response of a flexible block.
+    **Raises:** ValueError for the response of a flexible block, or of many scenes.
     """
     import matplotlib.pyplot as plt
 
@@ -132,23 +181,29 @@ def phase(response: Response | FlexibleResponse, axis: "Axes | None" = None) -> 
             "Argument `response` must be of a rigid block, but is a FlexibleResponse, whose orbit is in no plane: use "
             "`plot.history`."
         )
+    response.trajectory.check_single()
     if axis is None:
         _, axis = plt.subplots(figsize=(5.5, 5), layout="constrained")
+    _say_why_not(axis, response.status)
     scene = response.scene
     alpha = float(scene.alpha)
     _, rotation, velocity = _dense(response)
     # The line breaks at impacts: the velocity jumps there.
     crossed = np.flatnonzero(np.diff(np.sign(rotation)) != 0) + 1
     axis.plot(np.insert(rotation, crossed, np.nan), np.insert(velocity, crossed, np.nan), color=BLUE, linewidth=0.8)
+    saddles, speed = {}, 1.0
     for side, moments in zip((1, -1), scene.both_moments):
+        saddles[side] = float(moments.saddle) / alpha
         if isinstance(moments, Coefficients):  # of functions no manifold is known
-            _manifold(axis, moments, side, alpha)
-        axis.plot([side * float(moments.saddle) / alpha], [0], "o", color=RED, markersize=4)
+            speed = max(speed, _manifold(axis, moments, side, alpha))
+        axis.plot([side * saddles[side]], [0], "o", color=RED, markersize=4)
     axis.axvline(0, color=GREY, linewidth=0.5)
-    reach = max(1.1, 1.1 * float(np.max(np.abs(rotation[np.abs(rotation) < 2.5]), initial=0)))
-    axis.set_xlim(-reach, reach)
-    axis.set_ylim(-max(1.2, 1.1 * np.max(np.abs(velocity[np.abs(rotation) < reach]), initial=0)), None)
-    axis.set_ylim(axis.get_ylim()[0], -axis.get_ylim()[0])
+    seen = (rotation < 2.5 * max(1.0, saddles[1])) & (rotation > -2.5 * max(1.0, saddles[-1]))
+    reach = max(1.0, np.max(np.abs(rotation[seen]), initial=0))
+    axis.set_xlim(-1.1 * max(reach, saddles[-1]), 1.1 * max(reach, saddles[1]))
+    shown = (rotation > axis.get_xlim()[0]) & (rotation < axis.get_xlim()[1])
+    highest = max(1.2 * speed, 1.1 * np.max(np.abs(velocity[shown]), initial=0))
+    axis.set_ylim(-highest, highest)
     axis.set_xlabel(r"rotation $\theta/\alpha$")
     axis.set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     if axis.get_legend_handles_labels()[0]:

@@ -26,6 +26,7 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
     **Returns:** the axes: of the slenderness towards each azimuth [rad], and of p about the point there [rad/s].
     """
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
 
     if axes is None:
         _, axes = plt.subplots(1, 2, figsize=(7.5, 3.8), layout="constrained", subplot_kw={"projection": "polar"})
@@ -36,10 +37,12 @@ def slenderness(rock: Rock, axes: "Sequence[Axes] | None" = None, *, points: int
     if any(any(each.rolls) for each in found):
         wide = [rock.section(each, "wide").slenderness[0] for each in azimuth]
         axes[0].plot(azimuth, wide, "--", color=RED, linewidth=1, label="wide base")
-        axes[0].legend(loc="lower left", fontsize=8, frameon=False)
+        axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2, fontsize=8, frameon=False)
     axes[1].plot(azimuth, [float(block.p1) for block in blocks], color=BLUE)
     for axis, title in zip(axes, ("slenderness [rad]", "p [rad/s]")):
         axis.set_title(title, fontsize=9)
+        axis.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.tick_params(axis="y", labelsize=7)
     return axes
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from jaxrock._checks import one_of
 from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure, in_order
 from jaxrock.studies.critical import Critical
-from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap
+from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap, SlopeStatus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,13 +27,20 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
     - `axis`: matplotlib axis; None makes a figure.
 
     **Returns:** the axis.
+
+    **Raises:** ValueError for a result without elasticities, as the peaks of a block that overturns are.
     """
     import matplotlib.pyplot as plt
 
     one_of("result", result, _RESULTS)
+    slopes = getattr(sensitivity, result)
+    elasticity = np.asarray(slopes.elasticity)
+    if elasticity.ndim == 1 and np.isnan(elasticity).all():
+        lost = result != "margin" and bool(sensitivity.outcome.overturned)
+        instead = "the block overturns: draw its `margin`" if lost else SlopeStatus[slopes.status]
+        raise ValueError(f"Argument `sensitivity` must have elasticities of {result!r}, but has none: {instead}")
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 3), layout="constrained")
-    elasticity = np.asarray(getattr(sensitivity, result).elasticity)
     order = np.argsort(np.abs(elasticity))
     names = [sensitivity.names[k].replace("_", " ") for k in order]
     axis.barh(names, elasticity[order], color=[BLUE if x > 0 else RED for x in elasticity[order]], height=0.6)
@@ -87,14 +94,19 @@ def sensitivity_map(
 
 
 @figure(1)
-def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) -> "Axes":
+def critical(
+    abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None, *, label: str = "what the scenes differ by"
+) -> "Axes":
     """Draw all intensities at which blocks begin or cease to overturn, for many scenes side by side.
+
+    Scenes of which not all could be computed (`Critical.complete`) have a cross on the lower axis.
 
     **Arguments:**
 
     - `abscissa`: (scenes,) what the scenes differ by, such as periods [s].
     - `ends`: result of `critical_amplitudes` for many scenes.
     - `axis`: matplotlib axis; None makes a figure.
+    - `label`: of the axis across, such as "period [s]".
 
     **Returns:** the axis.
     """
@@ -111,12 +123,16 @@ def critical(abscissa: ArrayLike, ends: Critical, axis: "Axes | None" = None) ->
     there = np.isfinite(np.asarray(ends.intensity))
     rising, impacts = np.asarray(ends.rising), np.asarray(ends.impacts)
     kinds = (
-        ("overturns above: without impact", RED, rising & (impacts == 0)),
-        ("overturns above: after impacts", BLUE, rising & (impacts > 0)),
+        ("overturns above: without impact", BLUE, rising & (impacts == 0)),
+        ("overturns above: after impacts", RED, rising & (impacts > 0)),
         ("safe again above", SAND, ~rising),
     )
     for name, color, kind in kinds:
         axis.plot(x[there & kind], np.asarray(ends.intensity)[there & kind], ".", color=color, markersize=3, label=name)
-    axis.set_ylabel("intensity: amplitude/threshold")
+    part = np.asarray(abscissa)[~np.asarray(ends.complete)]
+    if part.size:
+        level = np.full(part.size, 0.02)
+        axis.plot(part, level, "kx", markersize=4, label="not all computed", transform=axis.get_xaxis_transform())
+    axis.set(xlabel=label, ylabel="intensity: amplitude/threshold")
     axis.legend(fontsize=8, frameon=False)
     return axis

@@ -55,6 +55,8 @@ def _check_axes(axes: Any, count: int) -> None:
 def log_ticks(axis: "Axes") -> "Axes":
     """Label the logarithmic axes of a figure at 1, 2, 5, 10, ..., in plain numbers, and nowhere else.
 
+    Axes of more than three decades are labelled at 1, 10, ... alone.
+
     **Arguments:**
 
     - `axis`: matplotlib axis; what is not logarithmic in it is left alone.
@@ -63,9 +65,14 @@ def log_ticks(axis: "Axes") -> "Axes":
     """
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+    class Locator(LogLocator):
+        def tick_values(self, vmin: float, vmax: float) -> Any:
+            self.set_params(subs=(1,) if vmin > 0 and vmax / vmin > 1e3 else (1, 2, 5))
+            return super().tick_values(vmin, vmax)
+
     for scale, ticks in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
         if scale == "log":
-            ticks.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ticks.set_major_locator(Locator())
             ticks.set_major_formatter(StrMethodFormatter("{x:g}"))
             ticks.set_minor_formatter(NullFormatter())
     return axis

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, shade
+from jaxrock.status import Status
 from jaxrock.studies.borders import Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
@@ -25,6 +26,8 @@ _DURATION = "pulse duration $p\\,t_d$"
 def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_duration: bool = False) -> "Sequence[Axes]":
     """Draw a rocking spectrum: peak rotation and peak velocity; sizes that overturn are shaded.
 
+    What was not computed (see `status`) is a gap, with a cross on the lower axis.
+
     **Arguments:**
 
     - `result`: from `rocking_spectrum` or `self_similar_spectrum`, without further axes.
@@ -41,35 +44,56 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     if by_duration and result.intensity is None:
         raise ValueError("Argument `by_duration` must be False for the spectrum of a motion that is given in seconds.")
 
+    own = axes is None
     if axes is None:
         _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), layout="constrained")
     abscissa = np.asarray(result.pulse_duration if by_duration else result.abscissa)
     order = np.argsort(abscissa)
     abscissa = abscissa[order]
     labels = result.uplift_strength if by_duration else result.intensity
-    rows = np.atleast_2d(np.asarray(result.overturned))[:, order]
+    good = np.asarray(result.status == Status.successful)
+    known = np.atleast_2d(np.broadcast_to(good, result.overturned.shape))[:, order]
+    lost = np.atleast_2d(np.asarray(result.overturned))[:, order] & known
     for axis, values in zip(axes, (result.max_rotation, result.max_velocity)):
-        values = np.atleast_2d(np.asarray(values))[:, order]
-        colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(values))) if len(values) > 1 else [BLUE]
-        for i, (curve, color) in enumerate(zip(values, colors)):
-            label = None if labels is None else f"{float(labels[i]):g}"
-            broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
-        axis.update_datalim([(abscissa[0], 0)])  # upward from zero, as long as the axis is not made logarithmic
-        axis.lines[-1].sticky_edges.y.append(0)
-        axis.autoscale_view()
+        values = np.where(known, np.atleast_2d(np.asarray(values))[:, order], np.nan)
+        _curves(axis, abscissa, values, labels)
         said = "overturned" if len(values) == 1 else "all overturned"
-        shade(axis, abscissa, rows.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
+        shade(axis, abscissa, lost.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
+        if axis.dataLim.y1 <= 0:  # all overturned, or all at rest
+            axis.set_ylim(0, 1, auto=True)
     axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
     axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
     self_similar = result.intensity is not None
     across = _DURATION if by_duration else r"frequency ratio $\omega/p$"
     axes[1].set_xlabel(across if self_similar else r"$2\pi/p$ [s]")
     if self_similar or axes[0].get_legend_handles_labels()[0]:
+        many = own and len(lost) > 4  # would hide what it lies on
         axes[0].legend(
             title=("uplift strength" if by_duration else "intensity") if self_similar else None,
-            fontsize=8, title_fontsize=8, frameon=False, loc="upper right",
+            fontsize=8, title_fontsize=8, framealpha=0.85, edgecolor="none",
+            loc="upper left" if many else "upper right", bbox_to_anchor=(1.0, 1.0),
         )  # fmt: skip
     return axes
+
+
+def _curves(axis: "Axes", abscissa: np.ndarray, rows: np.ndarray, labels) -> None:
+    """Curves of a spectrum; what is not a number was not computed, and gets a cross on the lower axis."""
+    import matplotlib.pyplot as plt
+
+    colors = plt.colormaps["viridis"](np.linspace(0, 0.85, len(rows))) if len(rows) > 1 else [BLUE]
+    for i, (curve, color) in enumerate(zip(rows, colors)):
+        label = None if labels is None else f"{float(labels[i]):g}"
+        broken_curve(axis, abscissa, curve, color=color, linewidth=1, label=label)
+    axis.update_datalim([(abscissa[0], 0)])  # upward from zero, as long as the axis is not made logarithmic
+    axis.lines[-1].sticky_edges.y.append(0)
+    axis.autoscale_view()
+    said: str | None = "not computed"
+    for row, color in zip(np.isnan(rows), colors):
+        if row.any():
+            level = np.full(row.sum(), 0.02)
+            axis.plot(abscissa[row], level, "x", color=color, markersize=4, label=said,
+                      transform=axis.get_xaxis_transform())  # fmt: skip
+            said = None
 
 
 @figure(1)
@@ -91,8 +115,8 @@ def overturning(
     - `by_duration`: uplift strength over pulse duration, as single-lobe pulses are drawn, in place of intensity over
       frequency ratio.
     - `exact`: whether borders are drawn where they are (`overturning_borders`: islands and gaps too, whatever the grid;
-      pixels remain where islands are too many) or pixels alone; None: borders where the series engine solves the map,
-      if they take half a million scenes at most.
+      pixels remain where islands are too many, or the search failed) or pixels alone; None: borders where the series
+      engine solves the map, if they take half a million scenes at most.
     - `safe`: whether survivors are coloured, with a scale beside the axis.
     - `progress`: whether to draw a progress bar while borders are looked for; None: on a terminal, if it takes long.
 
@@ -172,6 +196,8 @@ def borders(
 ) -> "Axes":
     """Draw the borders of an overturning map alone: to lay several over each other.
 
+    Those in the ranges that `overturning_borders` calls crowded are not all drawn; then the log says so.
+
     **Arguments:**
 
     - `result`: as in `overturning`.
@@ -192,7 +218,10 @@ def borders(
         _, axis = plt.subplots(figsize=(6, 4), layout="constrained")
     label = line.pop("label", None)
     ends = [edge(np.asarray(result.intensity)) for edge in (np.min, np.max)]
-    for region in overturning_borders(result, progress=progress).regions:
+    found = overturning_borders(result, progress=progress)
+    if found.crowded.size:
+        _LOG.info("borders are left out where islands are too many, or the search failed (`Borders.crowded`)")
+    for region in found.regions:
         for edge in (region.lower, region.upper):
             inside = (edge > ends[0] * (1 + 1e-12)) & (edge < ends[1] * (1 - 1e-12))
             if inside.any():  # not the edge of the map

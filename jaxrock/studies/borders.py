@@ -7,6 +7,7 @@ have islands without number, ever lower: those that cannot be seen in the map ar
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ _BEND = 1e-3  # of the ranges: the error of a straight line between two columns 
 _CLOSE = 1e-7  # of the range of frequencies: columns are put no closer
 _SPECK = 1e-6  # of the area of a map: what may be drawn wrongly where intervals do not fit
 _MOST = 600  # columns
+_NEAR = 1e-6  # relative: points of a map that lie so near to a border may have either verdict
 
 
 class Region(NamedTuple):
@@ -45,7 +47,9 @@ class Borders(NamedTuple):
     """What `overturning_borders` finds.
 
     - `regions`: a list of `Region`s.
-    - `crowded`: (n, 2) ranges of frequency ratios in which there are too many islands to be told apart.
+    - `crowded`: (n, 2) ranges of frequency ratios in which there are too many islands to be told apart, in which the
+      engine gave up (a step budget that is too small), or where points of the map say otherwise. Regions there are not
+      to be trusted.
     """
 
     regions: list[Region]
@@ -94,7 +98,7 @@ def borders_within(result: OverturningMap, most: int | None, progress: bool | No
     ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
     search = _Search(result.scene, float(intensity.min()), float(intensity.max()), progress, _Budget(most))
     try:
-        return _found(search, ratio)
+        return _found(search, ratio, intensity, np.asarray(result.state))
     except _TooMany:
         return None
 
@@ -118,8 +122,12 @@ class _Budget:
             raise _TooMany
 
 
-def _found(search: "_Search", ratio: np.ndarray) -> Borders:
-    columns = {x: column for x, column in zip(np.unique(ratio), search.columns(np.unique(ratio)))}
+def _found(search: "_Search", ratio: np.ndarray, intensity: np.ndarray, state: np.ndarray) -> Borders:
+    first, where = np.unique(ratio, return_index=True)
+    columns = dict(zip(first, search.columns(first)))
+    for x, known in zip(first, state.T[where]):
+        if _contradicts(columns[x], intensity, known):
+            columns[x] = None
     width = float(np.ptp(ratio))
     while True:
         places = sorted(columns)
@@ -128,6 +136,19 @@ def _found(search: "_Search", ratio: np.ndarray) -> Borders:
             break
         columns |= zip(between, search.columns(np.array(between)))
     return Borders(_regions(places, columns), np.array(crowded).reshape(-1, 2))
+
+
+def _contradicts(column: "list[_Interval] | None", intensity: np.ndarray, state: np.ndarray) -> bool:
+    """Whether points of a map, not too near to a border, are of another verdict than the intervals of their column."""
+    if column is None:
+        return False
+    lost = np.zeros(intensity.size, bool)
+    near = state < 0
+    for interval in column:
+        lost |= (intensity >= interval.lower) & (intensity <= interval.upper)
+        for end in interval[:2]:
+            near |= abs(intensity / end - 1) < _NEAR
+    return bool(((lost != (state > 0)) & ~near).any())
 
 
 class _Search(NamedTuple):
@@ -144,19 +165,26 @@ class _Search(NamedTuple):
         self.budget.take(z.size)
         return tuple(map(np.asarray, surface(_point, (z, ratio), self.scene, "borders", self.progress, outer=False)))
 
-    def columns(self, ratio: np.ndarray) -> list[list[_Interval]]:
-        """The overturning intervals of every column."""
+    def columns(self, ratio: np.ndarray) -> list[list[_Interval] | None]:
+        """The overturning intervals of every column; None where a point that was asked for them had no result."""
         steps = self.low + (self.high - self.low) * np.geomspace(1e-4, 1.0, _FIRST)
         grid = np.broadcast_to(np.log([self.low, *steps]), (ratio.size, _FIRST + 1))
+        failed: set[float] = set()
+
+        def ask(z, ratio):
+            values = self.at(z, ratio)
+            failed.update(ratio[np.isnan(values[0])].tolist())
+            return values
 
         def at(z, index):
-            return self.at(z, ratio[index])
+            return ask(z, ratio[index])
 
         ends = roots_of(at, brackets_of(at, grid)[0])
-        first, last = (self.at(np.full(ratio.size, edge), ratio) for edge in (grid[0, 0], grid[0, -1]))
+        first, last = (ask(np.full(ratio.size, edge), ratio) for edge in (grid[0, 0], grid[0, -1]))
         found = [self._ends(grid[0], first, last, ends, k) for k in range(ratio.size)]
-        cuts = self._cuts([(*pair, x) for x, pairs in zip(ratio, found) for pair in pairs])
-        return [[part for pair in pairs for part in _parts(pair, cuts)] for pairs in found]
+        cuts = _cuts(ask, [(*pair, x) for x, pairs in zip(ratio, found) for pair in pairs])
+        parts = [[part for pair in pairs for part in _parts(pair, cuts)] for pairs in found]
+        return [None if x in failed else column for x, column in zip(ratio.tolist(), parts)]
 
     @staticmethod
     def _ends(grid, first: tuple, last: tuple, ends: dict, k: int) -> list[tuple]:
@@ -171,20 +199,21 @@ class _Search(NamedTuple):
             upper = [*upper, (grid[-1], int(last[2][k]))]
         return list(zip(lower, upper))
 
-    def _cuts(self, found: list[tuple]) -> dict[tuple, float]:
-        """Where blocks overturn after impacts below and, without a safe gap between, without any above; or conversely.
 
-        By the ends of the interval."""
-        mixed = [row for row in found if _is_mixed(row[0], row[1])]
-        if not mixed:
-            return {}
-        low, high, ratio = (np.array(x) for x in zip(*((first[0], last[0], x) for first, last, x in mixed)))
-        without = np.array([first[1] == 0 for first, *_ in mixed])
-        for _ in range(50):
-            middle = (low + high) / 2
-            same = (self.at(middle, ratio)[2] == 0) == without
-            low, high = np.where(same, middle, low), np.where(same, high, middle)
-        return {row[:2]: float(cut) for row, cut in zip(mixed, (low + high) / 2)}
+def _cuts(ask: Callable, found: list[tuple]) -> dict[tuple, float]:
+    """Where blocks overturn after impacts below and, without a safe gap between, without any above; or conversely.
+
+    By the ends of the interval."""
+    mixed = [row for row in found if _is_mixed(row[0], row[1])]
+    if not mixed:
+        return {}
+    low, high, ratio = (np.array(x) for x in zip(*((first[0], last[0], x) for first, last, x in mixed)))
+    without = np.array([first[1] == 0 for first, *_ in mixed])
+    for _ in range(50):
+        middle = (low + high) / 2
+        same = (ask(middle, ratio)[2] == 0) == without
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return {row[:2]: float(cut) for row, cut in zip(mixed, (low + high) / 2)}
 
 
 def _is_mixed(lower: tuple, upper: tuple) -> bool:
@@ -241,9 +270,14 @@ def _seen(count: int) -> float:
 
 
 def _wanted(places: list, columns: dict, width: float, height: float) -> tuple[list[float], list[tuple]]:
-    """Where columns have to be put between; and between which it is left, although intervals do not fit."""
+    """Where columns have to be put between; and between which it is left, although intervals do not fit, or as those
+    of one of them are not known."""
     wanted, crowded, pairs = set(), [], []
     for left, right in zip(places, places[1:]):
+        if columns[left] is None or columns[right] is None:
+            crowded.append((left, right))
+            pairs.append([])
+            continue
         found = _pairs(columns[left], columns[right], strict=True)
         pairs.append(found)
         lonely, seen = 0.0, 1.0
@@ -279,8 +313,8 @@ def _regions(places: list, columns: dict) -> list[Region]:
     """Intervals that belong together, column after column."""
     open_, regions = {}, []
     for k, place in enumerate(places):
-        now = columns[place]
-        onward = {j: i for i, j in _pairs(columns[places[k - 1]], now, strict=False)} if k else {}
+        now, before = columns[place] or [], (columns[places[k - 1]] if k else None) or []
+        onward = {j: i for i, j in _pairs(before, now, strict=False)}
         chains = {j: open_.pop(onward[j], []) if j in onward else [] for j in range(len(now))}
         regions += open_.values()
         open_ = {j: [*chain, (place, now[j])] for j, chain in chains.items()}
