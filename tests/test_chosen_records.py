@@ -9,6 +9,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock._checks import is_traced
+from jaxrock.engines import outlook
 from jaxrock.engines.scene import Scene
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 
@@ -220,3 +221,11 @@ def test_compiled_functions_do_not_see_names():
     for record in records:
         twice(record)
     assert seen == [("", "")] and [record.name for record in records] == ["first", "second"]
+
+
+@pytest.mark.parametrize("count", [17, 255, 256, 257, 513, 3000])
+def test_largest_values_from_each_piece_on(count):
+    """Of the next 16, the next 256, and all that follow."""
+    values = np.abs(np.random.default_rng(count).normal(size=count)) * np.exp(-np.arange(count) / count)
+    wanted = [[values[i : i + most].max() for i in range(count)] for most in (count, 16, 256)]
+    np.testing.assert_array_equal(outlook._maxima(jnp.asarray(values)), wanted)

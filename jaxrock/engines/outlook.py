@@ -93,11 +93,17 @@ def _maxima(values: Inexact[Array, " n"]) -> tuple[Inexact[Array, " n"], ...]:
     """
 
     def wider(k, maxima):
-        wide, near, far = maxima
+        wide, near = maxima
         wide = _wider(wide, 1 << k)
-        return wide, where(1 << k < _NEAR, wide, near), where(1 << k < _FAR, wide, far)
+        return wide, where(1 << k < _NEAR, wide, near)
 
-    return jax.lax.fori_loop(0, (values.size - 1).bit_length(), wider, (values, values, values))
+    size = values.size
+    far, near = jax.lax.fori_loop(0, min(size - 1, _FAR - 1).bit_length(), wider, (values, values))
+    # To the end: the next 256, and whole stretches of as many beyond the one in which these begin.
+    stretches = _maximum_to_end(far[::_FAR], None)
+    beyond = jnp.concatenate([stretches[1:], jnp.zeros_like(values[:1])])
+    beyond = jnp.broadcast_to(beyond[:, None], (beyond.size, _FAR)).reshape(-1)[:size]
+    return jnp.maximum(far, beyond), near, far
 
 
 def _maximum_to_end(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:

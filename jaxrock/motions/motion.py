@@ -330,7 +330,9 @@ class Summed(_Together):
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
-        first, second = self._finer.spread(self.first.bounds, self.second.bounds, quiet=0.0)
+        # Looked up before they are scaled: what only scales a part leaves that to all scales alike.
+        both = self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both))
+        first, second = (bounds.times_gain(bounds.values) for bounds in both)
         return first + second
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
