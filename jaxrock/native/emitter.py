@@ -138,6 +138,8 @@ class Emitter:
         depth = max(map(self._depth, inputs), default=0)
         if depth == len(self.before):
             results = self._apply(equation, inputs, active)
+        elif depth > len(self.before):
+            raise Unsupported(f"{name} of what another loop makes")
         else:
             with self.b.goto_block(self.before[depth]):
                 results = self._apply(equation, inputs, active)
