@@ -697,6 +697,7 @@ def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
 
 
 WAVES = np.sin(0.3 * np.arange(70))
+LIFTING = rk.RectangularPulse(0.3, 0.25)
 LAST = rk.RectangularPulse(-0.25, 0.4)
 TOGETHER = {
     "a pulse that begins where another ends": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b), 0.5),
@@ -709,6 +710,8 @@ TOGETHER = {
     "with the vertical motion": (lambda a, b: rk.SinePulse(0.4, a).with_vertical(rk.CosinePulse(0.2, b)), 0.6),
     "later": (lambda a, b: (rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b)).shifted(a), 0.6),
     "beside a record": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b) + rk.Record(0.1 * WAVES, 0.02), 0.5),
+    "lifted there": (lambda a, b: LIFTING.shifted(a) + rk.TriangularPulse(-0.15, 0.5).shifted(b), 0.75),
+    "lifted there, beside a record": (lambda a, b: LIFTING.shifted(a) + rk.Record(0.05 * WAVES, b / 15), 0.75),
     "a record upward, too": (lambda a, b: rk.Record(0.4 * WAVES, a / 25).with_vertical(rk.Record(WAVES, b / 25)), 0.5),
 }
 

@@ -93,17 +93,17 @@ def _maxima(values: Inexact[Array, " n"]) -> tuple[Inexact[Array, " n"], ...]:
     """
 
     def wider(k, maxima):
-        wide, near = maxima
-        wide = _wider(wide, 1 << k)
-        return wide, where(1 << k < _NEAR, wide, near)
+        (wide, near), reach = maxima, 1 << k
+        wide = _wider(wide, reach)
+        return wide, where(reach < _NEAR, wide, near)
 
     size = values.size
     far, near = jax.lax.fori_loop(0, min(size - 1, _FAR - 1).bit_length(), wider, (values, values))
     # To the end: the next 256, and whole stretches of as many beyond the one in which these begin.
-    stretches = _maximum_to_end(far[::_FAR], None)
-    beyond = jnp.concatenate([stretches[1:], jnp.zeros_like(values[:1])])
-    beyond = jnp.broadcast_to(beyond[:, None], (beyond.size, _FAR)).reshape(-1)[:size]
-    return jnp.maximum(far, beyond), near, far
+    stretches = jax.lax.cummax(far[::_FAR], reverse=True)  # few, of which XLA may take the square
+    beyond = jax.lax.concatenate([stretches[1:], jax.lax.full((1,), 0.0, values.dtype)], 0)
+    beyond = jax.lax.broadcast_in_dim(beyond, (beyond.size, _FAR), (0,)).reshape(-1)[:size]
+    return jax.lax.max(far, beyond), near, far
 
 
 def _maximum_to_end(values: Inexact[Array, " n"], left: Int[Array, " m"] | None) -> Inexact[Array, " n"]:
@@ -124,5 +124,5 @@ def _wider(
     """Each value, or the one `reach` further on if that is larger (zeros beyond the end, and beyond the `room` that is
     left from a position on; none is negative)."""
     beyond = jnp.concatenate([values, jnp.zeros_like(values)])
-    more = jax.lax.dynamic_slice_in_dim(beyond, jnp.minimum(reach, values.size), values.size)
+    more = jax.lax.dynamic_slice_in_dim(beyond, reach, values.size, allow_negative_indices=False)  # zeros are the last
     return jnp.maximum(values, more if room is None else where(reach < room, more, 0.0))

@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.engines.state import State
 from jaxrock.engines.stepper import AbstractStepper
+from jaxrock.models.equation import Angle
+from jaxrock.motions.motion import is_of_several
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
@@ -65,7 +67,25 @@ def wait(
     waited = lift(waited, where(second, -1.0, 1.0), met, met, zero > 0)
     (first, touching), (other, touching2) = lifted
     at_once = lift(state, where(first, 1.0, -1.0), first | other, where(first, touching, touching2), first | other)
-    return jax.tree.map(lambda a, b: where(first | other, a, b), at_once, waited)
+    after = jax.tree.map(lambda a, b: where(first | other, a, b), at_once, waited)
+    return _moved_by_ties(stepper, state, shaking, ~lasting, after) if is_of_several(scene.motion) else after
+
+
+def _moved_by_ties(stepper: AbstractStepper, state: State, shaking: Shaking, tied: Flag, after: State) -> State:
+    """Between knots that come together nothing is lifted; but where the ground would lift the block there, and does so
+    at the last of them, it does as soon as one of them goes. So the velocity of a block at rest has a derivative, which
+    does not outlast a wait in which it is not lifted at once."""
+    scene, eps = stepper.scene, jnp.finfo(state.local.dtype).eps
+    velocity, zero = state.velocity, jnp.zeros_like(state.opening)
+    push, weight = shaking.now
+    gone = scene.p * stepper.room(state)
+    eager = jnp.zeros_like(tied)
+    for side, moments, (drive, level) in zip((1, -1), scene.both_moments, scene.drives_of(shaking)):
+        lifts = tied & (drive[0] > level * (1 + 8 * eps))
+        acceleration = moments.acceleration(Angle.of(zero), zero, side * push, weight)
+        velocity = where(lifts, velocity + side * gone * acceleration, velocity)
+        eager = eager | lifts
+    return replace(after, velocity=where(eager, with_derivatives_of(fixed(after.velocity), velocity), after.velocity))
 
 
 def longest_wait(stepper: AbstractStepper, shaking: Shaking, room: Scalar, order: int, tolerance: float) -> Scalar:

@@ -23,6 +23,7 @@ from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
 _MANY = 32  # pieces, from which on there may be room for more
+_TOGETHER = 4  # knots that come together, of motions at once
 
 
 def peak_bound(motion: AbstractMotion) -> Scalar:
@@ -192,10 +193,13 @@ class Scene(eqx.Module):
 
     def after_quiet(self, piece: Int[Array, ""]) -> Int[Array, ""]:
         """First piece from `piece` on that may uplift a block at rest; cheap, so it may stop early."""
-        return jnp.minimum(self.outlook.after_quiet(piece), self.pieces)
+        later = self.outlook.after_quiet(piece)
+        if is_of_several(self.motion):  # those just before may have no length, but slopes
+            later = jnp.maximum(later - _TOGETHER, piece)
+        return jnp.minimum(later, self.pieces)
 
     def from_here(self, piece: Int[Array, ""]) -> Int[Array, ""]:
-        """This piece, or, where it does not last, the first after it that does."""
+        """This piece, or, where it does not last, the first after it that does, if the scene tells which."""
         return piece if self.following is None else jnp.minimum(self.following[piece], self.pieces)
 
     def length(self, piece: Int[Array, ""]) -> Scalar:

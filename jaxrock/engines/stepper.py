@@ -110,8 +110,10 @@ class AbstractStepper(eqx.Module):
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
         """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
         ends = full if self.stop is None else full & (self._to_knot(state) <= self.stop - self.time(state))
-        # A history tells all its steps, as many with derivatives as without.
-        following = state.piece + 1 if self.history else self.scene.from_here(state.piece + 1)
-        piece = where(ends, following, state.piece)
+        piece = state.piece + ends
+        if (
+            self.scene.following is not None and not self.history
+        ):  # which tells as many steps with derivatives as without
+            piece = where(ends, self.scene.from_here(piece), piece)
         over = piece >= self.scene.pieces if self.stop is None else full & ~ends
         return piece, where(ends, 0.0, state.local + elapsed), over
