@@ -64,8 +64,9 @@ def main():
         table(["motion", "knots", "µs a response", "responses/s", "difference"], rows),
         "",
         "Before pieces were looked up in one table, and those without a length passed over, the vertical component",
-        "took twelve times as long as the record alone (514 µs of processor time beside 41). Sums take six to ten times: what the",
-        "ground may do from each piece on is found anew for every scale of one part, where one record has it once.",
+        "took twelve times as long as the record alone (514 µs of processor time beside 41). Sums take six to ten",
+        "times: what the ground may do from each piece on is found anew for every scale of one part, where one record",
+        "has it once.",
     ]
     (Path(__file__).parent / "two_motions.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
