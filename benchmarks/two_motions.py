@@ -63,9 +63,9 @@ def main():
         "",
         table(["motion", "knots", "µs a response", "responses/s", "difference"], rows),
         "",
-        "Before pieces were looked up in one table, and those without a length passed over (commit 644d81d), this script",
-        "gave 25.1, 287 and 587 µs for the first three. Sums take six to ten times one record: what the ground may do from",
-        "each piece on is found anew for every scale of one part, where one record has it once.",
+        "Before pieces were looked up in one table, and those without a length passed over (commit 644d81d), this",
+        "script gave 25.1, 287 and 587 µs for the first three. Sums take six to ten times one record: what the ground",
+        "may do from each piece on is found anew for every scale of one part, where one record has it once.",
     ]
     (Path(__file__).parent / "two_motions.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -22,7 +22,10 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
     if arguments.clear:
         for each in place.iterdir() if place.is_dir() else ():  # which may be a link, and stays
-            shutil.rmtree(each, ignore_errors=True) if each.is_dir() else each.unlink(missing_ok=True)
+            if each.is_dir():
+                shutil.rmtree(each, ignore_errors=True)
+            else:
+                each.unlink(missing_ok=True)
         if left := [file for file in kept() if file.exists()]:
             raise OSError(f"{len(left)} of {len(files)} files in {place} cannot be deleted, such as {left[0]}")
     report.results |= {"folder": str(place), "programs": programs, "mebibytes": size, "deleted": arguments.clear}
