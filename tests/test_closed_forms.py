@@ -495,6 +495,12 @@ def test_pushover_has_ranges():
         pushover.amplitude_after(-5, 0.9, 0.5)
 
 
+def test_no_impact_costs_nothing():
+    """Of a block that an impact would stop as well: and the amplitude does not depend on the restitution."""
+    value, slope = jax.value_and_grad(lambda e: pushover.amplitude_after(0, 0.5, e))(0.0)
+    assert (float(value), float(slope)) == (pytest.approx(0.5, rel=1e-15), 0.0)
+
+
 def test_free_rocking():
     """Housner's period and decay against a history."""
     block, quiet = rk.Block(ALPHA, 2.0, 0.9), rk.Record(np.zeros(2), 1.0)

@@ -494,6 +494,8 @@ def test_what_is_written_is_read_again(tmp_path):
     assert tuple(rk.read_record(path).origin)[:3] == origin[:3]
     rk.motions.write_csv(record, path, "cm/s2")
     np.testing.assert_allclose(rk.read_record(path).samples, SAMPLES, rtol=1e-15)
+    rk.motions.write_csv(rk.Record(SAMPLES.astype(np.float32), np.float32(0.01)), path)  # which is 0.00999999977
+    assert path.read_text().splitlines()[3].startswith("0.01,")
 
 
 @pytest.mark.parametrize(

@@ -416,12 +416,15 @@ ARITHMETIC = {
     "numpy scalar*m": (np.float64(2.5) * A, lambda a, b: 2.5 * a),
     "jax scalar*m": (jnp.asarray(2.5) * A, lambda a, b: 2.5 * a),
     "0*m": (0 * A, lambda a, b: 0 * a),
+    "m/2": (A / 2, lambda a, b: 0.5 * a),
+    "m/jax scalar": (A / jnp.asarray(4.0), lambda a, b: 0.25 * a),
     "-m": (-A, lambda a, b: -a),
     "-(3*m)": (-(3 * A), lambda a, b: -3 * a),
     "m+n": (A + B, lambda a, b: a + b),
     "n+m": (B + A, lambda a, b: a + b),
     "m-n": (A - B, lambda a, b: a - b),
     "m-m": (A - A, lambda a, b: 0 * a),
+    "sum": (sum([A, B, A]), lambda a, b: 2 * a + b),
     "3*(m-n)+n": (3 * (A - B) + B, lambda a, b: 3 * a - 2 * b),
 }
 

@@ -171,5 +171,6 @@ def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result
 
     **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.
     """
-    left: Any = restitution ** (2 * impacts) * amplitude * (2 - amplitude)
+    kept = jnp.where(impacts == 0, 1.0, restitution)  # a power of zero to zero has no slope
+    left: Any = kept ** (2 * impacts) * amplitude * (2 - amplitude)
     return left / (1 + jnp.sqrt(1 - left))

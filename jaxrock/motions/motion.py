@@ -7,6 +7,7 @@ in units of g; positive acceleration drives negative rotation.
 
 import abc
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -125,11 +126,17 @@ class AbstractMotion(Owner):
     def __rmul__(self, factor: ArrayLike) -> "Scaled":
         return Scaled(self, factor)
 
+    def __truediv__(self, factor: ArrayLike) -> "Scaled":
+        return Scaled(self, 1 / factor)
+
     def __neg__(self) -> "Scaled":
         return Scaled(self, -1.0)
 
     def __add__(self, other: "AbstractMotion") -> "Summed":
         return Summed(self, other) if isinstance(other, AbstractMotion) else NotImplemented
+
+    def __radd__(self, other: Any) -> "AbstractMotion":
+        return self if isinstance(other, int) and other == 0 else NotImplemented  # with which `sum` begins
 
     def __sub__(self, other: "AbstractMotion") -> "Summed":
         return Summed(self, -other) if isinstance(other, AbstractMotion) else NotImplemented

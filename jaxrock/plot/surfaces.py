@@ -9,7 +9,7 @@ import numpy as np
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, shade
 from jaxrock.status import Status
-from jaxrock.studies.borders import Region, borders_within, overturning_borders
+from jaxrock.studies.borders import Borders, Region, borders_within, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
 if TYPE_CHECKING:
@@ -126,7 +126,6 @@ def overturning(
     """
     import matplotlib.pyplot as plt
     from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
-    from matplotlib.patches import Patch
 
     _without_more(result)
     if axis is None:
@@ -141,13 +140,7 @@ def overturning(
         peaks = _beyond(np.where(state == 0, np.asarray(result.max_rotation)[np.ix_(rows, columns)], np.nan))
         picture = draw_cells(axis, x, y, peaks, cmap=shades, vmin=0, vmax=1)
         axis.figure.colorbar(picture, ax=axis, label=r"peak rotation of survivors $\theta_{max}/\alpha$", extend="max")
-    pixels, found = np.ones(x.size, bool), None
-    if exact:
-        found = overturning_borders(result, progress=progress)
-    elif exact is None and _is_quick(result):
-        found = borders_within(result, _SCENES, progress)
-        if found is None:
-            _LOG.info("too many islands for exact borders: pixels are drawn (exact=True takes the time)")
+    pixels, found = np.ones(x.size, bool), _borders_of(result, exact, progress)
     if found is not None:
         pixels = _within(np.asarray(result.frequency_ratio)[columns], found.crowded)
         for region in found.regions:
@@ -158,11 +151,7 @@ def overturning(
     if (state == -1).any():
         unknown = np.nonzero(state == -1)
         axis.plot(x[unknown[1]], y[unknown[0]], "kx", markersize=3)
-    names = {-1: "not computed", 0: "safe", 1: "overturned without impact", 2: "overturned after impacts"}
-    colors = dict(zip((-1, 1, 2, 0), (*_STATES, _SAFE[0])))
-    shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
-    handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
-    axis.legend(handles=handles, loc="lower right" if by_duration else "upper left", fontsize=8)
+    _explain_states(axis, state, "lower right" if by_duration else "upper left")
     axis.set(xlim=limits_of(x), ylim=limits_of(y))
     axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
     axis.set_ylabel(
@@ -171,6 +160,29 @@ def overturning(
         else "intensity (peak acceleration / uplift threshold)"
     )
     return axis
+
+
+def _borders_of(result: OverturningMap, exact: bool | None, progress: bool | None) -> Borders | None:
+    """Where borders are drawn as they are: asked for, or quickly found where nothing is said."""
+    if exact:
+        return overturning_borders(result, progress=progress)
+    if exact is False or not _is_quick(result):
+        return None
+    found = borders_within(result, _SCENES, progress)
+    if found is None:
+        _LOG.info("too many islands for exact borders: pixels are drawn (exact=True takes the time)")
+    return found
+
+
+def _explain_states(axis: "Axes", state: np.ndarray, place: str) -> None:
+    """A legend of verdicts; of "not computed" where there are such."""
+    from matplotlib.patches import Patch
+
+    names = {-1: "not computed", 0: "safe", 1: "overturned without impact", 2: "overturned after impacts"}
+    colors = dict(zip((-1, 1, 2, 0), (*_STATES, _SAFE[0])))
+    shown = sorted(set(np.unique(state).tolist()) | {0, 1, 2})
+    handles = [Patch(facecolor=colors[i], edgecolor=GREY, label=names[i]) for i in shown]
+    axis.legend(handles=handles, loc=place, fontsize=8)
 
 
 def draw_region(axis: "Axes", region: Region, by_duration: bool = False) -> None:
