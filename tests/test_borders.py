@@ -124,16 +124,16 @@ def test_intervals_that_belong_together(name):
 
 
 def test_where_impacts_give_way_to_none_without_a_gap(monkeypatch):
-    """A region is parted there: here by a margin that is made up."""
+    """A region is parted there, in every column elsewhere: here by a margin that is made up."""
 
     def margins(self, z, ratio):
         intensity = np.exp(z)
-        return 2 - intensity, -intensity, np.where(intensity > 3, 0, 1)
+        return 2 - intensity, -intensity, np.where(intensity > 2 + ratio, 0, 1)
 
     monkeypatch.setattr(borders._Search, "at", margins)
-    ((lower, upper),) = borders._Search((), 1.0, 4.0, False).columns(np.array([1.0]))
-    np.testing.assert_allclose([lower.lower, lower.upper, upper.lower, upper.upper], [2, 3, 3, 4], rtol=1e-12)
-    assert (lower.impacts, upper.impacts) == (1, 0)
+    for (lower, upper), cut in zip(borders._Search((), 1.0, 4.0, False).columns(np.array([1.0, 0.5])), (3, 2.5)):
+        np.testing.assert_allclose([lower.lower, lower.upper, upper.lower, upper.upper], [2, cut, cut, 4], rtol=1e-12)
+        assert (lower.impacts, upper.impacts) == (1, 0)
 
 
 @pytest.mark.parametrize("change", [{"scene": None}, {"parameters": {"shape": jnp.zeros(2)}}])

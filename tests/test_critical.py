@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.studies import ends
 
 SCENES = json.loads((Path(__file__).parents[1] / "references" / "critical.json").read_text())["scenes"]
 PULSES = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "half sine": rk.HalfSinePulse}
@@ -46,6 +47,29 @@ def test_all_ends(kind):
                 derivatives += 1
     assert found.names[:4] == ("alpha", "p", "restitution", "period" if kind == "sine" else "duration")
     assert derivatives >= 4
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_search_in_the_precision_of_its_margins(kind):
+    """It does not go on where nothing is told any more, and takes for balance what rounding may leave."""
+    asked = []
+
+    def at(z, index):
+        asked.append(z)
+        margin = kind(30) * (kind(np.sqrt(0.5)) - z.astype(kind))
+        return margin, np.full_like(margin, -30), (margin < 0).astype(int)
+
+    found = ends.roots_of(at, ends.brackets_of(at, np.linspace(0, 1, 5)[None])[0])
+    np.testing.assert_allclose(found["z"], [np.sqrt(0.5)], rtol=20 * np.finfo(kind).eps)
+    assert found["balanced"].tolist() == [True] and len(asked) < 40
+
+
+def test_what_is_not_known_is_no_end():
+    """Beside a point without a result the verdict may change or not."""
+    sides = [np.array([[0.0], [1.0]]), np.array([[-1.0], [1.0]]), np.ones((2, 1)), np.ones((2, 1), int)]
+    values = (np.array([0.5]), np.array([np.nan]), np.ones(1), np.ones(1, int))
+    *_, single, more = ends.halved(np, sides, values, np.array([6]))
+    assert not single.any() and not more.any()
 
 
 def least(numbers, amplitude):

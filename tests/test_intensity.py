@@ -159,6 +159,14 @@ def test_one_motion_has_one_mean_period():
     assert rk.intensity.arias(record.shifted(1.2345)) == pytest.approx(rk.intensity.arias(record), rel=1e-12)
 
 
+def test_mean_period_of_few_samples_a_second():
+    """Straight lines between samples move above half of the rate of the samples, too: as those at a shorter step do."""
+    signs = np.where(np.arange(400) % 2, 0.1, -0.1)
+    record = rk.Record((np.sin(2 * np.pi * np.arange(400) * 0.05) + signs) * (np.arange(400) % 399 > 0), 0.05)
+    finer = rk.Record(np.interp(0.0125 * np.arange(1597), 0.05 * np.arange(400), record.samples), 0.0125)
+    assert rk.intensity.mean_period(record) == pytest.approx(rk.intensity.mean_period(finer), rel=1e-5)
+
+
 def test_mean_period_of_a_long_sine():
     record = rk.Record(np.sin(2 * np.pi * np.arange(40_000) * 0.005 / 0.5), 0.005)
     assert rk.intensity.mean_period(record) == pytest.approx(0.5, rel=3e-3)

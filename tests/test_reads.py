@@ -122,6 +122,24 @@ def test_not_told(name):
     assert reads(NOT_TOLD[name]) is None
 
 
+def test_which_function_is_called_again_is_told():
+    """Of functions that hold the same others, in another order."""
+
+    def held(a, b, c):
+        return lambda x: a(x) + b(x) * c(x)
+
+    def same(x):
+        return x
+
+    def tenfold(x):
+        return 10 * x
+
+    orders = [(same, tenfold, same), (same, tenfold, tenfold), (same, same, tenfold)]
+    assert len({reads(held(*order)) for order in orders}) == 3
+    for order in orders:
+        assert float(rk.sweep(held(*order), x=[2.0]).values[0]) == held(*order)(2.0)
+
+
 def test_not_told_where_it_imports_or_assigns():
     def importing(x):
         import time

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxrock as rk
-from jaxrock.blocks.restitution import Corners, Reset, on_sides
+from jaxrock.blocks.restitution import Corners, Reset, on_sides, tells_sides
 from jaxrock.studies.parameters import named, rebuilt
 
 SOFT = rk.restitution.SpeedDependent(0.95, 0.6, 0.3)  # changes much within the speeds that occur here
@@ -290,6 +290,26 @@ class Leaning(rk.restitution.AbstractRestitution):
 
     def ratio(self, corners, speed):
         return jnp.where(corners.side < 0, 0.7, self.first) + 0 * speed
+
+
+def tabulated(values):
+    return jax.jit(lambda speed: jnp.interp(speed, jnp.arange(2.0), values))
+
+
+class Tabulated(rk.restitution.AbstractRestitution):
+    """One whose sides differ by the arrays that two functions under `jax.jit` hold."""
+
+    depends_on_speed = True
+    sides: tuple = eqx.field(static=True, default=(tabulated(jnp.array([0.9, 0.8])), tabulated(jnp.array([0.7, 0.6]))))
+
+    def ratio(self, corners, speed):
+        return self.sides[0 if corners.side > 0 else 1](speed)
+
+
+def test_arrays_within_functions_tell_sides_apart():
+    """The text of both programs is the same."""
+    corners = rk.Block(0.2, 2.0).corners
+    assert tells_sides(Tabulated(), corners) and not tells_sides(rk.restitution.Housner(), corners)
 
 
 @pytest.mark.parametrize("law", [rk.restitution.PerSide(0.9, 0.7), Leaning(jnp.asarray(0.9))])

@@ -387,6 +387,8 @@ def test_fit_of_a_simulated_surface():
     assert float(fit.fragility.median) == float(plain.fragility.median) == pytest.approx(0.15, rel=0.05)
     errors = np.sqrt(np.diag(fit.covariance) / np.diag(plain.covariance))
     assert np.all((0.5 < errors) & (errors < 2.0))
+    alone = rk.hazard.SimulatedSurface(*jax.device_put((acceleration, ratio)), verdict[..., :1]).fit()
+    assert np.isfinite(alone.fragility.median) and np.isnan(alone.covariance).all()  # a block says nothing of others
     verdict[0, 5, 5, 0] = -1
     with pytest.raises(ValueError, match="1 of 4000 scenes are undecided"):
         found.fit()
@@ -465,6 +467,10 @@ def test_motions_of_one_name_are_numbered():
         (
             lambda: rk.hazard.fit_surface([0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.0, 1.0, 0.0], clusters=[1, 2]),
             r"shape \(3,\)",
+        ),
+        (
+            lambda: rk.hazard.fit_surface([0.1, 0.2, 0.3], [0.1, 0.3, 0.2], [0.0, 1.0, 0.0], clusters=["a"] * 3),
+            "`clusters` must name at least two clusters",
         ),
     ],
 )

@@ -150,6 +150,21 @@ def test_whole_numbers_are_numbers(kind):
     assert answer(kind)[2][0] > 0
 
 
+class Misnamed(rk.motions.SinePulse):
+    """A motion with a parameter of the block's name."""
+
+    alpha: jax.Array = rk.parameter("-")
+
+    def __init__(self, amplitude, period, alpha):
+        super().__init__(amplitude, period)
+        self.alpha = jnp.asarray(alpha)
+
+
+def test_a_motion_does_not_replace_numbers_of_the_block():
+    with pytest.raises(ValueError, match="`motion` has a parameter 'alpha', as the block has"):
+        rk.studies.sensitivity(rk.Block(0.2, 2.0), Misnamed(0.4, 1.0, 0.5))
+
+
 class Picked(rk.motions.AbstractMotion):
     """One of many lists of corners, by its number."""
 

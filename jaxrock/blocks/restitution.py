@@ -15,7 +15,8 @@ or in a file of yours:
 """
 
 import abc
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -271,8 +272,17 @@ def tells_sides(law: AbstractRestitution, corners: Corners) -> bool:
     one, other = program(1), program(-1)
     if str(one) != str(other):
         return True
-    pairs = zip(one.consts, other.consts)
+    pairs = zip(_arrays_within(one), _arrays_within(other))
     return any(a is not b and (is_traced((a, b)) or not np.array_equal(a, b)) for a, b in pairs)
+
+
+def _arrays_within(program: Any) -> Iterator:
+    """The arrays in a program, whose text does not show them, and in those of the functions that it calls."""
+    yield from getattr(program, "consts", ())
+    for equation in program.eqns:
+        for part in jax.tree.leaves(equation.params):
+            if hasattr(part, "eqns"):
+                yield from _arrays_within(part)
 
 
 def law_of(

@@ -123,7 +123,7 @@ def fit_surface(
 
     **Returns:** a `SurfaceFit`.
 
-    **Raises:** ValueError for arguments outside their ranges, or of other shapes.
+    **Raises:** ValueError for arguments outside their ranges, or of other shapes, and for fewer than two clusters.
 
     **Source:** the two measures by Purvance, Anooshehpoor & Brune (2008); Liang & Zeger (1986), clusters.
     """
@@ -140,9 +140,11 @@ def fit_surface(
     )
     if labels.shape != acceleration.shape:
         raise ValueError(f"Argument `clusters` must have shape {acceleration.shape}, but has shape {labels.shape}.")
-    fit, scores = _fit(acceleration, ratio, toppled, trials - toppled)
     count = int(labels.max()) + 1
-    if count < 2 or count == acceleration.size:
+    if count < 2:
+        raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
+    fit, scores = _fit(acceleration, ratio, toppled, trials - toppled)
+    if count == acceleration.size:
         return fit
     summed = jnp.zeros((count, 3)).at[labels].add(scores)
     middle = summed.T @ summed * count / (count - 1)
@@ -249,14 +251,18 @@ class SimulatedSurface(eqx.Module):
         - `bound`: as in `SimulatedFragility.counts`.
 
         **Returns:** a `SurfaceFit`. Draws are taken as what is random (clusters): its covariance tells how far their
-        number lets the fit be known, for the pulses as they are; of a single block it says nothing.
+        number lets the fit be known, for the pulses as they are; of a single block it is not known, and NaN.
         """
         toppled = counts(np.moveaxis(self.verdict, 0, -1), bound)  # (rows, columns, draws), of all pulses
         cells = np.meshgrid(
             np.asarray(self.acceleration), np.asarray(self.ratio), np.arange(toppled.shape[-1]), indexing="ij"
         )
         acceleration, ratio, draws = (x.ravel() for x in cells)
-        return fit_surface(acceleration, ratio, toppled.ravel(), float(len(self.verdict)), draws)
+        trials = float(len(self.verdict))
+        if toppled.shape[-1] > 1:
+            return fit_surface(acceleration, ratio, toppled.ravel(), trials, draws)
+        fit = fit_surface(acceleration, ratio, toppled.ravel(), trials)
+        return eqx.tree_at(lambda f: f.covariance, fit, jnp.full_like(fit.covariance, jnp.nan))
 
 
 @arguments

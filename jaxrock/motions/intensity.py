@@ -224,10 +224,13 @@ def mean_period(motion: AbstractMotion) -> float:
     # At a jump the mean of both sides, so that it comes neither too early nor too late.
     samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
     count = 1 << int(np.ceil(np.log2(max(2 * samples.size, 1 / (_APART * step)))))
-    grid = np.fft.rfftfreq(count, step)
+    number = np.arange(int(20 * count * step) + 2)
+    grid = number / (count * step)
+    # Of straight lines between the samples: that of samples, which comes again beyond half of their rate, but weaker.
+    again = np.abs((number + count // 2) % count - count // 2)
+    found = (np.abs(np.fft.rfft(samples, count))[again] * np.sinc(grid * step) ** 2) ** 2
     frequency = np.concatenate([[0.25], grid[(grid > 0.25) & (grid < 20)], [20.0]])
-    # Of straight lines between the samples.
-    power = np.interp(frequency, grid, np.abs(np.fft.rfft(samples, count) * np.sinc(grid * step) ** 2) ** 2, right=0.0)
+    power = np.interp(frequency, grid, found)
     total = np.trapezoid(power, frequency)
     if not total > 0:
         raise ValueError("Argument `motion` must move between 0.25 and 20 Hz, but does not.")

@@ -110,7 +110,7 @@ class Suite(AbstractNamed):
                 peaks, "Argument `motions` must move the ground", failed
             )
             return
-        # What lasts for no time, as a record of one sample, has an acceleration, and no velocity.
+        # What lasts for no time, as a record of one sample, moves nothing.
         for name, peak, speed in zip(self.names, np.asarray(self.peak_acceleration), np.asarray(self.peak_velocity)):
             if not (peak > _LEAST and speed > 0):
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")

@@ -143,7 +143,8 @@ class Emitter:
         else:
             with self.b.goto_block(self.before[depth]):
                 results = self._apply(equation, inputs, active)
-        self.remember(flat([x for x in results if not isinstance(x, Memory)]), depth)
+        given = set(map(id, _loose(inputs)))  # what is passed on is not made here
+        self.remember([value for value in _loose(results) if id(value) not in given], depth)
         return results
 
     def _depth(self, value) -> int:
@@ -159,7 +160,7 @@ class Emitter:
         for value in values:
             if not isinstance(value, ir.Constant):  # which many share, and nothing makes
                 self._alive.append(value)
-                # What moves a value about makes none anew; the end of a loop takes what it leaves out of it.
+                # The end of a loop takes what it leaves out of it.
                 self._depths[id(value)] = min(depth, self._depths.get(id(value), depth))
 
     def _apply(self, equation, inputs: list, active) -> list:
@@ -282,6 +283,11 @@ def flat(values: list) -> list:
         else:
             vectors.append(value)
     return vectors
+
+
+def _loose(values: list) -> list:
+    """The single vectors, but for those in long lists."""
+    return flat([value for value in values if not isinstance(value, Memory)])
 
 
 def like(values: list, vectors: list) -> list:

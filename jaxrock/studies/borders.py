@@ -182,8 +182,9 @@ class _Search(NamedTuple):
         ends = roots_of(at, brackets_of(at, grid)[0])
         first, last = (ask(np.full(ratio.size, edge), ratio) for edge in (grid[0, 0], grid[0, -1]))
         found = [self._ends(grid[0], first, last, ends, k) for k in range(ratio.size)]
-        cuts = _cuts(ask, [(*pair, x) for x, pairs in zip(ratio, found) for pair in pairs])
-        parts = [[part for pair in pairs for part in _parts(pair, cuts)] for pairs in found]
+        rows = [[(*pair, x) for pair in pairs] for x, pairs in zip(ratio.tolist(), found)]
+        cuts = _cuts(ask, [row for column in rows for row in column])
+        parts = [[part for row in column for part in _parts(row, cuts)] for column in rows]
         return [None if x in failed else column for x, column in zip(ratio.tolist(), parts)]
 
     @staticmethod
@@ -203,7 +204,7 @@ class _Search(NamedTuple):
 def _cuts(ask: Callable, found: list[tuple]) -> dict[tuple, float]:
     """Where blocks overturn after impacts below and, without a safe gap between, without any above; or conversely.
 
-    By the ends of the interval."""
+    By the interval: both ends and the frequency ratio."""
     mixed = [row for row in found if _is_mixed(row[0], row[1])]
     if not mixed:
         return {}
@@ -213,19 +214,19 @@ def _cuts(ask: Callable, found: list[tuple]) -> dict[tuple, float]:
         middle = (low + high) / 2
         same = (ask(middle, ratio)[2] == 0) == without
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return {row[:2]: float(cut) for row, cut in zip(mixed, (low + high) / 2)}
+    return {row: float(cut) for row, cut in zip(mixed, (low + high) / 2)}
 
 
 def _is_mixed(lower: tuple, upper: tuple) -> bool:
     return (lower[1] == 0) != (upper[1] == 0)
 
 
-def _parts(pair: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
+def _parts(row: tuple, cuts: dict[tuple, float]) -> list[_Interval]:
     """The interval between two ends, in two where the one part is without impacts."""
-    (low, first), (high, last) = pair
-    if not _is_mixed(*pair):
+    (low, first), (high, last), _ = row
+    if not _is_mixed(*row[:2]):
         return [_Interval(math.exp(low), math.exp(high), first, (first, last))]
-    cut = math.exp(cuts[pair])
+    cut = math.exp(cuts[row])
     return [_Interval(math.exp(low), cut, first, (first, -1)), _Interval(cut, math.exp(high), last, (-1, last))]
 
 

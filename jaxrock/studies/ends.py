@@ -14,7 +14,8 @@ import numpy as np
 Sides = list[Any]  # z, margin, slope and impacts at both ends of many intervals, (2, intervals) each
 
 _ROUGH, _DEEP = 7, 60  # halvings of an interval: where the margin is not smooth, and where an end may hide
-_TIGHT = 4e-15  # width of a bracket, relative
+_TIGHT = 18  # width of a bracket, relative, over the rounding of margins
+_BALANCED = 1e-6, 2e4  # margin at an end where the block comes to balance: so much, or so often the rounding
 
 
 def brackets_of(at: Callable, grid: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -58,10 +59,11 @@ def halved(numbers: ModuleType, sides: Sides, values: tuple, depth) -> tuple:
     halves = [(numbers.concatenate([x[0], v]), numbers.concatenate([v, x[1]])) for x, v in zip(sides, values)]
     sides, depth = [numbers.stack(each) for each in halves], numbers.tile(depth, 2) + 1
     differ = (sides[1][0] < 0) != (sides[1][1] < 0)
-    hidden = ~differ & _may_hide(numbers, *sides) & (sides[0][1] - sides[0][0] > _TIGHT)
-    single = differ & (depth >= _ROUGH)
+    hidden = ~differ & _may_hide(numbers, *sides) & (sides[0][1] - sides[0][0] > _TIGHT * _rounding(sides))
+    known = ~numbers.isnan(sides[1]).any(axis=0)
+    single = differ & (depth >= _ROUGH) & known
     more = ((differ | rough) & (depth < _ROUGH)) | (hidden & (depth < _DEEP))
-    return sides, depth, single, more & ~numbers.isnan(sides[1]).any(axis=0) & ~single
+    return sides, depth, single, more & known & ~single
 
 
 def _may_hide(numbers: ModuleType, z, margin, slope, impacts):
@@ -99,7 +101,12 @@ MOST_POINTS = 120  # to close a bracket
 def is_wide(numbers: ModuleType, sides: Sides):
     """Whether a bracket is wider than rounding."""
     low, high = sides[0]
-    return high - low > _TIGHT * numbers.maximum(1.0, numbers.maximum(abs(low), abs(high)))
+    return high - low > _TIGHT * _rounding(sides) * numbers.maximum(1.0, numbers.maximum(abs(low), abs(high)))
+
+
+def _rounding(sides: Sides) -> float:
+    """Of margins: points may be known better."""
+    return float(np.finfo(sides[1].dtype).eps)
 
 
 def next_point(numbers: ModuleType, sides: Sides, count):
@@ -109,7 +116,7 @@ def next_point(numbers: ModuleType, sides: Sides, count):
     best, value, rate = (numbers.where(near, x[1], x[0]) for x in (z, margin, slope))
     step = -value / numbers.where(rate == 0, numbers.inf, rate)
     # A little too far, so that the bracket closes from both sides.
-    trial = best + 1.05 * step + numbers.copysign(_TIGHT / 4, step)
+    trial = best + 1.05 * step + numbers.copysign(_TIGHT / 4 * _rounding(sides), step)
     inside = (trial > z[0]) & (trial < z[1]) & (count % 4 != 3)
     return numbers.where(inside, trial, z.mean(axis=0))
 
@@ -117,11 +124,12 @@ def next_point(numbers: ModuleType, sides: Sides, count):
 def ends_of(numbers: ModuleType, sides: Sides) -> dict[str, Any]:
     """What is told of the ends in closed brackets: `safe` is the side on which the block stands."""
     z, margin, _, impacts = sides
+    least, often = _BALANCED
     rising = ~(margin[0] < 0)  # zero is safe
     return {
         "z": z.mean(axis=0),
         "safe": numbers.where(rising, z[0], z[1]),
         "rising": rising,
         "impacts": numbers.where(rising, impacts[1], impacts[0]),
-        "balanced": numbers.maximum(abs(margin[0]), abs(margin[1])) < 1e-6,
+        "balanced": numbers.maximum(abs(margin[0]), abs(margin[1])) < max(least, often * _rounding(sides)),
     }

@@ -30,10 +30,14 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     `radius_ratio`), its restitution (`restitution`; `restitution1` and `restitution2` of two sides; of a law with
     parameters of its own these, as `restitution.gentle`), and those of the motion as it names them; `amplitude` [g]
     also of a motion that does not (a record): its peak, which scales all of it.
+
+    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name.
     """
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
-    found |= {leaf.name: leaf.value for leaf in _numbers(motion)}
-    return found | {"amplitude": amplitude_of(motion)}
+    moving = {leaf.name: leaf.value for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
+    for name in found.keys() & moving:
+        raise ValueError(f"Argument `motion` has a parameter {name!r}, as the block has: it needs another name.")
+    return found | moving
 
 
 def amplitude_of(motion: AbstractMotion) -> Real:

@@ -62,17 +62,19 @@ class _Same:
 def reads(function: Callable) -> Hashable | None:
     """All that a function reads and is: equal as long as nothing of it changes. None where that cannot be told."""
     try:
-        return tuple(_of_value(function, set()))
+        return tuple(_of_value(function, {}))
     except _NotTold:
         return None
 
 
-def _of_function(function: Any, seen: set[int]) -> Iterator[Hashable]:
+def _of_function(function: Any, seen: dict[int, int]) -> Iterator[Hashable]:
+    """What a function is; of one that was seen before, which one that was."""
     if type(function) is not types.FunctionType or function.__dict__:  # attributes may change, too
         raise _NotTold
     if id(function) in seen:
+        yield "again", seen[id(function)]
         return
-    seen.add(id(function))
+    seen[id(function)] = len(seen)
     code = function.__code__
     yield _Same(code)
     held = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
@@ -85,7 +87,7 @@ def _of_function(function: Any, seen: set[int]) -> Iterator[Hashable]:
             raise _NotTold
 
 
-def _of_value(value: Any, seen: set[int]) -> Iterator[Hashable]:
+def _of_value(value: Any, seen: dict[int, int]) -> Iterator[Hashable]:
     """What a value is, if nobody can change it unseen."""
     kind = type(value)
     parts = _parts(value)
