@@ -2,11 +2,12 @@
 ten products.
 """
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.polynomial import jet, tangent
@@ -14,9 +15,19 @@ from jaxrock.numerics.xla_cpu import keep
 
 Scalar = Inexact[Array, ""]
 
-# Changes of a root, as a share of it, after which there are no more: the next is its square, times what may be 1e4
-# where the slope is small. And no more changes than these.
-_SETTLED, _MORE = 1e-10, 6
+_MORE = 6  # changes of a root in full degree
+
+
+def _settled(x: Scalar) -> float:
+    """The change of a root, as a share of it, after which there are no more: the next is its square, times what may be
+    1e4 where the slope is small."""
+    return max(1e-10, math.sqrt(4e-5 * float(jnp.finfo(x.dtype).eps)))
+
+
+def is_found(x: Scalar, change: Scalar, share: float = 1e-7) -> Bool[Array, ""]:
+    """Whether the last change of a root was small enough for it to be one: such a share of it, or in single precision
+    what is left there."""
+    return change <= max(share, 80 * float(jnp.finfo(x.dtype).eps)) * x
 
 
 def _guess(values: tuple[Scalar, Scalar], slopes: tuple[Any, Any]) -> Scalar:
@@ -55,7 +66,7 @@ def root_between(degrees, terms: list[Scalar], start: Scalar, end: Scalar, value
 
     def unsettled(carry):
         x, change, count = carry
-        return ~(change <= _SETTLED * x) & (count < _MORE)
+        return ~(change <= _settled(x) * x) & (count < _MORE)
 
     more = x, change, jnp.zeros_like(x, jnp.int32)
     x, change, _ = jax.lax.while_loop(unsettled, lambda carry: (*nearer(carry[0], order), carry[2] + 1), more)

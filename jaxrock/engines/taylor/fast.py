@@ -23,7 +23,7 @@ from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.newton import root_between
+from jaxrock.numerics.newton import is_found, root_between
 from jaxrock.numerics.polynomial import derivative, horner, jet, keeps_sign, last_size, step_length
 from jaxrock.numerics.xla_cpu import keep, keep_by, keep_flag
 from jaxrock.status import Status
@@ -163,7 +163,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
         x, last = root_between(_TURN, *_leaving(start, terms, part))
         x = keep_by(x, one)
         opening, _, acceleration = (keep_by(value, one) for value in jet(terms, x, 2))
-        return x, opening, acceleration, (last <= 1e-6 * x) & (x > 0)
+        return x, opening, acceleration, is_found(x, last, 1e-6) & (x > 0)
 
     turn_at, top, top_acceleration, sure = _if(
         turns, turn, (part.length, part.opening, part.acceleration, part.certain)
@@ -185,7 +185,7 @@ def _meeting(start: Start, terms: list[Scalar], part: _Part, state: State) -> _M
     def meet():
         x, last = root_between(_MEET, [terms[0] - level, *terms[1:]], low, high, (at_low, at_high), slopes)
         x = keep_by(x, one)
-        return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & (last <= 1e-7 * x)
+        return x, *(keep_by(value, one) for value in jet(terms, x, 2)), certain & is_found(x, last)
 
     def at_end(of_turn, of_part):
         return where(stops, of_turn, of_part)
@@ -207,7 +207,7 @@ def _fastest(start: Start, terms: list[Scalar], part: _Part, at: Scalar, known: 
         x, last = root_between(
             _FLAT, derivative(velocity), zero, part.length, (2 * terms[2], part.acceleration), (6 * terms[3], None)
         )
-        return where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | ((last <= 1e-4 * x) & (x > 0))
+        return where(x <= at, jnp.abs(horner(velocity, x)), 0.0), (x > at) | (is_found(x, last, 1e-4) & (x > 0))
 
     return _if(part.has_extremum & (jnp.abs(part.bound) > known), extremum, (zero, jnp.ones_like(part.has_extremum)))
 
@@ -334,7 +334,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
     piece, local, over = stepper.move_on(state, elapsed, full)
     piece = where(full & ~over, scene.after_quiet(piece), piece)
     never = scene.outlook.is_over(state.piece)
-    unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & (last > 1e-7 * x)))
+    unclear = ~never & ((share == 0) | touching | both | (meets & ~lifts & ~is_found(x, last)))
     rested = replace(
         state,
         piece=piece,
