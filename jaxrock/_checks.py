@@ -135,7 +135,7 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     fails is not a number.
     """
     array = as_real(name, value)
-    if _marks.get():
+    if not throws():
         return jnp.where(holds(array), array, jnp.nan)
     message = f"Argument `{name}` must {allowed}"
     if isinstance(array, jax.core.Tracer):
@@ -192,26 +192,27 @@ def put_down() -> Iterator[list[tuple[str, Bool[Array, ""]]]]:
         _put_down.reset(before)
 
 
-# Whether numbers outside of their ranges are marked, and raise nothing; every thread has its own.
-_marks = contextvars.ContextVar("marks", default=False)
+# Whether numbers outside of their ranges raise, or become what is not a number; every thread has its own.
+_throws = contextvars.ContextVar("throws", default=True)
 
 
 @contextlib.contextmanager
-def marked(unless: bool = False) -> Iterator[None]:
-    """Numbers outside of their ranges become what is not a number, whether they are known or traced.
+def throwing(wanted: bool) -> Iterator[None]:
+    """Numbers outside of their ranges, known or traced, raise here if that is wanted, and was before; or else they
+    become what is not a number.
 
-    Not around anything that JAX traces and keeps: a program would go on marking.
+    Not around anything that JAX traces and keeps: a program would go on without.
     """
-    before = _marks.set(_marks.get() or not unless)
+    before = _throws.set(_throws.get() and wanted)
     try:
         yield
     finally:
-        _marks.reset(before)
+        _throws.reset(before)
 
 
-def is_marking() -> bool:
-    """Whether numbers outside of their ranges are marked now."""
-    return _marks.get()
+def throws() -> bool:
+    """Whether numbers outside of their ranges raise now."""
+    return _throws.get()
 
 
 def with_throw(function: Making) -> Making:
@@ -226,7 +227,7 @@ def with_throw(function: Making) -> Making:
     def made(*args: Any, throw: bool = True, **kwargs: Any) -> Any:
         if truth("throw", throw):
             return function(*args, **kwargs)
-        with marked():
+        with throwing(False):
             return function(*args, **kwargs)
 
     return cast(Making, made)

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxrock._checks import RANGES, Range, check_shapes, finite, is_marking, is_traced, one_of
+from jaxrock._checks import RANGES, Range, check_shapes, finite, is_traced, one_of, throws
 
 
 class Parameter(NamedTuple):
@@ -102,10 +102,10 @@ def check_declared(owner: eqx.Module) -> None:
     """Raise ValueError for a value outside of what a class of the user's own declares: for `__check_init__`.
 
     Classes of the package check what they are given themselves. What is traced is not looked at, nor what stands for a
-    value (None), and nothing is raised where numbers are to be marked.
+    value (None), and nothing is raised where numbers outside of their ranges do not.
     """
     kind = type(owner)
-    if is_ours(owner) or is_marking():
+    if is_ours(owner) or not throws():
         return
     for name, known in declared(kind).items():
         value = getattr(owner, name)

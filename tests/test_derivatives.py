@@ -13,6 +13,7 @@ import jaxrock as rk
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
+from jaxrock.responses.outcome import has_one_peak
 from jaxrock.transforms.differentiation import differentiable
 from references.in_jaxrock import MODELS, PULSES
 from references.smooth_differences import gradient
@@ -569,6 +570,15 @@ def test_a_planted_graze():
         found = run(size)
         assert not bool(found.differentiable) or found.status == rk.Status.undecided
         assert float(found.clearance) < 1e-9
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_ties_and_grazes_within_rounding(kind):
+    """Two peaks one unit of rounding apart are equal in single precision, too; so is a graze of a few."""
+    eps = np.finfo(kind).eps
+    for second, clearance, smooth in ((0.09, 0.01, True), (0.1 * (1 - eps), 0.01, False), (0.09, 0.2 * eps, False)):
+        numbers = (jnp.asarray(x, kind) for x in (0.1, second, clearance, 0.2))
+        assert bool(has_one_peak(*numbers)) == smooth
 
 
 def test_a_tie_of_two_peaks():

@@ -29,6 +29,7 @@ if count > 1:
 rk.studies.use_cpu_devices(1 + own % 2)
 import jax.numpy as jnp
 import numpy as np
+from jaxrock._checks import checked
 from jaxrock.sweeps.store import Store
 
 def chaotic(alpha, p):
@@ -42,7 +43,21 @@ motion = rk.Record(0.4 * np.sin(np.linspace(0, 14, 120)), 0.02)
 def outcome(alpha, p):
     return rk.outcome(rk.Block(alpha, p), motion)
 
+def refused(alpha, p):
+    return chaotic(checked("p", p, "be below 3.85", lambda p: p < 3.85), 1.0)
+
 store = None if folder == "-" else folder
+if kind == "refused":  # one process fails, and the other hears of it
+    side = dict(p=np.linspace(1.0, 3.9, 31), alpha=np.ones(31), outer=False, progress=False)
+    def full(self, number, leaves):
+        raise OSError(28, "No space left")
+    for folder, own_write in ((None, Store.write), (store, full if own == 1 else Store.write)):
+        Store.write = own_write
+        try:
+            rk.sweep(refused if folder is None else chaotic, store=folder, block=16, **side)
+        except Exception as error:
+            print(type(error).__name__, error, flush=True)
+    store, kind = None, "chaotic"
 if kill >= 0:
     write, done = Store.write, []
     class Deadly:
@@ -155,6 +170,17 @@ def test_a_job_verifies_its_store_together(tmp_path, finished):
         said = (tmp_path / "second" / f"{own}.log").read_text()
         assert all((str(store / "x" / "c" / f"{number}" / "0") in said) == (own == 0) for number in (0, 1, 4))
         assert int(results["resumed"]) == 23 * 31 - 3 * 93
+
+
+def test_a_failure_in_one_process_is_one_in_all(tmp_path, alone):
+    """No other process is left waiting, and the next sweep finds all of them at the same place."""
+    for own, results in enumerate(job(2, tmp_path / "a.zarr", tmp_path / "out", "refused")):
+        assert bits(results) == alone
+        refused, full = (tmp_path / "out" / f"{own}.log").read_text().splitlines()[-2:]
+        assert refused.startswith("ValueError" if own == 1 else "RuntimeError Process 1 of this job failed: ValueError")
+        assert "Argument `p` must be below 3.85" in refused
+        assert full.startswith("OSError" if own == 1 else "RuntimeError Process 1 of this job failed: OSError")
+        assert "Blocks that are finished are kept" in full
 
 
 @pytest.mark.slow

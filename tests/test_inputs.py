@@ -17,6 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import jaxrock as rk
 from jaxrock import _foreign, _guard
 from jaxrock._foreign import CHECK
+from jaxrock.engines.trajectory import Trajectory
 
 NAN, INF, HALF_PI = np.nan, np.inf, np.pi / 2
 BLOCK = rk.Block(0.2, 1.0)
@@ -493,6 +494,16 @@ def test_times_outside_the_history_under_jit(time):
     assert rotation_at(response, 4.0) == np.asarray(response.rotation)[-1]
     with pytest.raises(Exception, match="Argument `time` must be in the history"):
         rotation_at(response, time).block_until_ready()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_times_that_round_past_the_end(kind):
+    """One unit past the duration is the duration, in single precision, too; more of it is not."""
+    duration = kind(7.3)
+    steps = Trajectory(None, None, jnp.zeros(1, kind), jnp.zeros(1, bool), jnp.asarray(duration))
+    assert steps.checked(np.nextafter(duration, kind(8))) > duration
+    with pytest.raises(ValueError, match="Argument `time` must be in the history"):
+        steps.checked(duration * kind(1 + 1e-6))
 
 
 def test_bad_input_under_vmap():

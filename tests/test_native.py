@@ -21,7 +21,7 @@ import equinox.internal as eqxi  # noqa: E402
 
 import jaxrock as rk  # noqa: E402
 from jaxrock import _foreign  # noqa: E402
-from jaxrock.native import plain as plain_programs  # noqa: E402
+from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.numerics.apart import apart  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
@@ -126,6 +126,14 @@ def test_operations_in_single_precision(name):
 )
 def test_operations_on_integers(function):
     agree(lambda k: [function(k)], WHOLE)
+
+
+@pytest.mark.parametrize("bits", [31, 32, 40, -1])
+def test_shifts_by_all_bits_and_more(bits):
+    """By a number that is known beforehand, and by a lane's own."""
+    shifts = jax.lax.shift_left, jax.lax.shift_right_arithmetic
+    given = np.full(WHOLE.shape, bits, np.int32)
+    agree(lambda k, own: [shift(k, by) for shift in shifts for by in (jnp.int32(bits), own)], WHOLE, given)
 
 
 def test_logarithms_at_the_ends():
@@ -261,6 +269,17 @@ def test_lanes_part_where_they_need_other_steps(count, draws, threads):
         for one, same in zip(compiled(*leaves), expected, strict=True):
             np.testing.assert_array_equal(one, same)
         assert count == 1 or np.min(np.sum(np.asarray(expected[2:]), axis=-1)) > 0
+
+
+def test_a_step_whose_last_condition_is_known():
+    """It has no cases of its own; whatever it is, it is a number and no result of an operation."""
+
+    def function(leaves):
+        return [jax.lax.while_loop(lambda x: x < 9, lambda x: jax.lax.cond(True, jnp.exp, jnp.sin, x + 1), leaves[0])]
+
+    x = np.linspace(0, 4, 9)
+    expected = jax.vmap(lambda x: function([x]))(x)
+    np.testing.assert_allclose(run(function, [x], [False], True)[0], expected[0], rtol=1e-13)
 
 
 @pytest.mark.parametrize("refilled", [False, True], ids=["in step", "refilled"])
@@ -439,6 +458,15 @@ def test_any_number_of_lanes(count):
     agree(lambda x, y: [x + y, x > y], np.arange(float(count)), 3.0, shared=(1,))
 
 
+def test_a_list_of_one_lane_is_looked_up_by_all_lanes_of_a_vector():
+    """There is no room for a list of each."""
+    program = jax.make_jaxpr(lambda x: [x[jnp.round(x[0]).astype(int)]])(np.arange(100.0))
+    for alone, begins in ((True, {"0"}), (False, set("01234567"))):
+        text = str(kernels.emit(program, [False], 8, "program", alone))
+        names = re.findall(r"mul i64 (\S+), 100$", text, re.MULTILINE)
+        assert {re.search(rf"{re.escape(name)} = add i64 \S+, (\d+)", text)[1] for name in names} == begins
+
+
 def test_places_outside_of_a_table():
     agree(lambda i, table: [table[i]], np.array([-30, -1, 0, 9, 10, 300]), np.arange(10.0), shared=(1,))
 
@@ -460,6 +488,7 @@ SMALL_ARRAYS = {
     "where it is least": lambda i, x, y: jnp.argmin(y),
     "where it is largest": lambda i, x, y: jnp.argmax(y[:5]),
     "products": lambda i, x, y: x[0] @ x[1] + x.T @ x + jnp.tensordot(x, x),
+    "products of nothing": lambda i, x, y: jnp.concatenate([x[:, :0] @ x[:0], x[:0, :0] @ x[:0]]),
 }
 
 
@@ -530,7 +559,27 @@ def turns(x):
     return list(jax.lax.while_loop(lambda c: c[0] < 5, turn, start))
 
 
+def zeros_of_both_signs(x):
+    """Two cases that only look alike; they are told apart by what they divide."""
+    return [1 / jax.lax.select_n(x > 1, jnp.zeros(2), -jnp.zeros(2)) + x]
+
+
+def bits(x):
+    """Of whole numbers, which are no flags."""
+    whole = jnp.arange(5) + 8
+    return [jax.lax.reduce_or(whole, [0]) + x, jax.lax.reduce_and(whole, [0]) + x, jnp.any(whole > 3) & (x > 0)]
+
+
+def no_rows(x):
+    """A loop over none at all: what it would have stacked is there, and empty."""
+    carry, (rows, flags) = jax.lax.scan(lambda c, row: (c + 1, (c * row, c > 0)), x, jnp.zeros((0, 3)))
+    return [carry, jnp.sum(rows) + x, flags]
+
+
 PROGRAMS = {
+    "zeros of both signs": (zeros_of_both_signs, {"select_n"}),
+    "bits of whole numbers": (bits, set()),
+    "rows of nothing": (no_rows, set()),
     "stages of a solver": (stages, set()),
     "rows of an array": (rows, set()),
     "turns that are not known": (turns, {"while"}),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock._checks import marked
+from jaxrock._checks import throwing
 from jaxrock.transforms.fingerprint import Traced
 from jaxrock.transforms.reads import reads
 from jaxrock.transforms.user_function import current_function
@@ -195,7 +195,7 @@ def test_traced_again_where_nothing_is_raised():
         return rk.Block(x, 1.0).alpha
 
     raising = Traced.of(function, POINT)
-    with marked():
+    with throwing(False):
         marking = Traced.of(function, POINT)
     assert raising is Traced.of(function, POINT) and raising.program.messages and not marking.program.messages
     assert np.isnan(jax.tree.leaves(marking(-1.0, marking.constants))[0])

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import jaxrock as rk
 from jaxrock.blocks.restitution import Reset
-from jaxrock.engines.free_stage import Visit, free_stage
+from jaxrock.engines.free_stage import Visit, _time_to_impact, _time_to_peak, free_stage
 from jaxrock.models.equation import Angle
 from references import lumped_column
 from references.in_jaxrock import PULSES
@@ -357,3 +357,17 @@ def test_kinds_are_one_model():
             for model in (rk.Housner(), rk.Spring("SM1", "sine"))
         ]
         assert free[0] == pytest.approx(free[1], rel=1e-15)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_turn_that_is_the_balance_to_the_last_digit(kind):
+    """The time up to there is long, as the logarithm of the least number is, and finite in single precision, too."""
+    alpha = jnp.asarray(0.2, kind)
+    moments = rk.models.Housner().moments(rk.Block(alpha, jnp.asarray(1.0, kind)))
+    most = moments.manifold(jnp.zeros_like(alpha))
+    out = _time_to_peak(moments, moments.saddle, most, most)
+    tiny = most * np.finfo(kind).tiny ** 0.75  # its square is zero
+    back = _time_to_impact(moments, tiny, tiny, 2 * tiny, most, most)
+    assert out.dtype == back.dtype == kind
+    for time in (out, back):
+        assert 0.95 < float(time) / -np.log(np.sqrt(np.finfo(kind).tiny)) < 1.05

@@ -1,5 +1,6 @@
 """Stores: a sweep that was interrupted goes on where it was, with the same bits; nothing else is taken for it."""
 
+import shutil
 import sys
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.sweeps.labels import RECORDS
 from jaxrock.sweeps.store import Store
 
 xarray, zarr = pytest.importorskip("xarray"), pytest.importorskip("zarr")
@@ -148,6 +150,16 @@ def test_an_unfinished_store_is_not_loaded(tmp_path, written):
         run(store=tmp_path / "a.zarr")
     with pytest.raises(ValueError, match="is not finished: 2 of 5 blocks"):
         rk.studies.Grid.load(tmp_path / "a.zarr")
+
+
+def test_what_lies_beside_the_blocks_is_left_alone(tmp_path, straight):
+    """A record of a block that the grid does not have."""
+    store = tmp_path / "a.zarr"
+    run(store=store)
+    shutil.copytree(store / RECORDS / "c" / "0", store / RECORDS / "c" / "99")
+    again = run(store=store)
+    assert again.resumed == 9 * 50
+    same(again, straight)
 
 
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])

@@ -90,7 +90,8 @@ def _time_to_peak(moments: Coefficients, gap: Scalar, manifold: Scalar, speed: S
     if moments.skew is not None:
         turn = skewed.turning_gap((manifold - speed) * (manifold + speed), moments.skew, moments.saddle)
         return skewed.time_to_turning(gap, speed, turn, moments.skew)
-    k = jnp.sqrt(jnp.maximum((manifold - speed) * (manifold + speed), 1e-280)) / 2
+    deficit = (manifold - speed) * (manifold + speed)
+    k = jnp.sqrt(jnp.maximum(deficit, skewed.least(deficit))) / 2
     tangent = speed / (2 * jnp.cos(gap / 2))
     ratio = tangent / k
     return ratio * carlson_rf(jnp.ones_like(k), 1 + tangent**2, 1 + ratio**2)
@@ -105,11 +106,12 @@ def _time_to_impact(moments: Coefficients, gap: Scalar, manifold: Scalar, speed:
         return _time_to_peak(moments, moments.saddle, base, arrival) - _time_to_peak(moments, gap, manifold, speed)
 
     def above():
-        kappa = jnp.sqrt(jnp.maximum((speed - manifold) * (speed + manifold), 1e-280)) / 2
+        excess = (speed - manifold) * (speed + manifold)
+        kappa = jnp.sqrt(jnp.maximum(excess, skewed.least(excess))) / 2
 
         def from_saddle(angle):
             if moments.skew is not None:
-                return skewed.time_from_balance(angle, (speed - manifold) * (speed + manifold), moments.skew)
+                return skewed.time_from_balance(angle, excess, moments.skew)
             tangent = jnp.tan(angle / 2)
             ratio = (tangent / kappa) ** 2 * (1 + kappa**2)
             return tangent / kappa * carlson_rf(jnp.ones_like(kappa), 1 + tangent**2, 1 + ratio)

@@ -47,6 +47,7 @@ class State(eqx.Module):
     steps: Int[Array, ""]
 
 
+ROUNDING = 4096  # units of rounding that peaks of one height may be apart
 _MOST = 1e30  # [g], [rad/s], [s]
 
 
@@ -111,4 +112,4 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
 
 def surpasses(value: Scalar, best: Scalar) -> Flag:
     """Whether a peak is higher than the best so far, beyond rounding: of equal peaks the first is timed."""
-    return value > best * (1 + 4096 * jnp.finfo(best.dtype).eps)
+    return value > best * (1 + ROUNDING * jnp.finfo(best.dtype).eps)

@@ -39,7 +39,8 @@ class Trajectory(eqx.Module):
     def checked(self, time: Values) -> Inexact[Array, "..."]:
         """Times within the history."""
         self.check_single()
-        end = self.duration * (1 + 1e-12)  # a time computed as the duration may round past it
+        rounding = max(1e-12, 4 * float(jnp.finfo(self.duration.dtype).eps))
+        end = self.duration * (1 + rounding)  # a time computed as the duration may round past it
         time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
         return time.astype(jnp.result_type(time, self.duration))
 

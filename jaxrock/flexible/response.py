@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import Values, marked, scalar, span
+from jaxrock._checks import Values, scalar, span, throwing
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
@@ -197,7 +197,7 @@ def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike 
         )
     if duration is None:
         return motion.end + 10 / block.p
-    with marked(unless=throw):
+    with throwing(throw):
         return scalar("duration", span("duration", duration))
 
 

@@ -39,7 +39,7 @@ def turning_gap(deficit: Scalar, skew: Scalar, reach: Scalar) -> Scalar:
 
     Beyond the balance the same holds with the negative skew.
     """
-    missing = jnp.sqrt(jnp.maximum(deficit, _least(deficit)))
+    missing = jnp.sqrt(jnp.maximum(deficit, least(deficit)))
     return bracketed_root(_lacking, jnp.zeros_like(missing), reach, missing, skew)
 
 
@@ -64,7 +64,7 @@ def time_to_turning(gap: Scalar, speed: Scalar, turn: Scalar, skew: Scalar) -> S
 
 def time_from_balance(gap: Scalar, excess: Scalar, skew: Scalar) -> Scalar:
     """Time from the balance to a gap, negative before it; `excess`: squared speed at the balance."""
-    kappa = jnp.sqrt(jnp.maximum(excess, _least(excess)))
+    kappa = jnp.sqrt(jnp.maximum(excess, least(excess)))
 
     def of(up, down):
         gap = kappa * (up - down) / 2
@@ -84,6 +84,6 @@ def _integral(function: Callable, length: Scalar) -> Scalar:
     return length * jax.lax.fori_loop(0, _NODES.size, add, jnp.zeros_like(length))
 
 
-def _least(like: Scalar) -> float:
+def least(like: Scalar) -> float:
     """Of a squared speed: its root has a derivative, and a square."""
     return 4 * float(jnp.finfo(like.dtype).tiny)

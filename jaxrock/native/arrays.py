@@ -6,22 +6,15 @@ a choice among all that it may be. Needs llvmlite.
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 from llvmlite import ir
 
-from jaxrock.native.lists import boxed, sorted_list
+from jaxrock.native.lists import boxed, for_each, sorted_list
 from jaxrock.native.operations import OPERATIONS, Unsupported, is_float
-
-
-def _each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
-    """`function` of single vectors, for every element of arrays of one shape."""
-    results = np.empty(arrays[0].shape, object)
-    for place in np.ndindex(results.shape):
-        results[place] = function(*(x[place] for x in arrays))
-    return results
 
 
 def _number(index) -> int | None:
@@ -69,7 +62,7 @@ def _part_of(e, x: np.ndarray, starts: Sequence, sizes: Sequence[int]) -> np.nda
         found = _part(x, axis, 0, size)
         for place in range(1, last + 1):
             choice = functools.partial(e.b.select, e.b.icmp_signed(">=", start, e.constant_of(place, start.type)))
-            found = _each(choice, _part(x, axis, place, size), found)
+            found = for_each(choice, _part(x, axis, place, size), found)
         x = found
     return x
 
@@ -95,7 +88,7 @@ def _with_part(e, x: np.ndarray, part: np.ndarray, starts: Sequence, moves: bool
         if not masks:
             return new
         here = functools.reduce(e.b.and_, masks)
-        found = _each(lambda a, b, here=here: b if a is b else e.b.select(here, a, b), new, found)
+        found = for_each(lambda a, b, here=here: b if a is b else e.b.select(here, a, b), new, found)
     return found
 
 
@@ -124,17 +117,16 @@ def _product(e, equation, x, y) -> np.ndarray:
     def rows(x, axes):
         free = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in free]
-        return x.transpose([*free, *axes]).reshape(int(np.prod(shape)), -1), shape
+        return x.transpose([*free, *axes]).reshape(math.prod(shape), math.prod(x.shape[axis] for axis in axes)), shape
 
     (first, shape), (second, more) = rows(boxed(x), along), rows(boxed(y), of_other)
-    results = np.empty((len(first), len(second)), object)
+    results, none = np.empty((len(first), len(second)), object), e.constant(0, equation.outvars[0].aval.dtype)
     for place in np.ndindex(results.shape):
         pairs = list(zip(first[place[0]], second[place[1]], strict=True))
         # What no step has filled yet counts nothing.
         pairs = [pair for pair in pairs if not all(map(_is_zero, pair))] or pairs
-        results[place] = functools.reduce(
-            lambda a, b: OPERATIONS["add"](e, equation, a, b), [OPERATIONS["mul"](e, equation, *p) for p in pairs]
-        )
+        products = [OPERATIONS["mul"](e, equation, *p) for p in pairs] or [none]
+        results[place] = functools.reduce(lambda a, b: OPERATIONS["add"](e, equation, a, b), products)
     return results.reshape([*shape, *more])
 
 

@@ -16,7 +16,7 @@ from jax.extend.core import Literal
 from llvmlite import ir
 
 from jaxrock.native.arrays import OF_FEW, is_one_place
-from jaxrock.native.lists import Memory, boxed, of_memory, unboxed
+from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
 from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
@@ -125,7 +125,9 @@ class Emitter:
         if value.size > SMALL**2:
             raise Unsupported("a large array in the program")
         return (
-            _each(lambda x: self.constant(x, value.dtype), value) if value.ndim else self.constant(value, value.dtype)
+            for_each(lambda x: self.constant(x, value.dtype), value)
+            if value.ndim
+            else self.constant(value, value.dtype)
         )
 
     def _place(self, equation, inputs: list, active) -> list:
@@ -184,13 +186,13 @@ class Emitter:
             return [unboxed(OF_FEW[name](self, equation, *inputs))]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
-        return [_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
+        return [for_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
 
     def _total(self, equation, array: np.ndarray):
         operation = SUMS[equation.primitive.name]
         for axis in sorted(equation.params["axes"], reverse=True):
             parts = list(np.moveaxis(array, axis, 0))
-            array = functools.reduce(lambda x, y: _each(lambda *v: operation(self, equation, *v), x, y), parts)
+            array = functools.reduce(lambda x, y: for_each(lambda *v: operation(self, equation, *v), x, y), parts)
         return unboxed(array)
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
@@ -256,20 +258,6 @@ class Emitter:
             phi.add_incoming(old, before)
         self.remember(joined, len(self.before))
         return like(results, joined)
-
-
-def _each(function: Callable, *inputs):
-    """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
-    for x in inputs:
-        if isinstance(x, np.ndarray):
-            break
-    else:
-        return function(*inputs)
-    inputs = np.broadcast_arrays(*map(boxed, inputs))
-    results = np.empty(inputs[0].shape, object)
-    for place in np.ndindex(results.shape):
-        results[place] = function(*(x[place] for x in inputs))
-    return results
 
 
 def flat(values: list) -> list:

@@ -36,8 +36,8 @@ def is_long(shape: tuple[int, ...]) -> bool:
 class Frame:
     """A function `void name(void **outputs, void **inputs, int64 *next)`.
 
-    The first input tells for how many lanes there is room in the arrays, and how many are wanted (int32 both); `next`
-    is the first that nobody has taken.
+    The first input tells three numbers (int32): for how many lanes there is room in the arrays, how many are wanted,
+    and how many threads there are. `next` is the first lane that nobody has taken.
     """
 
     def __init__(self, inputs: Sequence[np.dtype], outputs: Sequence[np.dtype], lanes: int, name: str):
@@ -116,9 +116,9 @@ class Frame:
 def emit(program, shared: list[bool], lanes: int, name: str, alone: bool = False) -> ir.Module:
     """A function `void name(void **outputs, void **inputs, int64 *next)` that runs a program over arrays of many lanes.
 
-    Before the inputs of the program stands how many lanes there are (no fewer than `lanes`), and how many are wanted
-    (at least 1). What is not `shared` has an axis of lanes. `alone`: there is one, and room for one, which all lanes of
-    the vector do.
+    Before the inputs of the program stands for how many lanes there is room (no fewer than `lanes`), how many are
+    wanted (at least 1), and how many threads there are. What is not `shared` has an axis of lanes. `alone`: there is
+    one, and room for one, which all lanes of the vector do.
     """
     jaxpr = program.jaxpr
     f = Frame.of(jaxpr, lanes, name)
@@ -137,7 +137,7 @@ def emit(program, shared: list[bool], lanes: int, name: str, alone: bool = False
         return f.load_shared(source, f.place(number, first)) if alone else f.load(source, f.place(number, first))
 
     def starts(size):
-        return [b.mul(b.add(first, _I64(i)), _I64(size)) for i in range(lanes)]
+        return [b.mul(b.add(first, _I64(0 if alone else i)), _I64(size)) for i in range(lanes)]
 
     given = zip(jaxpr.invars, f.sources, shared, strict=True)
     results = e.run(program, [f.argument(*each, load, starts) for each in given], e.constant(True, bool))

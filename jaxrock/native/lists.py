@@ -3,6 +3,7 @@
 Functions of the emitter that writes the program (`e`). Needs llvmlite.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -39,6 +40,20 @@ def boxed(x) -> np.ndarray:
 
 def unboxed(x):
     return x[()] if isinstance(x, np.ndarray) and not x.ndim else x
+
+
+def for_each(function: Callable, *inputs):
+    """`function` of single vectors, for every element of arrays; axes of length 1 are repeated."""
+    for x in inputs:
+        if isinstance(x, np.ndarray):
+            break
+    else:
+        return function(*inputs)
+    inputs = np.broadcast_arrays(*map(boxed, inputs))
+    results = np.empty(inputs[0].shape, object)
+    for place in np.ndindex(results.shape):
+        results[place] = function(*(x[place] for x in inputs))
+    return results
 
 
 def of_memory(e, equation, memory: Memory, *more):

@@ -160,6 +160,20 @@ def _to_integer(e, x, limits, dtype, kind):
     return e.b.select(inside, whole, e.b.select(known, limited, e.constant_of(0, kind)))
 
 
+def _shift(name: str):
+    """By as many bits as there are, or more (a negative number, too), nothing is left but the sign, if that is kept;
+    for LLVM such a shift is no number at all."""
+
+    def operation(e, _, x, y):
+        width = x.type.element.width
+        inside = e.b.icmp_unsigned("<", y, e.constant_of(width, y.type))
+        if name == "ashr":
+            return e.b.ashr(x, e.b.select(inside, y, e.constant_of(width - 1, y.type)))
+        return e.b.select(inside, e.b.shl(x, y), e.constant_of(0, x.type))
+
+    return operation
+
+
 def _choose(e, _, which, *cases):
     if _is_flag(which):
         return e.b.select(which, cases[1], cases[0])
@@ -263,8 +277,8 @@ OPERATIONS: dict[str, Callable] = {
     "or": lambda e, _, x, y: e.b.or_(x, y),
     "xor": lambda e, _, x, y: e.b.xor(x, y),
     "not": lambda e, _, x: e.b.not_(x),
-    "shift_left": lambda e, _, x, y: e.b.shl(x, y),
-    "shift_right_arithmetic": lambda e, _, x, y: e.b.ashr(x, y),
+    "shift_left": _shift("shl"),
+    "shift_right_arithmetic": _shift("ashr"),
     "select_n": _choose,
     "convert_element_type": _convert,
     "keep": lambda e, _, value, witness: value,  # what is in a register is computed once
@@ -366,8 +380,8 @@ KNOWN: dict[str, Callable] = {
             "is_finite": np.isfinite,
         }.items()
     },
-    "reduce_or": lambda parameters, x: np.any(x, parameters["axes"]),
-    "reduce_and": lambda parameters, x: np.all(x, parameters["axes"]),
+    "reduce_or": lambda parameters, x: np.bitwise_or.reduce(x, parameters["axes"]),
+    "reduce_and": lambda parameters, x: np.bitwise_and.reduce(x, parameters["axes"]),
     "reduce_max": lambda parameters, x: np.max(x, parameters["axes"]),
     "iota": lambda parameters: _iota(**parameters),
     "dynamic_slice": _taken,

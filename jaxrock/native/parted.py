@@ -8,6 +8,7 @@ from their slots, do it together, and are put back. Needs llvmlite.
 
 from typing import Any
 
+from jax.extend.core import Literal
 from llvmlite import ir
 
 from jaxrock.native.emitter import Emitter, flat, like
@@ -27,9 +28,13 @@ def _condition(program) -> tuple[list, Any] | None:
     if not equations or equations[-1].primitive.name != "cond":
         return None
     makers = {v: equation for equation in equations for v in equation.outvars}
-    flag = makers.get(equations[-1].invars[0])
+
+    def maker(atom):
+        return None if isinstance(atom, Literal) else makers.get(atom)
+
+    flag = maker(equations[-1].invars[0])
     while flag is not None and flag.primitive.name in _AS_NUMBER:
-        flag = makers.get(flag.invars[_AS_NUMBER[flag.primitive.name]])
+        flag = maker(flag.invars[_AS_NUMBER[flag.primitive.name]])
     return None if flag is None or flag.primitive.name != "apart" else (equations[:-1], equations[-1])
 
 

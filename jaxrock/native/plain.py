@@ -148,6 +148,9 @@ class _Run:
             found = self.of(parameters["jaxpr"], [*fixed, *carry, *(_row(x, place) for x in lists)])
             carry = found[:carried]
             rows.append(found[carried:])
+        if not rows:
+            made = parameters["jaxpr"].out_avals[carried:]
+            return [*carry, *(np.zeros((0, *x.shape), x.dtype) for x in made)]
         columns = zip(*(rows[::-1] if parameters["reverse"] else rows))
         return [*carry, *(_stacked(column) for column in columns)]
 
@@ -246,7 +249,9 @@ def _known(x):
 
 
 def _same(x, y) -> bool:
-    return _is_known(x) and _is_known(y) and x.dtype == y.dtype and np.array_equal(x, y, equal_nan=x.dtype.kind == "f")
+    """Whether both are known and the same, to the sign of a zero."""
+    is_like = _is_known(x) and _is_known(y) and x.dtype == y.dtype and x.shape == y.shape
+    return is_like and x.tobytes() == y.tobytes()
 
 
 def _computed(equation, given: list) -> list | None:

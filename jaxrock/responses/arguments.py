@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import as_real, checked, is_traced, marked, scalar, shown, strength
+from jaxrock._checks import as_real, checked, is_traced, scalar, shown, strength, throwing
 from jaxrock._parameters import check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -44,7 +44,7 @@ def start_of(initial: tuple[ArrayLike, ArrayLike], throw: bool = True) -> tuple[
     """Initial rotation and angular velocity, checked; what fails is not a number unless it is to `throw`."""
     if all(isinstance(x, float) and x == 0 for x in initial):
         return _at_rest(jnp.result_type(float))
-    with marked(unless=throw):
+    with throwing(throw):
         return _start_of(initial)
 
 

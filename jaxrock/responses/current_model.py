@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxrock._checks import is_traced, marked, put_down
+from jaxrock._checks import is_traced, put_down, throwing
 from jaxrock._guard import guarded
 from jaxrock._parameters import is_ours
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -75,7 +75,7 @@ def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Bl
         alpha = getattr(block, name)
         if throw and is_traced(alpha):
             continue
-        with marked(unless=throw):
+        with throwing(throw):
             found = spring.balanced(f"block.{name}", alpha)
         if found is not alpha:
             block = eqx.tree_at(operator.attrgetter(name), block, found)

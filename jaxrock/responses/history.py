@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import Values, marked, scalar, span
+from jaxrock._checks import Values, scalar, span, throwing
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
@@ -234,7 +234,7 @@ def simulate(
         budget = steps_of_flexible(model, initial, engine)
         return simulate_flexible(block, motion, duration=duration, samples=samples, throw=throw, **budget)
     if duration is not None:
-        with marked(unless=throw):
+        with throwing(throw):
             duration = scalar("duration", span("duration", duration))
     say_if_single()
     model = current_model(model, block, motion)

@@ -12,7 +12,7 @@ from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State, initial_state
+from jaxrock.engines.state import ROUNDING, State, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.engines.taylor.follow import follow, most_steps
@@ -44,8 +44,9 @@ class Outcome(AbstractTable):
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
     - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
-      peaks tie, or where before the peak an impact is grazed (both within 1e-9); nor if the block overturned. Where an
-      impact or the uplift falls on a jump of the motion, and in a tie, derivatives are those of one side.
+      peaks tie, or where before the peak an impact is grazed (both within 1e-9, in single precision within 5e-4, of the
+      peak and of the slenderness angle); nor if the block overturned. Where an impact or the uplift falls on a jump of
+      the motion, and in a tie, derivatives are those of one side.
     - `clearance`: how far from a graze the block has been before the peak [rad]: the least height at which it turned
       back before the ground, or the least depth to which it would have come where it hit the ground while being slowed
       down; infinite if there was neither. Where it is zero the number of impacts changes.
@@ -222,6 +223,13 @@ def _to_the_end(stepper: AbstractStepper, state: State) -> State:
     return engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
 
 
+def has_one_peak(peak: Scalar, second: Scalar, clearance: Scalar, alpha: Scalar) -> Bool[Array, "..."]:
+    """Whether neither another peak ties with the highest, nor an impact is grazed before it."""
+    equal = max(1e-9, ROUNDING * float(jnp.finfo(peak.dtype).eps))
+    tie = (peak - second <= equal * peak) & (peak > 0)
+    return ~tie & ~(clearance <= equal * alpha)
+
+
 def conclude(stepper: AbstractStepper, state: State) -> Outcome:
     """Add the free stage to a state at the end of the motion (or where the block was lost)."""
     final = stepper.finish(state)
@@ -230,15 +238,14 @@ def conclude(stepper: AbstractStepper, state: State) -> Outcome:
     def unless_overturned(value):
         return where(overturned, jnp.inf, value)
 
-    tie = final.peak - final.second <= 1e-9 * final.peak
     # A block that stands still in balance goes nowhere, however many steps it takes.
     eps = jnp.finfo(state.closeness.dtype).eps
     unfinished = Status.where(state.closeness > eps, Status.step_budget_exhausted, Status.undecided)
-    graze = final.peak_clearance <= 1e-9 * stepper.scene.alpha
+    is_smooth = has_one_peak(final.peak, final.second, final.peak_clearance, stepper.scene.alpha)
     margin = where(overturned, -final.closeness_beyond, final.closeness)
     status = Status.where(state.done, final.status, unfinished)
     return Outcome(
-        differentiable=~(tie & (final.peak > 0)) & ~graze & ~overturned,
+        differentiable=is_smooth & ~overturned,
         clearance=where(overturned, final.clearance, final.peak_clearance),
         max_rotation=unless_overturned(final.peak),
         max_velocity=unless_overturned(final.fastest * stepper.scene.p),

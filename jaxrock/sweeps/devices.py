@@ -115,6 +115,38 @@ def meet() -> None:
     client.wait_at_barrier(f"jaxrock-{next(_meetings)}", _PATIENCE * 1000)
 
 
+_SAID = 400  # bytes of what the others hear of an error
+
+
+@contextlib.contextmanager
+def all_or_none() -> Iterator[None]:
+    """What every process does by itself, and then meets the others: an error in one of them is one in all, as the
+    others would go on to wait for it.
+
+    **Raises:** RuntimeError where another process failed, with what it said.
+    """
+    if jax.process_count() == 1:
+        yield
+        return
+    try:
+        yield
+    except Exception as error:
+        _heard(f"{type(error).__name__}: {error}")
+        raise
+    for number, said in enumerate(_heard("")):
+        if said:
+            raise RuntimeError(f"Process {number} of this job failed: {said}")
+
+
+def _heard(said: str) -> list[str]:
+    """What every process says, in few bytes."""
+    meet()
+    brought = np.zeros(_SAID, np.uint8)
+    told = np.frombuffer(said.encode()[:_SAID], np.uint8)
+    brought[: told.size] = told
+    return [row.tobytes().rstrip(b"\0").decode(errors="ignore") for row in exchange(brought)]
+
+
 def exchange(own: UInt8[np.ndarray, " bytes"]) -> UInt8[np.ndarray, "processes bytes"]:
     """What every process brought along, to all of them; the same length everywhere."""
     mesh, copy = _one_device_each()

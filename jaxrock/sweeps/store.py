@@ -100,13 +100,15 @@ class Store:
 
     def begun(self) -> list[int]:
         """The blocks of which there is a record, good or not: to look for one after the other takes long where there
-        are many, and few of them are finished."""
-        root, found = self.path / RECORDS / "c", []
-        more = len(self._records.shape) - len(self._plan.blocks)
+        are many, and few of them are finished. What lies beside them is nobody's."""
+        root, found, blocks = self.path / RECORDS / "c", [], self._plan.blocks
+        more = len(self._records.shape) - len(blocks)
         for folder, _, files in os.walk(root, onerror=_unless_missing):
             index = Path(folder).relative_to(root).parts
-            if files and len(index) == len(self._plan.blocks) + more - 1 and all(map(str.isdecimal, index)):
-                found.append(int(np.ravel_multi_index(tuple(map(int, index[: 1 - more])), self._plan.blocks)))
+            if files and len(index) == len(blocks) + more - 1 and all(map(str.isdecimal, index)):
+                place = tuple(map(int, index[: 1 - more]))
+                if all(i < n for i, n in zip(place, blocks)):
+                    found.append(int(np.ravel_multi_index(place, blocks)))
         return sorted(found)
 
     def look(self, number: int) -> tuple[bool, list[Path]]:

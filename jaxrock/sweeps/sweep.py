@@ -24,7 +24,7 @@ from jaxrock._named import AbstractNamed
 from jaxrock._progress import Progress
 from jaxrock._tables import needed
 from jaxrock.sweeps.description import fingerprint
-from jaxrock.sweeps.devices import exchange, meet, process, shared_out
+from jaxrock.sweeps.devices import all_or_none, exchange, process, shared_out
 from jaxrock.sweeps.grid import Grid
 from jaxrock.sweeps.labels import own_names
 from jaxrock.sweeps.plan import Plan, tiles
@@ -100,8 +100,8 @@ def sweep(
 
     **Raises:** ValueError for axes that are not lists of numbers, for values that the function refuses, for results
     without names of their own, for a store of another sweep, or one that is no path of a file system (`s3://...`);
-    OSError where the store cannot be written, on a full disk, say; RuntimeError for a second sweep at a time in a job
-    of many processes; ImportError for a store without zarr.
+    OSError where the store cannot be written, on a full disk, say; RuntimeError in a job of many processes for a second
+    sweep at a time, and for what failed in another of them; ImportError for a store without zarr.
     """
     if not axes:
         raise ValueError("A sweep needs at least one axis, such as `p=[1.0, 2.0]`.")
@@ -154,12 +154,11 @@ def _keeper(
     if version is not None:
         made_by["argument `version`"] = str(version)
     damaged = []
-    try:
+    with all_or_none():
         if process()[0] == 0:
             damaged = made_or_mended(path, axes, plan.outer, leaves, plan.block, made_by, words)
-    finally:
-        meet()  # whatever became of it
-    store = of_sweep(path, made_by)
+    with all_or_none():
+        store = of_sweep(path, made_by)
     store.mended += damaged
     return store
 
@@ -172,19 +171,20 @@ def _there(store: Store) -> np.ndarray:
     own, count = process()
     found = np.zeros(store.count, np.uint8)
     damaged = []
-    for number in (each for each in store.begun() if each % count == own):
-        good, files = store.look(number)
-        damaged += files
-        found[number] = 2 if files else good
+    with all_or_none():
+        for number in (each for each in store.begun() if each % count == own):
+            good, files = store.look(number)
+            damaged += files
+            found[number] = 2 if files else good
     if count > 1:
-        meet()
         found = exchange(found).max(axis=0)
+    with all_or_none():
         others = [number for number in np.flatnonzero(found == 2) if number % count != own]
         damaged += [file for number in others if own == 0 for file in store.look(int(number))[1]]
-    if own == 0 and (files := store.mended + damaged):
-        warnings.warn(
-            f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.", stacklevel=4
-        )
+        if own == 0 and (files := store.mended + damaged):
+            warnings.warn(
+                f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.", stacklevel=4
+            )
     return found == 1
 
 
@@ -277,20 +277,19 @@ def compute(
     bar = Progress(int(plan.sizes[mine].sum()), label, progress if own == 0 else False)
     results = [] if store else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
-    for number in mine:
-        place = plan.place(number)
-        shape = tuple(p.stop - p.start for p in place)
-        leaves = run(plan.points(number), bar.add, tiles(shape, columns))
-        leaves = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in leaves]
-        if store:
-            _write(store, number, leaves)
-        else:
-            for leaf, part in zip(results, leaves):
-                leaf[place] = part
-    if count > 1:
-        meet()
-        if not store:
-            _gather(results, plan, left)
+    with all_or_none():
+        for number in mine:
+            place = plan.place(number)
+            shape = tuple(p.stop - p.start for p in place)
+            leaves = run(plan.points(number), bar.add, tiles(shape, columns))
+            leaves = [leaf.reshape(*shape, *leaf.shape[1:]) for leaf in leaves]
+            if store:
+                _write(store, number, leaves)
+            else:
+                for leaf, part in zip(results, leaves):
+                    leaf[place] = part
+    if count > 1 and not store:
+        _gather(results, plan, left)
     if store and not load:
         return None, resumed
     return jax.tree.unflatten(run.tree, store.read() if store else results), resumed

@@ -71,7 +71,11 @@ def _strong(x: Any) -> Any:
 
 
 def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
-    """A recipe whose function holds no traced values of what is around it: they become leaves."""
+    """A recipe whose function holds no traced values of what is around it: they become leaves.
+
+    Where there are any, what is left of it is the whole, traced: its parts and its way over a tape take no such leaves,
+    so that many scenes go the careful way, and derivatives by very many numbers the usual one.
+    """
     if recipe.facts is not None:
         return recipe, leaves
     program, shapes = recipe.program, recipe.results

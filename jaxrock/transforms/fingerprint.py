@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
-from jaxrock._checks import is_marking, put_down
+from jaxrock._checks import put_down, throws
 from jaxrock.transforms.reads import reads
 
 
@@ -82,7 +82,7 @@ def traced(function: Callable, key: Hashable | None, leaves: Iterable) -> tuple[
     """
     if key is None:
         return jax.make_jaxpr(with_checks(function), return_shape=True)(*leaves)
-    found = _under_jit(_Keyed(function, (key, is_marking()))).trace(*leaves)
+    found = _under_jit(_Keyed(function, (key, throws()))).trace(*leaves)
     return found.jaxpr, found.out_info
 
 

@@ -21,6 +21,7 @@ from jaxrock.engines.rest import lift, longest_wait
 from jaxrock.engines.state import State
 from jaxrock.engines.taylor.careful import TaylorStepper
 from jaxrock.engines.taylor.expansion import Start, expand
+from jaxrock.engines.taylor.outset import first_sign
 from jaxrock.engines.taylor.policy import POLICY
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.newton import is_found, root_between
@@ -36,10 +37,6 @@ Flag = Bool[Array, ""]
 _FLAT, _TURN, _MEET = (6, 10), (5, 10), (5, 9)
 
 
-def _first_sign(value: Scalar, following: Scalar) -> Scalar:
-    return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
-
-
 def _if(needed: Flag, function: Callable, otherwise):
     """`function()` where needed: skipped if no lane of a vector needs it."""
     return jax.lax.cond(needed, function, lambda: otherwise)
@@ -52,7 +49,7 @@ def _certified(terms: list[Scalar], length: Scalar, rises: Scalar) -> Scalar:
     """
     acceleration = derivative(derivative(terms))
     jerk = derivative(acceleration)
-    jerks = _first_sign(jerk[0], jerk[1])
+    jerks = first_sign(jerk[0], jerk[1])
 
     def sure(share):
         kept = keeps_sign(acceleration, rises, share * length) > 0
@@ -90,8 +87,8 @@ def _part(start: Start, terms: list[Scalar], room: Scalar, least: Scalar, most: 
     longest = _if(short, lambda: step_length(terms, least, cap), cap)
     reaches = longest >= room * (1 - 1e-9)
     longest = keep_by(where(reaches, room, longest), one)
-    rises = where(start.uplifting, 1.0, _first_sign(terms[2], terms[3]))
-    outward = where(start.uplifting, 1.0, _first_sign(before, rises))
+    rises = where(start.uplifting, 1.0, first_sign(terms[2], terms[3]))
+    outward = where(start.uplifting, 1.0, first_sign(before, rises))
     share = keep_by(_certified(terms, longest, rises), one)
 
     def extremum(length):
@@ -350,7 +347,7 @@ def wait(stepper: TaylorStepper, state: State) -> State:
 def _monotone(terms: list[Scalar], length: Scalar) -> Scalar:
     """The share of a step within which a series is certain to keep growing or falling."""
     slope = derivative(terms) or [jnp.zeros_like(length)]
-    rises = _first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
+    rises = first_sign(slope[0], slope[1] if len(slope) > 1 else jnp.ones_like(length))
     share = jnp.zeros_like(length)
     for part in (*reversed(POLICY.shorter), 1.0):
         share = where(keeps_sign(slope, rises, part * length) > 0, part, share)

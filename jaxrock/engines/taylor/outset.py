@@ -10,14 +10,15 @@ from jaxrock.numerics.polynomial import fall_bound
 Scalar = Inexact[Array, ""]
 
 
+def first_sign(value: Scalar, following: Scalar) -> Scalar:
+    """Sign with which a value starts; where it is zero, that of its derivative."""
+    return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
+
+
 def signs_at_start(state: State, coefficients) -> tuple[Scalar, Scalar]:
-    """Signs with which velocity and acceleration start; where one is zero, that of its derivative."""
-
-    def of(value, following):
-        return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
-
-    velocity = where(state.uplifting, 1.0, of(state.velocity, coefficients[2]))
-    acceleration = of(where(state.extremal, 0.0, coefficients[2]), coefficients[3])
+    """Signs with which velocity and acceleration start."""
+    velocity = where(state.uplifting, 1.0, first_sign(state.velocity, coefficients[2]))
+    acceleration = first_sign(where(state.extremal, 0.0, coefficients[2]), coefficients[3])
     return velocity, where(state.uplifting, 1.0, acceleration)
 
 
