@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
+from jaxrock._checks import is_traced
+
 if TYPE_CHECKING:  # of Equinox's own declaration some checkers think that its items are words
     from typing import Self, TypeVar
 
@@ -54,14 +56,34 @@ class Status(Enumeration):
     not_finite = item("The state or the motion stopped being a finite number. Check the inputs.")
 
 
+def is_none(given: Any) -> Bool[Array, ""]:
+    """Whether a number that is given is none."""
+    numbers = [x for x in jax.tree.leaves(given) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    return jnp.stack([jnp.isnan(x).any() for x in numbers]).any()
+
+
+@jax.jit
+def still_where(lost: Bool[Array, ""], values: Any) -> Any:
+    """The values, which nothing moves where `lost`: in reverse mode slopes that are no numbers end here."""
+
+    def of(x):
+        return jnp.where(lost, jax.lax.stop_gradient(x), x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
+
+    return jax.tree.map(of, values)
+
+
+def still_if_none(given: Any) -> Any:
+    """What is given to an engine, which has no slopes if a number of it is none."""
+    return still_where(is_none(given), given) if is_traced(given) else given
+
+
 @jax.jit
 def marked_result(result: Any, given: Any) -> Any:
     """A result as it is, unless a number that was given is none: then none of the result is, and its status says so.
 
     An engine may pass by a number that it does not come to need, and what it returns may look like a result.
     """
-    numbers = [x for x in jax.tree.leaves(given) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
-    bad = jnp.stack([jnp.isnan(x).any() for x in numbers]).any()
+    bad = is_none(given)
 
     def of(part):
         if isinstance(part, Status):

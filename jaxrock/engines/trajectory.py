@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock._checks import Values, checked
 from jaxrock.numerics.choice import where
+from jaxrock.status import still_where
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -41,7 +42,8 @@ class Trajectory(eqx.Module):
         self.check_single()
         rounding = max(1e-12, 4 * float(jnp.finfo(self.duration.dtype).eps))
         end = self.duration * (1 + rounding)  # a time computed as the duration may round past it
-        time = checked("time", time, "be in the history [0, duration]", lambda t: (t >= 0) & (t <= end))
+        allowed = "be in the history [0, duration]"  # of one that is none (`throw=False`) any time, which tells nothing
+        time = checked("time", time, allowed, lambda t: (t >= 0) & ~(t > end))
         return time.astype(jnp.result_type(time, self.duration))
 
     def at_times(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
@@ -50,7 +52,8 @@ class Trajectory(eqx.Module):
         def at(t):
             return follow(*self.before(t))
 
-        return jax.tree.map(lambda x: x.reshape(*time.shape, *x.shape[1:]), jax.vmap(at)(time.ravel()))
+        found = jax.tree.map(lambda x: x.reshape(*time.shape, *x.shape[1:]), jax.vmap(at)(time.ravel()))
+        return still_where(jnp.isnan(self.duration), found)
 
     def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
         """The node before a time, and how long after it that is [s]; not a number where no step was left for that."""

@@ -17,7 +17,7 @@ from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.nonlinear import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.status import Status, marked_result
+from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable
 
 Scalar = Inexact[Array, "..."]
@@ -153,9 +153,9 @@ def outcome_flexible(
     **Raises:** ValueError for arguments outside their ranges.
     """
     say_if_single()
-    stop = _duration(block, motion, duration, throw)
-    result = _outcome(block, motion, stop, _budget(block, motion, max_steps))
-    return result if throw else marked_result(result, (block, motion, stop))
+    given = _given(block, motion, duration, throw)
+    result = _outcome(*given, _budget(block, motion, max_steps))
+    return result if throw else marked_result(result, given)
 
 
 @arguments
@@ -181,12 +181,20 @@ def simulate_flexible(
     **Raises:** ValueError for arguments outside their ranges.
     """
     say_if_single()
-    stop = _duration(block, motion, duration, throw)
-    result, path = _simulate(block, motion, stop, _budget(block, motion, max_steps))
+    given = _given(block, motion, duration, throw)
+    result, path = _simulate(*given, _budget(block, motion, max_steps))
     time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
     rotation, displacement, bending = _at_times(path, time, "outputs")[:3]
     response = FlexibleResponse(time, rotation, displacement, bending, result, path)
-    return response if throw else marked_result(response, (block, motion, stop))
+    return response if throw else marked_result(response, given)
+
+
+def _given(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> tuple:
+    """What is followed, and how long."""
+    if throw:
+        return block, motion, _duration(block, motion, duration, throw)
+    block, motion = still_if_none((block, motion))
+    return still_if_none((block, motion, _duration(block, motion, duration, throw)))
 
 
 def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> Scalar:

@@ -158,11 +158,10 @@ class Emitter:
         return self._depths.get(id(value), 0)
 
     def remember(self, values: list, depth: int) -> None:
-        """That values are made anew in so many of the loops that are being written."""
+        """That values are made anew in so many of the loops that are being written, at most: those at their end."""
         for value in values:
             if not isinstance(value, ir.Constant):  # which many share, and nothing makes
                 self._alive.append(value)
-                # The end of a loop takes what it leaves out of it.
                 self._depths[id(value)] = min(depth, self._depths.get(id(value), depth))
 
     def _apply(self, equation, inputs: list, active) -> list:

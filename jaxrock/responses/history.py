@@ -27,7 +27,7 @@ from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
-from jaxrock.status import Status, marked_result
+from jaxrock.status import Status, marked_result, still_if_none, still_where
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[Array, "..."]
@@ -84,7 +84,8 @@ class Response(AbstractTable):
 
         **Raises:** ValueError for a time outside the history.
         """
-        return _evaluate(self.trajectory, self.trajectory.checked(time))
+        found = _evaluate(self.trajectory, self.trajectory.checked(time))
+        return still_where(jnp.isnan(self.trajectory.duration), found)
 
     @property
     def impact_count(self) -> Int[Array, "..."]:
@@ -239,11 +240,13 @@ def simulate(
     say_if_single()
     model = current_model(model, block, motion)
     engine = engine_of(engine, model, motion)
-    block, start = standing(block, model, engine, throw), start_of(initial, throw)
-    summary, path = _simulate(block, padded(motion), model, start, duration, engine)
+    given = block, motion, model, start_of(initial, throw), duration
+    block, motion, model, start, duration = given if throw else still_if_none(given)
+    given = standing(block, model, engine, throw), padded(motion), model, start, duration
+    summary, path = _simulate(*(given if throw else still_if_none(given)), engine)
     time, rotation, velocity = _equally_spaced(path, samples)
     response = Response(time, rotation, velocity, summary, path)
-    return response if throw else marked_result(response, (block, motion, model, start, duration))
+    return response if throw else marked_result(response, given)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -26,7 +26,7 @@ from jaxrock.motions.record import padded
 from jaxrock.numerics.choice import where
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
-from jaxrock.status import Status, marked_result
+from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable
 from jaxrock.transforms.recipe import Passes
 
@@ -148,11 +148,13 @@ def outcome(
         )
     say_if_single()
     model, engine = current_model(model, block, motion), engine_of(engine, model, motion)
-    block, motion = in_real_numbers(block, motion)
-    block, start = standing(block, model, engine, throw), start_of(initial, throw)
+    given = *in_real_numbers(block, motion), model, start_of(initial, throw)
+    block, motion, model, start = given if throw else still_if_none(given)
+    block = standing(block, model, engine, throw)
     in_place = isinstance(engine, Series) and is_in_place(motion)
-    result = _outcome(block, motion if in_place else padded(motion), model, start, engine)
-    return result if throw else marked_result(result, (block, motion, model, start))
+    given = block, motion if in_place else padded(motion), model, start
+    result = _outcome(*(given if throw else still_if_none(given)), engine)
+    return result if throw else marked_result(result, given)
 
 
 @jax.jit
