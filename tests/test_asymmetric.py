@@ -284,6 +284,14 @@ def test_outlines(name):
         np.testing.assert_allclose(flat.alpha1, block.alpha1, rtol=1e-15)
 
 
+def test_an_outline_may_be_closed():
+    """By its first vertex once more; and vertices may lie on straight edges."""
+    points = [(0, 0), (0.2, 0), (0.3, 0), (0.5, 0), (0.6, 2), (0, 2)]
+    found = [rk.blocks.AsymmetricBlock.from_outline(p) for p in (points, [*points, points[0]], points[:1] + points[3:])]
+    for block in found[1:]:
+        np.testing.assert_allclose([block.alpha1, block.p1], [found[0].alpha1, found[0].p1], rtol=1e-14)
+
+
 def test_constructors_agree():
     """From radii, frequencies and corners; a flat base without its ratio of radii."""
     block = rk.blocks.AsymmetricBlock.from_corners((0.25, 0.0), (-0.15, 0.0), (0.0, 1.0), np.sqrt(0.35))
@@ -310,7 +318,11 @@ BAD = {
     ),
     "crossing": (
         lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (1, 0), (0, 1.2)]),
-        "must not cross itself",
+        "must not cross or touch itself, but edges 0 and 2 do",
+    ),
+    "touching": (
+        lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)]),
+        "must not cross or touch itself, but edges 0 and 2 do",
     ),
     "a line": (lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (2, 2)]), "must enclose an area"),
     "a tip": (lambda: rk.blocks.AsymmetricBlock.from_outline([(0, 0), (1, 1), (-1, 1)]), "must have a flat base"),

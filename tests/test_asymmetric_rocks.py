@@ -48,6 +48,15 @@ def test_equal_sides_are_symmetric_rocks():
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
 
 
+def test_observations_of_traced_rocks():
+    """Where it is not known which way round they stand, they are taken both ways."""
+    known, ways = rocks(), jax.jit(lambda facing: rocks(facing=facing).ways)
+    found = jax.jit(lambda ratio: rocks(ratio).restitution)(1.35)
+    np.testing.assert_allclose(found, known.restitution, rtol=1e-14)
+    np.testing.assert_array_equal(ways(FACING), known.ways)
+    np.testing.assert_array_equal(ways(np.abs(FACING)).mean(0), np.abs(known.ways).mean(0) * (FACING != 0))
+
+
 @pytest.mark.parametrize("motion", [rk.SinePulse, with_vertical])
 def test_ways_are_those_of_the_mirrored_rock_and_their_mean(motion):
     """What turns round does so in the plane: up stays up."""

@@ -190,6 +190,7 @@ def test_two_parameters_of_a_lopsided_rock_whose_facing_is_not_known():
         ({"scatter": {"alpha": -0.1}}, "`scatter` must be positive"),
         ({"facing": 2}, "`facing` must hold"),
         ({"rotation": [0.5]}, "`rotation` must be NaN for tests that toppled"),
+        ({"rotation_sd": 0.0}, r"`rotation_sd` must be in \(0, 1\], but is 0.0"),
         ({"folds": 5}, "`folds` must be 0, or from 2 to the 1 groups"),
         ({"cells": {"q": 9}}, "`cells` must have some of the names"),
         ({"cells": {"alpha": 4}}, "`cells` must be a whole number from 8 to 4096"),

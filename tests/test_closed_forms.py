@@ -370,6 +370,21 @@ def test_islands():
     np.testing.assert_array_equal(intervals(3.0, 0.9).impacts, [1, 0])
 
 
+@pytest.mark.parametrize("begin", [1.7, 2.5, 3.5, 5.0])  # below and above the limits 2.376, 3.485 and 3.631
+def test_a_search_finds_what_lies_above_its_beginning(begin):
+    found, whole = sine_pulse.overturning_intervals(3.0, 0.9, searched_from=begin, points=64), intervals(3.0, 0.9)
+    above = whole.upper > begin
+    np.testing.assert_allclose(found.lower, np.maximum(whole.lower, begin)[above], rtol=1e-13)
+    np.testing.assert_allclose(found.upper, whole.upper[above], rtol=1e-13)
+    np.testing.assert_array_equal(found.impacts, whole.impacts[above])
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 0.01, 0.0142])
+def test_intervals_of_long_pulses_are_in_order(ratio):
+    found = intervals(ratio, 0.9)
+    assert found.lower[0] >= found.searched_from and np.all(found.lower < found.upper) and found.upper[-1] == np.inf
+
+
 @pytest.mark.slow
 def test_many_islands():
     np.testing.assert_array_equal(sine_pulse.overturning_intervals(0.25, 0.95).impacts, [*range(35, 0, -2), 0])
@@ -486,6 +501,8 @@ def test_pushover_has_ranges():
         for rotation in (1.6, -0.1):
             with pytest.raises(ValueError, match=r"Argument `rotation` must be in \[0, pi/2\), but is"):
                 ask(rotation, 0.2)
+    with pytest.raises(ValueError, match="Argument `inertia` must be finite, and at least 1, but is 0.75"):
+        restitution.housner(0.3, 0.75)  # its inverse, the `inertia_ratio` of a block
     for ask in (pushover.force, pushover.energy):  # a force beyond would have the wrong sign, and a work too
         for rotation in (1.6, -0.1):
             with pytest.raises(ValueError, match=r"Argument `rotation` must be in \[0, pi/2\], but is"):
@@ -499,6 +516,19 @@ def test_no_impact_costs_nothing():
     """Of a block that an impact would stop as well: and the amplitude does not depend on the restitution."""
     value, slope = jax.value_and_grad(lambda e: pushover.amplitude_after(0, 0.5, e))(0.0)
     assert (float(value), float(slope)) == (pytest.approx(0.5, rel=1e-15), 0.0)
+
+
+@pytest.mark.parametrize("impacts, restitution", [(0, 0.9), (3, 1.0), (1, 1 - 1e-12), (2, 0.9)])
+@pytest.mark.parametrize("short", [0.5, 1e-6, 2.0**-40])
+def test_amplitudes_near_balance(impacts, restitution, short):
+    """How far from balance a block stays, and its slope, to 50 digits."""
+    with mp.workdps(50):
+        left = lambda a: 1 - mp.sqrt(1 - mp.mpf(restitution) ** (2 * impacts) * a * (2 - a))
+        value, slope = left(mp.mpf(1) - short), mp.diff(left, mp.mpf(1) - short, h=mp.mpf(10) ** -25)
+        distance = float(1 - value)
+    found, change = jax.value_and_grad(pushover.amplitude_after, argnums=1)(float(impacts), 1 - short, restitution)
+    assert 1 - float(found) == pytest.approx(distance, rel=1e-9, abs=2.3e-16)
+    assert float(change) == pytest.approx(float(slope), rel=1e-4 if 0 < 1 - restitution < 1e-9 else 1e-12)
 
 
 def test_free_rocking():

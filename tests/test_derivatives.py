@@ -549,6 +549,15 @@ def test_an_overturned_block_has_no_peak_to_differentiate():
     assert found.margin.status == rk.studies.SlopeStatus.useful
 
 
+def test_a_block_that_does_not_uplift_has_no_slopes():
+    """Nor under a ground that does not move, in which there is no peak to scale."""
+    still = rk.Record([0.0, 0.0, 0.0], 0.01)
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), still, rk.Linear(), engine=rk.Series(order=4))
+    for slopes in (found.max_rotation, found.max_velocity):
+        assert slopes.value == 0 and np.isinf(slopes.reach) and slopes.status == rk.studies.SlopeStatus.useful
+        assert not np.any(slopes.derivative) and not np.any(slopes.elasticity)
+
+
 def two_lobes(restitution, *numbers):
     """A linear block under half sines of size and duration, the second after a delay."""
     first_size, first_duration, size, duration, delay = numbers

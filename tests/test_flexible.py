@@ -414,6 +414,8 @@ def test_small_budgets_have_a_status():
         (dict(youngs_modulus=1e5), "stiffer than its base"),
         (dict(youngs_modulus=1e21), "at most 1e12 times as stiff"),
         (dict(width=80.0), "at most 1.41 times the height"),
+        (dict(width=80.0, restitution=rk.restitution.Housner()), "at most 1.41 times the height"),
+        (dict(width=60.0, restitution=rk.restitution.Housner(1.0)), "`width` must be so small that Housner's"),
     ],
 )
 def test_wrong_arguments(change, message):

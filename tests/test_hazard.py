@@ -128,6 +128,16 @@ def test_extended_curve_continues_the_power_laws():
     np.testing.assert_allclose(extended.rates, 1e-3 * np.array([0.01, *x, 5.0]) ** -1.7, rtol=1e-13)
 
 
+def test_a_curve_that_falls_off_is_extended():
+    """The power law of its last interval is beyond all numbers at the lowest level, where it is not asked for."""
+    levels, rates = [0.01, 0.1, 1.0, 1.1], [1e-1, 1e-2, 1e-4, 1e-11]
+    found = rk.hazard.HazardCurve(levels, rates).extended(0.001, 2.0)
+    last = 1e-11 * (2.0 / 1.1) ** (-np.log(1e7) / np.log(1.1))
+    np.testing.assert_allclose(found.rates, [1.0, *rates, last], rtol=1e-12)
+    first = lambda lowest: rk.hazard.HazardCurve(levels, rates).extended(lowest, 2.0).rates[0]
+    np.testing.assert_allclose(jax.jit(jax.grad(first))(0.001), -1000.0, rtol=1e-12)
+
+
 @pytest.mark.parametrize("median", [0.02, 0.1, 0.5, 1.5])
 def test_what_a_curve_leaves_open_is_bounded(median):
     """The rate under the full hazard lies between those under the curve that was cut, and under its power laws."""

@@ -213,6 +213,10 @@ def test_a_displacement_that_is_drift_warns():
         (lambda: rk.intensity.significant_duration(0.0 * SINE), "`motion` must move"),
         (lambda: rk.intensity.velocity_to_acceleration(0.0 * SINE), "`motion` must move"),
         (lambda: rk.intensity.arias(rk.SinePulse(np.array([0.1, 0.2]), 1.0)), "`motion` must hold one scene"),
+        (
+            lambda: rk.intensity.velocity_ratio(rk.SinePulse(np.array([0.1, 0.2]), 1.0), rk.Block(0.2, 2.0)),
+            "`motion` must hold one scene",
+        ),
     ],
 )
 def test_what_is_refused(call, message):

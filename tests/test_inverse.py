@@ -583,3 +583,22 @@ def test_unexceeded_records():
 def test_wrong_arguments_are_named(wrong, message):
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+def test_observations_of_traced_values():
+    """What is known of them is known within `jax.jit`, too, and what is wrong raises there."""
+    words = ["survived", "toppled", "rotation"]
+    given = {"alpha_sd": 0.01, "rotation": 0.05, "rotation_sd": 0.01}
+
+    def restitution(alpha, known):
+        return rk.inverse.Observations(alpha, [2.0, 3.0, 4.0], words, known, **given).restitution
+
+    alpha, known = jnp.array([0.1, 0.2, 0.3]), jnp.array([0.9, np.nan, np.nan])
+    compiled = jax.jit(restitution)
+    np.testing.assert_allclose(compiled(alpha, known), restitution(alpha, known), rtol=1e-15)
+    slopes = jax.jit(jax.jacfwd(restitution))(alpha, known)
+    np.testing.assert_allclose(slopes, np.diag([0.0, *-1.5 * np.sin(2 * np.array([0.2, 0.3]))]), rtol=1e-13)
+    with pytest.raises(Exception, match="Argument `alpha` must be at most 0.955"):
+        compiled(alpha + 0.7, known)
+    measured = lambda x: rk.inverse.Observations(alpha, 4 * alpha, words, **(given | {"rotation": x})).rotation.sum()
+    assert jax.jit(jax.grad(measured))(0.05) == 1.0

@@ -24,7 +24,7 @@ from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.outline import Outline
 from jaxrock.blocks.restitution import AbstractRestitution, AngularMomentum, Corners, PerSide, law_of, ratio_of_inertia
-from jaxrock.blocks.rigid import GRAVITY, Side
+from jaxrock.blocks.rigid import GRAVITY, LENGTHS, Side
 from jaxrock.blocks.rock import section_of
 from jaxrock.numerics.elementary import sine_cosine
 
@@ -248,7 +248,7 @@ class AsymmetricBlock(Owner):
         *,
         base: Annotated[str, word_of("narrow", "wide")] = "narrow",
         plane: Annotated[str, word_of("projection", "cut")] = "projection",
-        unit: Annotated[str, word_of("m", "cm", "mm")] = "m",
+        unit: Annotated[str, word_of(*LENGTHS)] = "m",
         tolerance: ArrayLike | None = None,
         restitution: Ratios = None,
         gravity: ArrayLike = GRAVITY,

@@ -10,7 +10,7 @@ from jaxrock._checks import Range, below_one, checked, one_of, size, truth, whol
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, law_of
+from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fitting_width, law_of
 from jaxrock.blocks.rigid import GRAVITY
 
 Real = Inexact[Array, "..."]
@@ -104,9 +104,7 @@ class FlexibleBlock(Owner):
         set_parameters(self, width=width, height=height, youngs_modulus=youngs_modulus, density=density)
         set_parameters(self, damping_ratio=damping_ratio, gravity=gravity)
         self.law = law_of(restitution, Housner(), symmetric=True)
-        if restitution is None:
-            flat = "be at most 1.41 times the height when `restitution` is None: Housner's value is negative above"
-            self.width = checked("width", self.width, flat, lambda x: x <= math.sqrt(2) * self.height * (1 + 1e-6))
+        self.width = fitting_width(self.law, self.width, self.height)
         self.youngs_modulus = checked(
             "youngs_modulus",
             self.youngs_modulus,

@@ -20,7 +20,7 @@ class Outline(NamedTuple):
     def of(cls, outline: Values) -> "Outline":
         """Integrate over the polygon, as sums over the triangles from its first vertex to each edge.
 
-        **Raises:** ValueError where it has fewer than three vertices, no area, or crosses itself.
+        **Raises:** ValueError where it has fewer than three vertices, no area, or crosses or touches itself.
         """
         check_known(outline=outline)
         given = np.asarray(strength("outline", outline), float)
@@ -78,8 +78,9 @@ class Outline(NamedTuple):
 
 def _check_simple(vertices: np.ndarray) -> None:
     """Raise ValueError where two edges that are not neighbours cross or touch."""
-    n = len(vertices)
-    start, end = vertices, np.roll(vertices, -1, axis=0)
+    number = np.flatnonzero((vertices != np.roll(vertices, -1, axis=0)).any(axis=1))  # of edges that have a length
+    start = vertices[number]
+    end, n = np.roll(start, -1, axis=0), len(start)
 
     def turn(a, b, c):
         return np.sign(
@@ -91,7 +92,9 @@ def _check_simple(vertices: np.ndarray) -> None:
     i, j = i[keep], j[keep]
     apart = turn(start[i], end[i], start[j]) * turn(start[i], end[i], end[j])
     across = turn(start[j], end[j], start[i]) * turn(start[j], end[j], end[i])
-    crossing = (apart < 0) & (across < 0)
-    if crossing.any():
-        first = np.flatnonzero(crossing)[0]
-        raise ValueError(f"Argument `outline` must not cross itself, but edges {i[first]} and {j[first]} cross.")
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    near = ((low[i] <= high[j]) & (low[j] <= high[i])).all(axis=1)  # which tells of edges on one line
+    meeting = near & (apart <= 0) & (across <= 0)
+    if meeting.any():
+        first, second = (number[each[meeting]][0] for each in (i, j))
+        raise ValueError(f"Argument `outline` must not cross or touch itself, but edges {first} and {second} do.")

@@ -310,6 +310,17 @@ def fitting_alpha(law: AbstractRestitution, alpha: Real) -> Real:
     return checked("alpha", alpha, allowed, lambda x: law._loss * jnp.sin(x) ** 2 <= 1 + 1e-6)
 
 
+def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
+    """The width of a rectangle, where the law is one for such blocks."""
+    if not isinstance(law, Housner):
+        return width
+    reason = "Housner's value is negative above"
+    allowed = f"be at most 1.41 times the height when `restitution` is None or Housner's: {reason}"
+    if law.inertia_ratio is not None:
+        allowed = "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative"
+    return checked("width", width, allowed, lambda x: law._loss * x**2 <= (1 + 1e-6) * (x**2 + height**2))
+
+
 class Reset(eqx.Module):
     """A law at the impacts that end a block's stays on one corner; speeds are per p t, as in the engines.
 

@@ -18,6 +18,7 @@ from jaxrock.blocks.restitution import (
 )
 
 GRAVITY = 9.81  # m/s^2, the value of the papers; `gravity=` changes it
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # [m]
 
 
 class Block(Owner):

@@ -14,10 +14,10 @@ from jaxrock._checks import Values, finite, positive, scalar
 from jaxrock.blocks.base import arms_of, rolled, rounded_edge
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.mesh import surface_of
+from jaxrock.blocks.rigid import LENGTHS
 from jaxrock.blocks.section import Section, section_of_slab
 from jaxrock.blocks.slab import Slab
 
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _PLANES = ("projection", "cut")
 _SHARE = 0.01  # of the height, within which vertices stand on the ground
 
@@ -41,7 +41,7 @@ class Rock(NamedTuple):
     @classmethod
     @arguments
     def from_mesh(
-        cls, mesh: Any, *, unit: Annotated[str, word_of(*_UNITS)] = "m", tolerance: ArrayLike | None = None
+        cls, mesh: Any, *, unit: Annotated[str, word_of(*LENGTHS)] = "m", tolerance: ArrayLike | None = None
     ) -> "Rock":
         """Build a rock from a closed surface.
 
@@ -61,7 +61,7 @@ class Rock(NamedTuple):
         mesh = surface_of(mesh)
         if not bool(mesh.is_volume):
             raise ValueError("Argument `mesh` must be closed and turned outward, but is not: repair it first.")
-        factor = _UNITS[unit]
+        factor = LENGTHS[unit]
         vertices, volume = factor * np.asarray(mesh.vertices, float), factor**3 * float(mesh.volume)
         # trimesh's own density is 1 in its units.
         inertia = factor**2 * np.asarray(mesh.moment_inertia, float) / float(mesh.volume) / float(mesh.density)

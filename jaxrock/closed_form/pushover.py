@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, checked, not_negative, one_of, share
+from jaxrock._checks import acute, below_one, checked, not_negative, one_of, share
 from jaxrock.transforms.elementwise import elementwise
 
 __all__ = [
@@ -25,10 +25,6 @@ Real = Inexact[ArrayLike, "..."]
 Result = Float[Array, "..."]
 
 
-def _below_one(name, value):
-    return checked(name, value, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
-
-
 def _leaning(name, value):
     return checked(name, value, "be in [0, pi/2)", lambda x: (x >= 0) & (x < jnp.pi / 2))
 
@@ -38,7 +34,7 @@ def _up_to_flat(name, value):
 
 
 _elementwise = elementwise(
-    alpha=acute, rotation=_up_to_flat, amplitude=_below_one, restitution=share, impacts=not_negative
+    alpha=acute, rotation=_up_to_flat, amplitude=below_one, restitution=share, impacts=not_negative
 )
 _of_springs = elementwise(alpha=acute, rotation=_leaning)
 
@@ -172,5 +168,6 @@ def amplitude_after(impacts: Real, amplitude: Real, restitution: Real) -> Result
     **Source:** Housner (1963), equation 10: each impact multiplies the energy by restitution^2.
     """
     kept = jnp.where(impacts == 0, 1.0, restitution)  # a power of zero to zero has no slope
-    left: Any = kept ** (2 * impacts) * amplitude * (2 - amplitude)
-    return left / (1 + jnp.sqrt(1 - left))
+    part: Any = kept ** (2 * impacts)  # of the energy
+    missing = (1 - part) + part * (1 - amplitude) ** 2  # for balance; one less what is left would cancel near it
+    return part * amplitude * (2 - amplitude) / (1 + jnp.sqrt(missing))

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
-from jaxrock._checks import acute, positive
+from jaxrock._checks import Range, acute
 from jaxrock.transforms.elementwise import elementwise
 
 __all__ = ["housner"]
@@ -13,7 +13,10 @@ def __dir__() -> list[str]:
     return __all__
 
 
-@elementwise(alpha=acute, inertia=positive)
+_inertia = Range("be finite, and at least 1", 1.0, jnp.inf, lambda x: (x >= 1) & (x < jnp.inf))  # 1: all in one point
+
+
+@elementwise(alpha=acute, inertia=_inertia)
 def housner(alpha: Inexact[ArrayLike, "..."], inertia: Inexact[ArrayLike, "..."] = 4 / 3) -> Float[Array, "..."]:
     """Angular velocity after an impact over that before it, if the block neither bounces nor slides.
 

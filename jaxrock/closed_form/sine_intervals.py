@@ -57,6 +57,22 @@ def overturning_intervals(
     """
     ratio = frequency_ratio
     limit, last = float(impact_time_limit(ratio)), float(no_impact_limit(ratio))
+    lower, upper = _sampled(searched_from, limit, ratio, restitution, points) if searched_from < limit else ([], [])
+    begins, stops = (float(x) for x in after_pulse_limits(ratio, restitution))
+    if len(lower) > len(upper):
+        upper.append(stops if np.isfinite(stops) else limit)
+    elif np.isfinite(stops):
+        lower.append(begins)
+        upper.append(stops)
+    # What lies above the limit was not sampled, and may lie below where the search begins.
+    lower, upper = np.maximum([*lower, last], searched_from), np.array([*upper, np.inf])
+    lower, upper = lower[lower < upper], upper[lower < upper]
+    impacts = _at(np.minimum((lower[:-1] + upper[:-1]) / 2, np.nextafter(last, 0)), ratio, restitution)[1]
+    return OverturningIntervals(lower, upper, np.append(impacts, 0), float(searched_from))
+
+
+def _sampled(searched_from: float, limit: float, ratio: float, restitution: float, points: int) -> tuple[list, list]:
+    """Lower and upper ends of the intervals below a limit; the last one goes on above it where its upper end lacks."""
     samples = np.linspace(searched_from, max(limit * (1 - 1e-13), searched_from), points)
     values, impacts = _at(samples, ratio, restitution)
     # Where the number of impacts changes there is an island or a gap, however narrow; else it is near an extreme.
@@ -77,17 +93,7 @@ def overturning_intervals(
     lower, upper = list(ends[~lost[change]]), list(ends[lost[change]])
     if lost[0]:
         lower.insert(0, searched_from)
-    begins, stops = (float(x) for x in after_pulse_limits(ratio, restitution))
-    if lost[-1]:
-        upper.append(stops if np.isfinite(stops) else limit)
-    elif np.isfinite(stops):
-        lower.append(begins)
-        upper.append(stops)
-    middle = np.minimum((np.array(lower) + np.array(upper)) / 2, np.nextafter(last, 0))
-    impacts = _at(middle, ratio, restitution)[1]
-    return OverturningIntervals(
-        np.array([*lower, last]), np.array([*upper, np.inf]), np.array([*impacts, 0]), float(searched_from)
-    )
+    return lower, upper
 
 
 def _impact_turns(samples: np.ndarray, impacts: np.ndarray, ratio, restitution) -> np.ndarray:

@@ -141,15 +141,16 @@ class HazardCurve(eqx.Module):
         rates = given(checked("rates", self.rates, "be known at two levels or more", lambda _: known.sum() >= 2))
         first, last = arrays.argmax(known), known.size - 1 - arrays.argmax(known[::-1])
 
-        def law(a, b):
+        def law(a, b, here):
             exponent = arrays.log(rates[a] / rates[b]) / arrays.log(own[b] / own[a])
-            found = rates[a] * (levels / own[a]) ** -exponent
+            # Elsewhere it may leave the numbers, and is not asked for.
+            found = rates[a] * (arrays.where(here, levels, own[a]) / own[a]) ** -exponent
             said = "be levels up to which the power laws stay below the largest number"
             return given(checked("lowest` and `highest", found, said, lambda rate: rate < np.inf))
 
-        inner = arrays.pad(rates, 1)
-        inner = arrays.where(levels > own[last], law(last - 1, last), inner)
-        return arrays.where(levels < own[first], law(first, first + 1), inner)
+        before, after = levels < own[first], levels > own[last]
+        inner = arrays.where(after, law(last - 1, last, after), arrays.pad(rates, 1))
+        return arrays.where(before, law(first, first + 1, before), inner)
 
 
 def _can_be_rates(x):

@@ -35,7 +35,18 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite, repeated
-from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, as_draws, both_ways, scenes, stacked
+from jaxrock.studies.suite_scenes import (
+    FACINGS,
+    STOOD,
+    TOPPLED,
+    UNDECIDED,
+    as_draws,
+    both_ways,
+    capacities,
+    comes_back,
+    scenes,
+    stacked,
+)
 
 
 def counts(verdict: np.ndarray, bound: str | None) -> np.ndarray:
@@ -161,8 +172,7 @@ class SimulatedFragility(AbstractTable):
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
         """Whether every level above the first that topples a block topples it, too (undecided ones may have)."""
-        toppled_before = np.maximum.accumulate(self.verdict == TOPPLED, axis=1)
-        return ~np.any(toppled_before & (self.verdict == STOOD), axis=1)
+        return ~comes_back(self.verdict)
 
     @property
     def falls(self) -> Float[np.ndarray, " levels"]:
@@ -175,12 +185,7 @@ class SimulatedFragility(AbstractTable):
 
         Above the upper level it may stand again. An undecided level may have been the first: it widens the bracket.
         """
-        levels = np.concatenate([[0.0], np.asarray(self.levels), [np.inf]])
-        count = self.levels.size
-        toppled, stood = self.verdict == TOPPLED, self.verdict == STOOD
-        first = np.where(toppled.any(axis=1), toppled.argmax(axis=1), count)
-        safe = np.where(stood.all(axis=1), count, (~stood).argmax(axis=1))
-        return np.stack([levels[safe], levels[first + 1]], axis=-1)
+        return capacities(self.verdict, self.levels)
 
     def table(self) -> dict[str, np.ndarray]:
         """Columns with a row for every motion and level: names, level, peaks [g], [m/s], trials, toppled, undecided."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int8
 
 from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import Values, checked, positive, shown, size
+from jaxrock._checks import Values, checked, positive, shown
 from jaxrock._parameters import leaves_of
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -25,7 +25,16 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import Measure, measure_of, scaled_strengths
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite, repeated
-from jaxrock.studies.suite_scenes import FACINGS, STOOD, TOPPLED, UNDECIDED, is_symmetric, scenes, stacked
+from jaxrock.studies.suite_scenes import (
+    FACINGS,
+    UNDECIDED,
+    capacities,
+    comes_back,
+    is_symmetric,
+    rising_scales,
+    scenes,
+    stacked,
+)
 
 
 class SuiteOutcomes(AbstractTable):
@@ -84,16 +93,12 @@ class SuiteOutcomes(AbstractTable):
 
         Above the upper scale it may stand again. An undecided scale may have been the first: it widens the bracket.
         """
-        scales, count = np.concatenate([[0.0], self.scale, [np.inf]]), self.scale.size
-        toppled, stood = self.verdict == TOPPLED, self.verdict == STOOD
-        first = np.where(toppled.any(axis=1), toppled.argmax(axis=1), count)
-        safe = np.where(stood.all(axis=1), count, (~stood).argmax(axis=1))
-        return np.stack([scales[safe], scales[first + 1]], axis=-1)
+        return capacities(self.verdict, self.scale)
 
     @property
     def comes_back(self) -> np.ndarray:
         """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
-        return np.any(np.maximum.accumulate(self.verdict == TOPPLED, axis=1) & (self.verdict == STOOD), axis=1)
+        return comes_back(self.verdict)
 
     def table(self, measures: Mapping[str, str | Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
@@ -166,9 +171,7 @@ def suite_outcomes(
 
     **Source:** Vamvatsikos & Cornell (2002), incremental dynamic analysis.
     """
-    scales = np.atleast_1d(np.asarray(size("scale", scale), float))
-    if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
-        raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
+    scales = rising_scales(scale)
     suite = motions if isinstance(motions, Suite) else Suite(motions)
     twice = repeated(suite)
     if twice:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, known, list_of
-from jaxrock._checks import Values, as_real, below_one, share, shown, whole
+from jaxrock._checks import Range, Values, as_real, below_one, share, shown, whole
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
@@ -28,6 +28,7 @@ from jaxrock.status import Enumeration, item
 from jaxrock.studies.suite_scenes import scenes
 
 _LEAST_BEND = 1e-8  # of the likelihood over a range, squared: what is less is rounding
+_deviation = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
 _STARTS = 6  # points of a net from which the likelihood is climbed
 
 
@@ -186,7 +187,7 @@ def calibrate_block(
     model: AbstractEquation = Housner(),
     *,
     rotation: Values | None = None,
-    rotation_sd: Annotated[float, known(share)] = 0.3,
+    rotation_sd: Annotated[float, known(_deviation)] = 0.3,
     facing: Values = 0,
     cells: Mapping[str, int] | Annotated[int, at_least(8, 4096)] = 64,
     lapse: Annotated[float, known(below_one)] = 0.01,
@@ -210,7 +211,7 @@ def calibrate_block(
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
     - `rotation`: (tests,) peak rotation over slenderness of a block that stood, 0 if it was not seen to move (below
       0.01), NaN where only the verdict is known.
-    - `rotation_sd`: standard deviation of its logarithm, by what was measured and what the model leaves out.
+    - `rotation_sd`: standard deviation of its logarithm, in (0, 1], by what was measured and what the model leaves out.
     - `facing`: 1 if motion and block have the same positive direction in a test, -1 if not, 0 not known: one number or
       (tests,). Of a symmetric block it changes nothing.
     - `cells`: of the grid over every parameter, or by its name; the scenes are their product. The grid goes 2.5 of the

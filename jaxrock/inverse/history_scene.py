@@ -81,7 +81,7 @@ class FittedScene(eqx.Module):
     def _declared(self) -> dict[str, Parameter]:
         return declarations(self.block, self.motion)
 
-    def _size(self, name: str, value: float) -> float:
+    def _natural_size(self, name: str, value: float) -> float:
         """Natural size of a parameter: its value, but of angles and numbers that may be zero."""
         known = self._declared.get(name)
         if known is not None and known.axes is not None and known.unit in ("-", "rad") and known.range.low < 0:
@@ -94,7 +94,7 @@ class FittedScene(eqx.Module):
         sizes = {"initial": alpha, "velocity": alpha * p, "delay": 1 / p, "offset": alpha}
         known = named(self.block, self.motion) | dict(zip(("initial", "velocity"), self.initial))
         values = np.array([float(known.get(name, 0.0)) for name in self.names])
-        scale = np.array([sizes.get(n) or self._size(n, x) for n, x in zip(self.names, values)])
+        scale = np.array([sizes.get(n) or self._natural_size(n, x) for n, x in zip(self.names, values)])
         reach = float(self._reach)
         bounds = np.array([(-reach, reach) if n == "delay" else ends for n, ends in zip(self.names, self._ends)]).T
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -25,7 +25,7 @@ _ALSO = {  # what people write, too
     "rotation": ("rocked", "measured"),
 }
 CALLED = {word: name for name in SEEN for word in (name, *_ALSO[name])}
-SURVIVED, TOPPLED, ROTATION = range(3)
+TOPPLED, ROTATION = 1, 2  # places in SEEN
 Rocks = Inexact[Array, " rocks"]
 Real = Inexact[Array, "..."]
 
@@ -113,9 +113,8 @@ class Observations(eqx.Module):
         block = Block(alpha, _list("p", p, count), given)
         self.alpha, self.p = block.alpha, block.p
         if other is None:
-            own = np.asarray(alpha)[np.asarray(self.follows)]
-            if own.size:
-                Block(own, np.ones(own.size))  # raises for a rock too wide for Housner's value
+            fitting = Block(_where(self.follows, alpha, 0.5), 1.0).alpha  # raises for one too wide for Housner's value
+            self.alpha = _where(self.follows, fitting, self.alpha)
         self.restitution = _where(self.follows, self.by_momentum(self.alpha), given)
         deviations = {"alpha_sd": alpha_sd, "p_sd": p_sd, "restitution_sd": restitution_sd}
         self.alpha_sd, self.p_sd, self.restitution_sd = (
@@ -127,7 +126,7 @@ class Observations(eqx.Module):
         self.rotation, self.rotation_sd = (
             _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
         )
-        wider = self.alpha if other is None else self.alpha * np.maximum(1.0, other.alpha_ratio)
+        wider = self.alpha if other is None else self.alpha * _where(other.alpha_ratio > 1, other.alpha_ratio, 1.0)
         most = _where(measured, wider, np.inf)
         _check_below(
             "rotation", self.rotation, 2 * most, "twice `alpha`, from which no rock comes back, and in radians"
@@ -176,7 +175,7 @@ class Observations(eqx.Module):
         facing = checked("facing", _list("facing", facing, count), "be 1, -1 or 0", _is_facing)
         ratio, both = _of_two_impacts(first, second, p1, p2, radii)
         one_way, two_ways = _ways(facing)
-        ways = two_ways if np.any(np.asarray(facing) == 0) else one_way
+        ways = two_ways if is_traced(facing) or np.any(np.asarray(facing) == 0) else one_way
         other = OtherSide(alpha2 / alpha1, radii, inertia, ratio, ways)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
         if blocks.law.depends_on_speed:
@@ -288,7 +287,9 @@ def _list(name: str, value: Values, count: int) -> Rocks:
     if array.shape not in ((), (count,)):
         each = "one rock" if count == 1 else f"each of {count} rocks"
         raise ValueError(f"Argument `{name}` must have a value for {each}, but has shape {array.shape}.")
-    return array if array.ndim else placed(np.full(count, array))
+    if array.ndim:
+        return array
+    return jnp.full(count, array) if is_traced(array) else placed(np.full(count, array))
 
 
 def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
@@ -298,7 +299,8 @@ def _words(seen: Sequence[str], count: int) -> Int[Array, " rocks"]:
         if called(word) is None:
             told = f"must hold only {', '.join(map(repr, SEEN))}, but holds {word!r}.{meant(word, CALLED)}"
             raise ValueError(f"Argument `seen` {told}")
-    return placed(np.array([SEEN.index(called(word)) for word in seen]))
+    with jax.ensure_compile_time_eval():  # known within `jax.jit`, too
+        return placed(np.array([SEEN.index(called(word)) for word in seen]))
 
 
 def called(word: str) -> str | None:

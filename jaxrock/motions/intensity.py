@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, check_known, checked, is_traced, scalar
+from jaxrock._checks import Values, below_one, check_known, checked, inner_share, is_traced, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.motion import AbstractMotion, Shifted
@@ -162,7 +162,7 @@ def significant_duration(motion: AbstractMotion, begin: ArrayLike = 0.05, end: A
 
     **Source:** Trifunac & Brady (1975).
     """
-    begin, end = (float(scalar(n, checked(n, x, "be in (0, 1)", _inside))) for n, x in (("begin", begin), ("end", end)))
+    begin, end = (float(scalar(name, inner_share(name, x))) for name, x in (("begin", begin), ("end", end)))
     if begin >= end:
         raise ValueError(f"Argument `end` must be above `begin`, {begin}, but is {end}.")
     lines = straight(motion)
@@ -170,10 +170,6 @@ def significant_duration(motion: AbstractMotion, begin: ArrayLike = 0.05, end: A
     if not sums[-1] > 0:
         raise ValueError("Argument `motion` must move, but does not.")
     return _time_of(lines, sums, end * sums[-1]) - _time_of(lines, sums, begin * sums[-1])
-
-
-def _inside(x):
-    return (x > 0) & (x < 1)
 
 
 def _squares(lines: Straight) -> np.ndarray:
@@ -324,13 +320,13 @@ def velocity_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array,
 
     **Source:** Dimitrakopoulos & Paraskeva (2015), the measure.
     """
-    check_single(block=block)
+    check_single(motion=motion, block=block)
     ratio = peaks_and_last_velocity(motion)[1] * block.p / (GRAVITY * jnp.tan(block.alpha))
     return ratio if is_traced(ratio) else float(ratio)
 
 
 def _oscillators(period: Values, damping: ArrayLike) -> tuple[np.ndarray, float]:
-    damping = checked("damping", damping, "be in [0, 1)", lambda x: (x >= 0) & (x < 1))
+    damping = below_one("damping", damping)
     period = checked("period", period, "be from 0.001 to 10,000 s", lambda x: (x >= 1e-3) & (x <= 1e4))
     if period.size == 0:
         raise ValueError("Argument `period` must hold at least one period, but is empty.")

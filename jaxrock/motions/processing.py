@@ -27,7 +27,7 @@ from jaxrock._checks import (
     strength,
 )
 from jaxrock._parameters import check_single
-from jaxrock.blocks.rigid import GRAVITY
+from jaxrock.blocks.rigid import GRAVITY, LENGTHS
 from jaxrock.motions.filters import LOWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.record import Record
@@ -41,9 +41,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
-
-
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def _samples(record: Record) -> tuple[np.ndarray, float]:
@@ -98,7 +95,7 @@ def _series(name: str, values: Values, dt: ArrayLike, unit: str) -> tuple[np.nda
     array = np.asarray(checked if isinstance(values, jax.Array) else values, float)
     if array.ndim != 1 or array.size < 4:
         raise ValueError(f"Argument `{name}` must be a list of at least 4 samples, but has shape {array.shape}.")
-    return array * _UNITS[unit], _number("dt", dt, size)
+    return array * LENGTHS[unit], _number("dt", dt, size)
 
 
 @arguments
@@ -106,7 +103,7 @@ def from_displacement(
     displacement: Values,
     dt: ArrayLike,
     *,
-    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    unit: Annotated[str, word_of(*LENGTHS)] = "m",
     corner: Corner = None,
     order: Order = 4,
     name: str = "",
@@ -139,7 +136,7 @@ def from_velocity(
     velocity: Values,
     dt: ArrayLike,
     *,
-    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    unit: Annotated[str, word_of(*LENGTHS)] = "m",
     corner: Corner = None,
     order: Order = 4,
     name: str = "",
@@ -169,7 +166,7 @@ def fused(
     displacement: Values,
     dt: ArrayLike,
     *,
-    unit: Annotated[str, word_of(*_UNITS)] = "m",
+    unit: Annotated[str, word_of(*LENGTHS)] = "m",
     corner: Annotated[float, known(positive)] = 0.5,
     order: Order = 4,
 ) -> Record:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, direction, placed, scalar, shown, size
+from jaxrock._checks import Values, direction, placed, scalar, shown
 from jaxrock._parameters import check_single
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
@@ -25,7 +25,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.motions.components import Components
 from jaxrock.motions.record import with_room
 from jaxrock.responses.current_model import current_model
-from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, stacked
+from jaxrock.studies.suite_scenes import STOOD, TOPPLED, UNDECIDED, of_motion, rising_scales, stacked
 
 
 class AzimuthOutcomes(AbstractTable):
@@ -101,9 +101,7 @@ def azimuth_outcomes(
     angles = np.linspace(0, np.pi, 36, endpoint=False) if azimuth is None else np.asarray(direction("azimuth", azimuth))
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"Argument `azimuth` must be a list of angles, but has shape {angles.shape}.")
-    scales = np.atleast_1d(np.asarray(size("scale", scale), float))
-    if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
-        raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
+    scales = rising_scales(scale)
     first = float(scalar("orientation", direction("orientation", orientation)))
     blocks = _blocks(rock, angles)
     model = current_model(model, blocks, components.first, scales)

@@ -4,6 +4,7 @@ import operator
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
@@ -19,8 +20,6 @@ from jaxrock.motions.pulses.mavroeidis_papageorgiou import MavroeidisPapageorgio
 
 Real = Inexact[Array, "..."]
 AnyBlock = Block | AsymmetricBlock | FlexibleBlock
-
-_LAW = "law"  # the field of blocks that holds the law of restitution
 
 
 def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
@@ -116,7 +115,8 @@ def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real]) -> Abstract
     new = [values[leaf.name] for leaf in numbers]
     changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
     if "amplitude" not in [leaf.name for leaf in numbers]:
-        changed = Scaled(changed, values["amplitude"] / jax.lax.stop_gradient(peak_of(motion)))
+        peak = jax.lax.stop_gradient(peak_of(motion))
+        changed = Scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
     return changed
 
 

@@ -169,8 +169,10 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
 
     def slopes(name, known, range_=0.0):
         value, row, steep = getattr(result, name), rows[_RESULTS.index(name)], steepest(name)
-        relative = row * values / jnp.where(value == 0, 1.0, value)
-        reach = jnp.maximum(jnp.abs(value), range_) / steep
+        relative = row[:independent] * values[:independent] / jnp.where(value == 0, 1.0, value)
+        relative = jnp.append(relative, -relative[names.index("amplitude")])  # also of an infinite strength
+        flat = steep == 0
+        reach = jnp.where(flat, jnp.inf, jnp.maximum(jnp.abs(value), range_) / jnp.where(flat, 1.0, steep))
         row, relative, reach = (jnp.where(known, x, jnp.nan) for x in (row, relative, reach))
         status = SlopeStatus.where(reach < _USELESS, SlopeStatus.useless, SlopeStatus.useful)
         missing = ~successful | ~known & result.overturned

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
-from jaxrock._checks import placed
+from jaxrock._checks import Values, placed, shown, size
 from jaxrock._parameters import one_of_many
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -65,6 +66,28 @@ def as_draws(verdict: np.ndarray, facing: str) -> np.ndarray:
     motions, rows, draws = verdict.shape
     ways = len(FACINGS[facing])
     return verdict.reshape(motions, ways, -1, draws).swapaxes(1, 2).reshape(motions, rows // ways, ways * draws)
+
+
+def rising_scales(scale: Values) -> np.ndarray:
+    """Factors on all motions as an array, of one number, too."""
+    scales = np.atleast_1d(np.asarray(size("scale", scale), float))
+    if scales.ndim > 1 or scales.size == 0 or np.any(np.diff(scales) <= 0):
+        raise ValueError(f"Argument `scale` must be a number, or rise from scale to scale, but is {shown(scale)}.")
+    return scales
+
+
+def capacities(verdict: np.ndarray, levels: ArrayLike) -> np.ndarray:
+    """Between which levels a block first topples, (..., 2); the second axis of the verdicts is that of the levels."""
+    ends, count = np.concatenate([[0.0], np.asarray(levels), [np.inf]]), verdict.shape[1]
+    toppled, stood = verdict == TOPPLED, verdict == STOOD
+    first = np.where(toppled.any(axis=1), toppled.argmax(axis=1), count)
+    safe = np.where(stood.all(axis=1), count, (~stood).argmax(axis=1))
+    return np.stack([ends[safe], ends[first + 1]], axis=-1)
+
+
+def comes_back(verdict: np.ndarray) -> np.ndarray:
+    """Whether it stands at a level above one that topples it, of the same verdicts."""
+    return np.any(np.maximum.accumulate(verdict == TOPPLED, axis=1) & (verdict == STOOD), axis=1)
 
 
 def scenes(
