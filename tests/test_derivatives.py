@@ -351,9 +351,12 @@ def test_slopes_of_forces_in_both_modes():
         found = rk.responses.contact_forces(response, block)
         return jnp.stack([found.least_normal, found.largest_friction])
 
-    forward, reverse = jax.jit(lambda x: (jax.jacfwd(forces)(x), jax.jacrev(forces)(x)))(jnp.array([0.2, 0.4, 0.6]))
+    both = jax.jit(lambda x: (jax.jacfwd(forces)(x), jax.jacrev(forces)(x)))
+    forward, reverse = both(jnp.array([0.2, 0.4, 0.6]))
     assert np.abs(forward).min() > 1e-4
     np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    forward, reverse = both(jnp.array([0.2, 1.5, 0.6]))  # of a block that comes back from beyond its balance
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
 @pytest.mark.slow

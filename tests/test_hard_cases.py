@@ -468,6 +468,29 @@ def test_single_precision():
     np.testing.assert_allclose(response.max_rotation, exact.max_rotation, rtol=1e-5)
 
 
+@pytest.mark.parametrize("samples", [7, 30, 41])
+def test_a_history_as_long_as_its_record_tells_the_verdict(samples):
+    """The last step of such records is longer than what is left of the duration, by a rounding: the free stage was left
+    out, and a block that is thrown down was safe."""
+    record = rk.Record(np.full(MANY, 3.0)[:samples], 0.01)
+    for duration in (0.01 * (samples - 1), float(record.end), np.nextafter(float(record.end), 1.0)):
+        found = rk.simulate(rk.Block(0.2, 2.0), record, rk.Linear(), duration=duration, samples=2, engine=SHORT)
+        assert bool(found.overturned) and float(found.margin) < 0 and found.status == rk.Status.successful
+
+
+@pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_what_comes_to_rest_does_not_fall_through_the_ground(precision):
+    """In single precision the hops that are left out of a history last for 20 ms."""
+    numbers = map(precision, (0.23036395, 3.820548, 0.92390084, 0.24509491, 0.26094967))
+    with jax.enable_x64(precision is np.float64):
+        alpha, p, restitution, amplitude, period = numbers
+        block, pulse = rk.Block(alpha, p, restitution), rk.SinePulse(amplitude, period)
+        response = rk.simulate(block, pulse, duration=precision(0.4), samples=801)
+    assert np.abs(response.rotation).max() <= response.max_rotation * (1 + 1e-5)
+    assert np.abs(response.velocity).max() <= response.max_velocity * (1 + 1e-5)
+
+
 def test_not_finite_is_a_status():
     broken = jax.tree.map(lambda x: x * np.nan, rk.SinePulse(0.5, 1.0))
     engine = rk.Series(order=6, max_steps=3)  # as for elastic impacts: compiled once

@@ -108,6 +108,21 @@ def test_scenes(block, motion, more):
     assert no_result(history, [history.rotation, history.velocity, history.max_rotation, history.margin])
 
 
+def test_a_history_that_is_none_tells_no_numbers_and_has_no_slopes():
+    """At any time, in both modes: a fit that steps out of the ranges goes on."""
+
+    def rotations(x):
+        block = rk.Block(x[0], 2.0, x[1], throw=False)
+        return rk.simulate(block, SINE, **QUICK, duration=1.0, samples=2, throw=False)(jnp.array([0.3, 0.8]))[0]
+
+    of = jax.jit(jax.vmap(lambda x: (rotations(x), jax.jacfwd(rotations)(x), jax.jacrev(rotations)(x))))
+    values, *slopes = of(jnp.array([[0.2, 0.9], [0.2, 1.1], [-0.2, 0.9]]))
+    np.testing.assert_array_equal(np.isnan(values), [[False] * 2, [True] * 2, [True] * 2])
+    for each in slopes:
+        assert (each[0] != 0).any() and (each[1:] == 0).all()
+    assert np.isnan(rotations([-0.2, 0.9])).all()
+
+
 def test_a_duration():
     history = rk.simulate(BLOCK, SINE, **QUICK, duration=-1.0, samples=5, throw=False)
     assert no_result(history, [history.rotation, history.max_rotation])
@@ -126,7 +141,7 @@ def test_a_margin_that_is_no_number_is_never_successful():
 
 
 def margin(x):
-    block = rk.Block(0.2, x[0], x[1], throw=False)
+    block = rk.Block(x[3], x[0], x[1], throw=False)
     return rk.outcome(block, rk.SinePulse(0.3, x[2], throw=False), **QUICK, throw=False).margin
 
 
@@ -134,10 +149,11 @@ margins_and_slopes = jax.jit(jax.vmap(jax.value_and_grad(margin)))
 
 
 def test_lanes():
-    points = np.array([[2.0, 0.9, 1.0], [-2.0, 0.9, 1.0], [2.0, 1.1, 1.0], [2.0, 0.9, 0.0], [2.0, 0.9, 1.1]])
+    points = np.array([[2.0, 0.9, 1.0, 0.2]] * 7)
+    points[1:6] += np.vstack([np.diag([-4.0, 0.2, -1.0, -0.4]), [0, 0, 0, np.nan]])
     found, slopes = jax.device_get(margins_and_slopes(points))
-    np.testing.assert_array_equal(np.isnan(found), [False, True, True, True, False])
-    assert (slopes[1:4] == 0).all() and (slopes[0] != 0).all()
+    np.testing.assert_array_equal(np.isnan(found), [False, *[True] * 5, False])
+    assert (slopes[1:6] == 0).all() and (slopes[0] != 0).all()
     with_throw = rk.outcome(rk.Block(0.2, 2.0, 0.9), SINE, **QUICK).margin
     np.testing.assert_allclose(found[0], with_throw, rtol=1e-13)
 
@@ -155,8 +171,9 @@ def test_an_optimiser_without_bounds():
     tried = []
 
     def of(x):
-        values, slopes = jax.device_get(margins_and_slopes(np.tile(x, (5, 1))))  # as many as above: one program
-        return values[0], slopes[0]
+        points = np.tile([*x, 0.2], (7, 1))  # as many as above: one program
+        values, slopes = jax.device_get(margins_and_slopes(points))
+        return values[0], slopes[0, :3]
 
     def loss(x):
         value, slope = of(x)

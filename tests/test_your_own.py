@@ -150,6 +150,15 @@ def test_whole_numbers_are_numbers(kind):
     assert answer(kind)[2][0] > 0
 
 
+class Tabled(rk.models.AbstractEquation):
+    """An equation of known coefficients."""
+
+    table: rk.models.Coefficients
+
+    def moments(self, block):
+        return self.table
+
+
 class Misnamed(rk.motions.SinePulse):
     """A motion with a parameter of the block's name."""
 
@@ -325,6 +334,19 @@ def test_any_arm_in_both_engines(arm):
     values, slopes = map(np.asarray, jax.vmap(jax.value_and_grad(lambda s: peak(s, QUICK["engine"])))(around))
     assert float(values[1]) == pytest.approx(float(peak(around[1], rk.Diffrax(rtol=1e-10))), rel=1e-7)
     assert float(slopes[1]) == pytest.approx(float(values[2] - values[0]) / 2e-6, rel=1e-6)
+
+
+def test_slopes_where_the_arm_alone_is_no_constant():
+    """A straight restoring moment, and an arm that shrinks: the moment grows with the angle as the ground shakes."""
+
+    def peak(x):
+        shape = rk.models.Terms(constant=1.0, line=x[1])
+        model = rk.models.Coefficients(rk.models.Terms(constant=jnp.asarray(0.2), line=-1.0), shape)
+        return rk.outcome(BLOCK, rk.SinePulse(x[0], 0.9), Tabled(model), engine=QUICK["engine"]).max_rotation
+
+    x, found = jnp.array([0.3, -0.3]), jax.jit(peak)
+    differences = [(found(x + way) - found(x - way)) / 2e-6 for way in 1e-6 * jnp.eye(2)]
+    np.testing.assert_allclose(jax.grad(peak)(x), differences, rtol=1e-6)
 
 
 def test_a_controller_with_arrays():

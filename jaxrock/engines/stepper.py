@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
@@ -107,9 +108,14 @@ class AbstractStepper(eqx.Module):
     def _to_knot(self, state: State) -> Scalar:
         return self.scene.length(state.piece) - state.local
 
+    def _is_over_by(self, stop: Scalar, piece: Int[Array, ""]) -> Flag:
+        """Whether a piece is over before the stop, or then: a duration that is computed may round to either side."""
+        following = where(piece < self.scene.pieces, self.scene.start(piece + 1), jnp.inf)
+        return following <= stop * (1 + 8 * float(jnp.finfo(following.dtype).eps))
+
     def move_on(self, state: State, elapsed: Scalar, full: Flag) -> tuple[Int[Array, ""], Scalar, Flag]:
         """Piece and local time after `elapsed` seconds (`full`: up to the knot or the stop), and whether it is over."""
-        ends = full if self.stop is None else full & (self._to_knot(state) <= self.stop - self.time(state))
+        ends = full if self.stop is None else full & self._is_over_by(self.stop, state.piece)
         piece = state.piece + ends
         if (
             self.scene.following is not None and not self.history

@@ -189,7 +189,9 @@ def simulate_flexible(
     return response if throw else marked_result(response, given)
 
 
-def _given(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> tuple:
+def _given(
+    block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool
+) -> tuple[FlexibleBlock, AbstractMotion, Scalar]:
     """What is followed, and how long."""
     if throw:
         return block, motion, _duration(block, motion, duration, throw)

@@ -124,11 +124,7 @@ class Emitter:
         value = np.asarray(value, dtype)
         if value.size > SMALL**2:
             raise Unsupported("a large array in the program")
-        return (
-            for_each(lambda x: self.constant(x, value.dtype), value)
-            if value.ndim
-            else self.constant(value, value.dtype)
-        )
+        return for_each(lambda x: self.constant(x, value.dtype), value if value.ndim else value[()])
 
     def _place(self, equation, inputs: list, active) -> list:
         """Apply an operation, before the loops that do not change its operands."""

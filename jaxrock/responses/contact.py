@@ -163,8 +163,9 @@ def _ground(scene: Scene, time: Scalar) -> tuple[Scalar, Scalar]:
 
 def _highest(values: Inexact[Array, " points"]) -> Scalar:
     """The largest of a smooth function that is known at equal distances: of parabolas through each three points."""
-    left, middle, right = values[:-2], values[1:-1], values[2:]
-    top = (middle >= left) & (middle >= right) & jnp.isfinite(left + middle + right)
+    known = jnp.isfinite(values[:-2] + values[1:-1] + values[2:])
+    left, middle, right = (jnp.where(known, each, 0.0) for each in (values[:-2], values[1:-1], values[2:]))
+    top = (middle >= left) & (middle >= right) & known  # what is infinite would spoil slopes in reverse mode
     curvature = jnp.where(top & (2 * middle > left + right), 2 * middle - left - right, jnp.inf)
     rise = jnp.where(top, (right - left) ** 2, 0.0) / (8 * curvature)
     return jnp.maximum(jnp.max(values), jnp.max(jnp.where(top, middle + rise, -jnp.inf)))

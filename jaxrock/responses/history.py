@@ -361,4 +361,9 @@ def _at(given) -> tuple[Scalar, Scalar]:
     lies = node.done & (node.opening >= jnp.pi / 2)
     caught = with_derivatives_of((node.opening, node.velocity * stepper.scene.p), (opening, speed))
     opening, speed = (jnp.where(node.done, end, x) for end, x in zip(caught, (opening, speed)))
+    # Hops of rounding height, by which a block comes to rest, are no steps: it lies there. (Not at an impact, whose
+    # time is rounded.)
+    rounding = 64 * float(jnp.finfo(opening.dtype).eps)
+    hops = opening < -rounding * (stepper.scene.alpha + jnp.abs(speed) * (stepper.time(node) + elapsed))
+    opening, speed = jnp.where(hops, 0.0, opening), jnp.where(hops, 0.0, speed)
     return node.side * jnp.where(lies, node.opening, opening), node.side * jnp.where(lies, 0.0, speed)

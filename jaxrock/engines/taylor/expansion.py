@@ -155,7 +155,8 @@ class _Sources(NamedTuple):
     def pulls(self, start: Start, order: int) -> list[Scalar]:
         """Coefficients of how fast the moment grows with the angle."""
         moments, side = start.moments, start.side
-        constant_pull = not moments.trigonometric and start.shaking.vertical is None
+        is_line = not moments.trigonometric and moments.arm_terms.line is None
+        constant_pull = is_line and start.shaking.vertical is None
 
         def of(k):
             restoring, arm = (basis.term(k).derivative for basis in (self.restoring, self.arm))
