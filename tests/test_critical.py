@@ -230,16 +230,17 @@ def test_the_amplitude_of_a_sum_is_its_own_peak():
 
 def test_ends_of_a_sum_of_pulses_are_ends():
     """The verdict changes there, and derivatives are those of differences."""
-    block, asked = rk.Block(0.2, 2.0, 0.9), {"intensity": (4.0, 5.0), "progress": False}
+    block, how = rk.Block(0.2, 2.0, 0.9), {"model": rk.Linear(), "engine": rk.Series(order=8)}
+    asked = how | {"intensity": (4.0, 5.0), "progress": False}
 
     def motion(amplitude):
         return rk.SinePulse(amplitude, 0.6) + rk.SinePulse(0.2, 0.3)
 
     found = rk.critical_amplitudes(block, motion(0.3), **asked)
     peak = rk.intensity.peak_acceleration(motion(0.3))
-    verdicts = [bool(rk.outcome(block, found.lowest * (1 + x) / peak * motion(0.3)).overturned) for x in (-1e-6, 1e-6)]
-    assert verdicts == [False, True]
-    ends = [rk.critical_amplitudes(block, motion(0.3 + x), **asked).lowest for x in (-1e-5, 1e-5)]
+    either = [rk.outcome(block, found.lowest * (1 + x) / peak * motion(0.3), **how).overturned for x in (-1e-6, 1e-6)]
+    assert [bool(x) for x in either] == [False, True]
+    ends = [rk.critical_amplitudes(block, motion(0.3 + x), **asked, derivatives=False).lowest for x in (-1e-5, 1e-5)]
     slope = found.derivative[int(np.argmin(found.value)), found.names.index("first.amplitude")]
     np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-6)
 

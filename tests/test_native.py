@@ -808,7 +808,8 @@ def test_a_record_of_one_sample_beside_a_longer_one(caplog):
     both = record + rk.Record([0.1], 0.02)
     scales = jnp.linspace(0.7, 1.3, 65)
     found, alone = (
-        jax.vmap(lambda s, m=m: rk.outcome(rk.Block(0.15, 2.5), s * m).margin)(scales) for m in (both, record)
+        jax.vmap(lambda s, m=m: rk.outcome(rk.Block(0.15, 2.5), s * m, rk.Linear()).margin)(scales)
+        for m in (both, record)
     )
     np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
     assert "left to XLA" not in caplog.text
