@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -104,6 +105,8 @@ def test_diagnostics(found):
     pairs = [(a > b) + 0.5 * (a == b) for a in chosen[toppled == 1] for b in chosen[toppled == 0]]
     assert found.auc() == pytest.approx(np.mean(pairs), rel=1e-12)
     assert 0.8 < found.auc(held_out=True) <= found.auc() + 0.01
+    nothing = eqx.tree_at(lambda f: f.held_out, found, np.full(COUNT, np.nan))
+    assert np.isnan(nothing.auc(held_out=True)) and nothing.auc() == found.auc()
     curve = found.curve(5)
     assert curve["tests"].sum() == COUNT
     assert np.abs(curve["probability"] - curve["toppled"]).max() < 0.2

@@ -502,6 +502,7 @@ def test_derivatives_where_rates_are_unknown(name):
         ),
         (lambda: rk.hazard.allowed_scale(ROCK, 1.0, CURVE, 1.0), r"`probability` must be in \(0, 1\), but is 1.0"),
         (lambda: rk.hazard.branch_weights([1.0, 1.0], [0.5]), "`prior` and `survival` must be lists of one length"),
+        (lambda: rk.hazard.branch_weights([], []), "`prior` and `survival` must hold at least one branch"),
         (
             lambda: rk.hazard.branch_weights([-1.0, 1.0], [0.5, 0.5]),
             "`prior` must be 0 or more and finite, but is -1.0",

@@ -1,5 +1,7 @@
 """Fits to histories: against free rocking in closed form, certified least squares, and repeated experiments."""
 
+import types
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -110,6 +112,15 @@ def test_errors_that_last_are_told_of():
     wider = found.intervals()[:, 1] - found.intervals()[:, 0]
     independent = found.intervals(robust=False)
     assert np.all(wider > independent[:, 1] - independent[:, 0])
+
+
+@pytest.mark.parametrize("freedom, t", [(1, 12.7062047364), (2, 4.3026527297), (30, 2.0422724563)])
+def test_intervals_are_those_of_student(freedom, t):
+    """Quantiles of his table."""
+    few = types.SimpleNamespace(
+        values=np.ones(1), covariance=np.ones((1, 1)), residuals=np.ones(freedom + 1), correlated=False
+    )
+    np.testing.assert_allclose(rk.inverse.HistoryFit.intervals(few), [[1 - t, 1 + t]], rtol=1e-9)
 
 
 # --------------------------------------------------------------------------------------- least squares alone

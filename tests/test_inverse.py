@@ -14,6 +14,7 @@ from jaxrock.command_line.main import main
 from jaxrock.inverse.observation_files import _COLUMNS
 from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
+from jaxrock.inverse.profile_likelihood import shape_at
 from jaxrock.inverse.scatter import rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import climb
@@ -312,6 +313,45 @@ def test_maxima_at_the_end_of_a_range_are_in_it(dtype, off):
 
 
 WORDS = ["toppled"] * 6 + ["survived"] * 6
+
+
+class _Bowl:
+    """Values and slopes of a normal likelihood with ripples; places are points."""
+
+    def __init__(self, hessian, summit, ripple):
+        self.hessian, self.summit, self.ripple = hessian, summit, ripple
+        self.ends = np.repeat([[-1.0], [1.0]], len(summit), axis=1)
+        self.waves = 90 * np.arange(1, 1 + len(summit))
+
+    def places(self, points):
+        return points
+
+    def at(self, places):
+        away = places - self.summit
+        pull, phase = away @ self.hessian, away @ self.waves
+        return (
+            -np.sum(pull * away, axis=1) / 2 + self.ripple * np.cos(phase),
+            -pull - self.ripple * np.sin(phase)[:, None] * self.waves,
+        )
+
+
+@pytest.mark.parametrize("summit", [(0.0,), (0.3, -0.2), (1.0, 0.97), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)])
+def test_steps_of_a_likelihood_do_not_change_its_shape(summit):
+    """Ripples of 0.02, that bend it by up to 30 times as much, at the end of a range, too."""
+    axes = np.linalg.qr(np.random.default_rng(4).normal(size=(len(summit),) * 2))[0]
+    exact = axes @ np.diag(np.geomspace(0.05, 0.2, len(summit)) ** 2) @ axes.T
+    shape = shape_at(_Bowl(np.linalg.inv(exact), np.array(summit), 0.02), np.array(summit))
+    tight = np.linalg.cholesky(exact)
+    np.testing.assert_allclose(
+        np.linalg.solve(tight, np.linalg.solve(tight, shape.covariance).T), np.eye(len(summit)), atol=0.15
+    )
+
+
+def test_a_flat_likelihood_with_steps_has_no_covariance():
+    shape = shape_at(_Bowl(np.diag([100.0, 0.0]), np.array([0.3, 0.1]), 0.002), np.array([0.3, 0.1]))
+    assert np.isinf(shape.covariance).all()
+    np.testing.assert_allclose(shape.deviations[1], 0.05, rtol=0.1)
+    np.testing.assert_allclose(np.abs(shape.directions[0]), [0, 1], atol=0.02)
 
 
 def test_regions_agree_with_verdicts():

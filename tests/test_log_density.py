@@ -47,6 +47,11 @@ def test_the_objective_is_that_of_the_likelihood(names, density):
     np.testing.assert_allclose(found, terms.sum(axis=-1) + prior, rtol=1e-12)
 
 
+def test_no_points_have_no_densities(density):
+    for points in (np.zeros((0, 2)), np.zeros((3, 0, 2))):
+        assert density(points).shape == density.objective(points).shape == points.shape[:-1]
+
+
 def test_points_and_values_are_each_others_inverse(density):
     points = density.starts(8)
     values = jax.device_get(density.values(points))

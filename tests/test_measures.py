@@ -80,7 +80,8 @@ def outcomes(cause):
     """Verdicts that a function of a motion's (PGA, PGV) alone decides, with scatter."""
     suite = rk.motions.Suite(MOTIONS)
     strength = np.log(cause(np.asarray(suite.peak_acceleration), np.asarray(suite.peak_velocity)))
-    fell = strength + 0.2 * RANDOM.normal(size=COUNT) > np.median(strength)
+    scatter = np.random.default_rng(12).normal(size=COUNT)  # the same, whatever tests ran before
+    fell = strength + 0.2 * scatter > np.median(strength)
     verdict = fell.astype(np.int8)[:, None, None, None]
     blank = np.zeros(verdict.shape)
     return rk.hazard.SuiteOutcomes(
@@ -167,6 +168,31 @@ def test_what_parts_outcomes_well_is_not_flagged():
         assert found.status == getattr(rk.hazard.FitStatus, status)
         assert float(found.p_values[0]) < 1e-6 and found.useless == ()
     assert fit((order < 60) ^ (order == 90)).useless == ("x",)
+
+
+RISING = np.geomspace(0.1, 1.0, COUNT)
+
+
+@pytest.mark.parametrize(
+    "level, fell, clusters, p_value",
+    [
+        (RISING, np.arange(COUNT) < 60, np.arange(COUNT), 0),  # parted, the wrong way
+        (RISING, np.ones(COUNT), np.arange(COUNT), 1),
+        (np.full(COUNT, 0.3), np.arange(COUNT) < 60, np.arange(COUNT), 1),
+        (np.tile([0.5, 0.65], 60), np.arange(COUNT) < 60, np.arange(COUNT) // 2, 1),  # each did the same at both
+    ],
+    ids=["falls", "all alike", "constant", "clusters cancel"],
+)
+def test_what_says_nothing_is_flagged_where_there_is_no_slope(level, fell, clusters, p_value):
+    fit = rk.hazard.fit_probit({"x": level}, fell, clusters=clusters)
+    assert fit.useless == ("x",)
+    assert float(fit.p_values[0]) == pytest.approx(p_value, abs=1e-6)
+
+
+def test_what_others_part_already_needs_no_more_measures():
+    rows = 1.0 + np.arange(200)
+    fit = rk.hazard.fit_probit({"x": rows, "more": 1 + rows % 3}, rows > 60)
+    assert fit.useless == ("more",) and float(fit.p_values[1]) == 1
 
 
 @pytest.mark.slow

@@ -208,9 +208,23 @@ MANY = N // 4  # the program of the fits above
         ({"PGA": MANY * [0.1, 0.2, 0.3, 0.4]}, MANY * [0, 0, 1, 1], rk.hazard.FitStatus.separable),
         ({"PGA": MANY * [0.1, 0.2, 0.3, 0.4]}, MANY * [1, 1, 1, 1], rk.hazard.FitStatus.separable),
         ({"PGA": MANY * [0.2, 0.2, 0.2, 0.2]}, MANY * [0, 1, 0, 1], rk.hazard.FitStatus.not_converged),
+        ({"PGA": MANY * [0.1, 0.2, 0.2, 0.4]}, MANY * [0, 0, 1, 1], rk.hazard.FitStatus.separable),
+        ({"PGA": MANY * [0.1, 0.2, 0.2, 0.4]}, MANY * [0.0, 0.0, 0.4, 1.0], rk.hazard.FitStatus.separable),
+        (
+            {"PGA": MANY * [0.1, 0.2, 0.2, 0.4], "ratio": MANY * [0.4, 0.2, 0.2, 0.2]},
+            MANY * [0, 0, 1, 1],
+            rk.hazard.FitStatus.separable,
+        ),
+        (
+            {"PGA": MANY * [0.1, 0.2, 0.2, 0.4], "ratio": MANY * [0.1, 0.2, 0.2, 0.4]},
+            [*MANY * [0, 0, 1, 1]][:-1] + [0],
+            rk.hazard.FitStatus.not_converged,
+        ),
     ],
+    ids=["parted", "all alike", "constant", "one level of both", "with counts", "a plane", "the same twice"],
 )
 def test_fits_that_fail_say_so(measures, fell, status):
+    """Of outcomes that are parted but for some on the border between, too: the likelihood of these has no maximum."""
     fit = rk.hazard.fit_probit(measures, fell)
     assert fit.status == status
     assert np.isnan(fit.slopes).all() and np.isnan(fit.covariance).all()

@@ -371,8 +371,12 @@ def test_fit_of_a_surface():
     np.testing.assert_allclose(np.asarray(contour)[1], 0.15 * 0.1**-0.6)
     one = rk.hazard.fit_surface(acceleration, np.full(4000, 0.1), toppled)
     assert one.status == rk.hazard.FitStatus.not_converged
-    safe = rk.hazard.fit_surface(acceleration, ratio, np.zeros(4000))
-    assert safe.status != rk.hazard.FitStatus.successful and np.isnan(safe.fragility.median)
+    each = rk.hazard.fit_surface(acceleration, ratio, toppled, clusters=np.arange(4000))  # a sandwich, of many
+    wider = np.diag(each.covariance) / np.diag(found.covariance)
+    assert np.all(wider != 1) and np.all(np.abs(wider - 1) < 0.1)
+    for parted in (np.zeros(4000), acceleration * ratio > 0.1):
+        failed = rk.hazard.fit_surface(acceleration, ratio, parted)
+        assert failed.status == rk.hazard.FitStatus.separable and np.isnan(failed.fragility.median)
 
 
 def test_fit_of_a_simulated_surface():

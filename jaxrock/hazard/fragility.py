@@ -180,9 +180,9 @@ class FitStatus(Enumeration):
 
     successful = item("The likelihood has one maximum, and it was found.")
     separable = item(
-        "No shaking that a rock survived was stronger than one that toppled it (or the reverse, or all ended alike): "
-        "the likelihood only grows as the dispersion shrinks or the median leaves the data. Outcomes that overlap "
-        "are needed; these only tell between which levels the median lies."
+        "No shaking that a rock survived was stronger than one that toppled it (or the reverse, or all ended alike), "
+        "by one measure or some sum of several: the likelihood only grows as the dispersion shrinks or the median "
+        "leaves the data. Outcomes that overlap are needed; these only tell between which levels the median lies."
     )
     not_growing = item(
         "Stronger shakings did not topple more often: no lognormal fragility describes that. Tabulate it."
@@ -206,7 +206,7 @@ class FragilityFit(AbstractTable):
     - `status`: a `FitStatus`.
     - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test
       with the observed information): above 0.05 this measure of intensity is useless here. It holds of separable
-      outcomes, too.
+      outcomes, too; 1 where all ended alike.
     """
 
     fragility: LogNormalFragility
@@ -345,7 +345,8 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
 
     Rao's score test, with the observed information: at the line without it, whose slope is zero. (A test of the slope
     in its standard errors finds less the better outcomes are parted.) Of clusters by their labels, of which there are
-    `count`, by the scatter of their scores.
+    `count`, by the scatter of their scores. 1 where nothing could tell a slope: an abscissa is constant, all ended
+    alike or are parted by the others, or the scores of each cluster cancel.
     """
 
     def test(tested, others):
@@ -353,8 +354,8 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
         if len(others):
             line = probit_line(others, toppled, survived)[0]
         else:
-            line = jax.scipy.special.ndtri(jnp.sum(toppled) / jnp.sum(toppled + survived))[None]
-        _, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
+            line = jax.scipy.special.ndtri(jnp.where(mixed, jnp.sum(toppled) / jnp.sum(toppled + survived), 0.5))[None]
+        likelihood, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
         information = rows @ (-curvature[:, None] * rows.T)
         combination = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
         scores = (combination @ rows) * by_z
@@ -362,8 +363,12 @@ def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
             scatter = combination @ information @ combination
         else:
             scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
-        return jax.lax.erfc(jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * scatter))
+        rounding = 8 * jnp.finfo(scores.dtype).eps * jnp.sum(jnp.abs(scores))
+        nothing = ~mixed | (likelihood >= -1e-6) | (jnp.ptp(tested) <= 1e-9) | (scatter <= rounding**2)
+        ratio = jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * jnp.where(nothing, 1.0, scatter))
+        return jnp.where(nothing, 1.0, jax.lax.erfc(ratio))
 
+    mixed = (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
     if len(abscissas) == 1:
         return test(abscissas[0], abscissas[:0])[None]
     rests = np.array([np.delete(np.arange(len(abscissas)), index) for index in range(len(abscissas))])

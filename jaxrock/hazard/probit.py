@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, not_negative, positive, shown
+from jaxrock._checks import Values, is_traced, not_negative, positive, shown
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line, slope_tests
 
@@ -27,7 +27,8 @@ class ProbitFit(AbstractTable):
     - `log_likelihood`: at the maximum, without the binomial coefficients.
     - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
       a slope (Rao's score test with the observed information, of clusters where there are any); they hold of separable
-      outcomes, too.
+      outcomes, too. 1 where nothing could tell a slope: a measure is constant, all ended alike, or others part them.
+    - `falls`: (measures,) whether the mean logarithm of a measure is less where rocks toppled than where they stood.
     - `status`: a `FitStatus`; of one measure that topples less the stronger it is, successful with a slope below 0.
     """
 
@@ -37,6 +38,7 @@ class ProbitFit(AbstractTable):
     covariance: Float[Array, "terms terms"]
     log_likelihood: Float[Array, ""]
     p_values: Float[Array, " measures"]
+    falls: Bool[Array, " measures"]
     status: FitStatus
 
     @property
@@ -58,11 +60,11 @@ class ProbitFit(AbstractTable):
 
     @property
     def useless(self) -> tuple[str, ...]:
-        """Names of measures whose slope cannot be told from 0 (`p_values` above 0.05), or falls where there is one
-        measure only: what they say of toppling may be chance."""
-        untold = self.p_values > 0.05
+        """Names of measures whose slope cannot be told from 0 (`p_values` above 0.05, or NaN where another says the
+        same or nothing), or is below 0 where there is one measure only: what they say of toppling may be chance."""
+        untold = ~(self.p_values <= 0.05)
         if len(self.names) == 1:
-            untold |= self.slopes < 0
+            untold |= self.falls
         return tuple(name for name, bad in zip(self.names, np.asarray(untold)) if bad)
 
     def __call__(self, **measures: Values) -> Float[Array, "..."]:
@@ -133,8 +135,37 @@ def fit_probit(
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
     logarithms = jnp.log(jnp.stack(lists).astype(jnp.result_type(float)))  # whose sums over outcomes are long
     count = 0 if errors == "information" else int(labels.max()) + 1
-    numbers = _fit(logarithms, toppled, trials - toppled, jnp.asarray(labels), count, errors)
-    return ProbitFit(tuple(measures), *numbers)
+    survived = trials - toppled
+    numbers = _fit(logarithms, toppled, survived, jnp.asarray(labels), count, errors)
+    return or_separable(ProbitFit(tuple(measures), *numbers), logarithms, toppled, survived)
+
+
+def or_separable(fit, logarithms, toppled, survived):
+    """A fit, which says so if it failed because a plane parts outcomes, but for those in it: then no line is the best.
+
+    Such a plane is looked for by a linear program: all outcomes on their side of it or in it, as far away as can be.
+
+    **Source:** Albert & Anderson (1984), when no maximum exists; Konis (2007), the program.
+    """
+    if is_traced(toppled) or bool(fit.status == FitStatus.successful):
+        return fit
+    from scipy.optimize import linprog  # it takes half a second
+
+    rows = np.asarray(logarithms, float)
+    rows = rows - rows.mean(axis=1, keepdims=True)
+    rows = np.concatenate([np.ones_like(rows[:1]), rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), 1e-9)])
+    sides = np.concatenate([rows[:, np.asarray(toppled) > 0], -rows[:, np.asarray(survived) > 0]], axis=1)
+    plane = linprog(-np.sum(sides, axis=1), A_ub=-sides.T, b_ub=np.zeros(sides.shape[1]), bounds=(-1, 1))
+    parted = plane.success and np.max(plane.x @ sides, initial=0.0) > 1e-5  # less is within the program's tolerance
+    return eqx.tree_at(lambda f: f.status, fit, FitStatus.separable) if parted else fit
+
+
+def inverse_information(rows, curvature, trials):
+    """The covariance of a line by the observed information, and if that is known: it is not where this information is
+    next to none of what outcomes of even odds would be, as it is along a plane that parts them."""
+    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
+    even = jnp.trace(covariance @ (rows @ (trials[:, None] * rows.T)))
+    return covariance, (even > 0) & (even < jnp.finfo(rows.dtype).eps ** -0.75)
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
@@ -146,7 +177,7 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     line, converged = probit_line(abscissas, toppled, survived)
     rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
     likelihood, by_z, curvature = probit(line @ rows, toppled, survived)
-    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
+    covariance, told = inverse_information(rows, curvature, toppled + survived)
     if errors == "clusters":
         scores = jnp.zeros((count, len(rows))).at[labels].add((rows * by_z).T)
         covariance = covariance @ (scores.T @ scores * count / (count - 1)) @ covariance
@@ -163,9 +194,10 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     back = jnp.diag(jnp.concatenate([jnp.ones(1), 1 / size])).at[0, 1:].set(-centre / size)
     # Where outcomes can be parted, probabilities come to 0 or 1 and the line goes on for ever.
     converged &= known & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
-    converged &= likelihood < -1e-6
+    converged &= told & (likelihood < -1e-6)
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
     numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood
     tests = slope_tests(abscissas, toppled, survived, None if errors == "information" else labels, count)
-    return *(jnp.where(converged, x, jnp.nan) for x in numbers), tests, status
+    means = [jnp.sum(abscissas * n, axis=1) / jnp.sum(n) for n in (toppled, survived)]
+    return *(jnp.where(converged, x, jnp.nan) for x in numbers), tests, means[0] < means[1], status

@@ -43,6 +43,7 @@ from jaxrock.hazard.fragility import (
     probit_line,
     rising_list,
 )
+from jaxrock.hazard.probit import inverse_information, or_separable
 from jaxrock.hazard.simulation import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -94,7 +95,8 @@ class SurfaceFit(eqx.Module):
     """What `fit_surface` finds; where `status` is not `FitStatus.successful`, the numbers of the fit are NaN.
 
     - `fragility`: the `SurfaceFragility` of largest likelihood.
-    - `covariance`: (3, 3) of (ln median, exponent, ln dispersion); of outcomes in clusters, a sandwich.
+    - `covariance`: (3, 3) of (ln median, exponent, ln dispersion): the inverse of the observed information; where
+      clusters are told, a sandwich of theirs.
     - `status`: a `FitStatus`.
     """
 
@@ -143,8 +145,10 @@ def fit_surface(
     count = int(labels.max()) + 1
     if count < 2:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    fit, scores = _fit(acceleration, ratio, toppled, trials - toppled)
-    if count == acceleration.size:
+    survived = trials - toppled
+    fit, scores = _fit(acceleration, ratio, toppled, survived)
+    fit = or_separable(fit, jnp.log(jnp.stack([acceleration, ratio])), toppled, survived)
+    if clusters is None:
         return fit
     summed = jnp.zeros((count, 3)).at[labels].add(scores)
     middle = summed.T @ summed * count / (count - 1)
@@ -169,8 +173,8 @@ def _fit(acceleration, ratio, toppled, survived):
     logarithm = -(line[0] - slopes @ centre[:, 0]) * dispersion
     _, by_z, curvature = probit(z, toppled, survived)
     rows = jnp.stack([jnp.full_like(z, -1 / dispersion), -measures[1] / dispersion, -z])
-    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
-    converged &= known & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
+    covariance, told = inverse_information(rows, curvature, toppled + survived)
+    converged &= known & told & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
     status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)
     status = FitStatus.where(converged, status, FitStatus.not_converged)
     numbers = jnp.exp(logarithm), exponent, dispersion, covariance

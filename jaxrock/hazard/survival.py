@@ -98,6 +98,8 @@ def branch_weights(prior: Values, survival: Values) -> Inexact[Array, " branches
     if prior.ndim != 1 or prior.shape != survival.shape:
         both = f"{prior.shape} and {survival.shape}"
         raise ValueError(f"Arguments `prior` and `survival` must be lists of one length, but have shapes {both}.")
+    if prior.size == 0:
+        raise ValueError("Arguments `prior` and `survival` must hold at least one branch, but are empty.")
     weights = prior * survival
     total = jnp.sum(weights)
     return weights / checked("survival", total, "be above 0 for a branch that has weight", lambda x: x > 0)

@@ -94,9 +94,9 @@ class BlockCalibration(AbstractTable):
         return _density(self.problem, {name: as_real(name, values[name]) for name in self.problem.unknowns})
 
     def auc(self, held_out: bool = False) -> float:
-        """Share of pairs of a test that toppled and one that stood of which the first has the higher probability."""
-        chosen = np.asarray(self.held_out if held_out else self.probability)
-        fell, stood = chosen[np.asarray(self.toppled) == 1], chosen[np.asarray(self.toppled) == 0]
+        """Share of pairs of a test that toppled and one that stood in which the first is more probable, NaN of none."""
+        chosen, toppled = np.asarray(self.held_out if held_out else self.probability), np.asarray(self.toppled)
+        fell, stood = (chosen[(toppled == way) & np.isfinite(chosen)] for way in (1, 0))
         if not fell.size or not stood.size:
             return float("nan")
         places = np.searchsorted(np.sort(stood), fell, side="left"), np.searchsorted(np.sort(stood), fell, side="right")

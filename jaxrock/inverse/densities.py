@@ -96,6 +96,8 @@ def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) 
         raise ValueError(
             f"Argument `point` must end with an axis of {len(problem.names)}, but has shape {point.shape}."
         )
+    if point.size == 0:
+        return jnp.zeros(point.shape[:-1], point.dtype)
     nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
     point = jnp.where(nowhere[..., None], 0.0, point)
     value = problem.log_density(density.place(point)) + jnp.where(by_point, density.log_volume(point), 0.0)

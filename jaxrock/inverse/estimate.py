@@ -74,7 +74,10 @@ class Estimate(AbstractTable):
       maxima that are as good lie within.
     - `open`: (parameters, 2) whether an end is only the end of the range.
     - `covariance`: (parameters, parameters) of logarithms of the parameters (of a parameter itself that is not searched
-      in its logarithm): the inverse of minus the Hessian at the maximum; infinite where that is singular.
+      in its logarithm): the inverse of the bend of a parabola through values of the log-likelihood around its
+      maximum, as far away as it falls by about 1/2 (it has steps, so that slopes do not tell); infinite if it is flat
+      in a direction, falling by less than 0.02 within half a range. Of summits side by side it is that of the highest;
+      intervals are of all.
     - `directions`, `deviations`: (parameters, parameters) rows of unit vectors in ranges of the parameters, and
       (parameters,) the standard deviation along each, in ranges; those of half a range and more are not determined.
     - `log_likelihood`: at the maximum, with the priors.

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -97,14 +96,14 @@ class HistoryFit(AbstractTable):
 
         **Raises:** ValueError for a confidence outside its range.
 
-        **Source:** Student's t by Abramowitz & Stegun (1964), 26.7.5.
+        **Source:** Student (1908), t.
         """
+        from scipy.special import stdtrit
+
         confidence = float(scalar("confidence", inner_share("confidence", confidence)))
         robust = self.correlated if robust is None else robust
         covariance = self.robust_covariance if robust else self.covariance
-        z = float(jax.scipy.special.ndtri((1 + confidence) / 2))
-        freedom = self.residuals.size - self.values.size
-        t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)  # A&S 26.7.5
+        t = stdtrit(self.residuals.size - self.values.size, (1 + confidence) / 2)
         half = t * np.sqrt(np.diag(covariance))
         return np.stack([self.values - half, self.values + half], axis=1)
 

@@ -9,6 +9,9 @@ from jaxrock.numerics.climb import Summits, climb
 
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _ROOT = np.sqrt(2 * _RATIO)
+_PARABOLAS, _SETTLED = 4, 0.3  # fits of a parabola at most; change of the lengths of its axes that calls for none more
+_TELLING = 0.16  # bend over a range, squared, with which it falls by 0.02 over half of it: less may be steps
+_NOTHING = 50.0  # a fall after which the likelihood is none
 _AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
 
@@ -22,26 +25,71 @@ class Shape(NamedTuple):
 
 
 def shape_at(evaluate: Evaluator, point: np.ndarray) -> Shape:
-    """The Hessian by differences of slopes over a third of a standard deviation: on a finer scale there are steps."""
+    """The bend of a parabola through values about a standard deviation away, where the likelihood has fallen by 1/2.
+
+    Slopes do not tell it: on a finer scale the likelihood has steps, between which it bends otherwise. Each parabola
+    says how far along its axes the next one looks, beside all values so far.
+    """
     place = evaluate.places(point)
-    low, high = evaluate.ends
-    size, count = high - low, place.size
-    step = np.full(count, 0.02)  # of the range
-    for _ in range(2):
-        moves = np.concatenate([np.diag(step), -np.diag(step)]) * size
-        at = np.clip(place + moves, low, high)
-        slopes = evaluate.at(at)[1] * size
-        distance = np.diagonal(at[:count] - at[count:]) / size
-        hessian = (slopes[:count] - slopes[count:]) / np.maximum(distance, 1e-12)[:, None]
-        hessian = -(hessian + hessian.T) / 2
-        spread = 1 / np.sqrt(np.maximum(np.diagonal(hessian), 1e-6))
-        step = np.clip(spread / 3, 1e-4, 0.05)
-    eigenvalues, vectors = np.linalg.eigh(hessian)
-    deviations = 1 / np.sqrt(np.maximum(eigenvalues, 1e-6))
-    covariance = np.full_like(hessian, np.inf)
-    if eigenvalues[0] > 1e-6 * max(eigenvalues[-1], 1.0):
+    size, count = np.ptp(evaluate.ends, axis=0), place.size
+    top = evaluate.at(place[None])[0]
+    axes, (first, second) = _alone(evaluate, place, top), np.triu_indices(count, 1)  # rows, in ranges
+    offsets, falls = np.zeros((1, count)), np.zeros(1)
+    for _ in range(_PARABOLAS):
+        steps = np.concatenate([axes, (axes[first] + axes[second]) / np.sqrt(2)])
+        more = _around(evaluate, place, steps)
+        offsets = np.concatenate([offsets, (more - place) / size])
+        falls = np.concatenate([falls, top - evaluate.at(more)[0]])
+        back = np.linalg.inv(axes)
+        slope, bend = _parabola(offsets @ back, falls)
+        bends, vectors = np.linalg.eigh(bend)
+        axes, slopes = vectors.T @ axes, np.abs(vectors.T @ slope)
+        # How far a fall of 1/2 is: the root of slope length + bend length^2/2 = 1/2.
+        length = 1 / np.maximum(slopes + np.sqrt(np.maximum(slopes**2 + bends, 0.0)), 0.25)
+        length = np.minimum(length, 0.5 / np.max(np.abs(axes), axis=1))
+        axes *= length[:, None]
+        if np.all(np.abs(length - 1) < _SETTLED):
+            break
+    hessian = back @ bend @ back.T
+    eigenvalues, directions = np.linalg.eigh(hessian)
+    covariance = np.full_like(bend, np.inf)
+    if eigenvalues[0] > _TELLING:
         covariance = np.linalg.inv(hessian) * np.outer(size, size)
-    return Shape(place, covariance, vectors.T, deviations)
+    return Shape(place, covariance, directions.T, 1 / np.sqrt(np.maximum(eigenvalues, 1e-6)))
+
+
+def _alone(evaluate: Evaluator, place: np.ndarray, top: np.ndarray) -> np.ndarray:
+    """A step along each parameter alone, in ranges, with which the likelihood falls by about 1/2."""
+    length = np.full(place.size, 0.02)
+    for _ in range(4):
+        falls = top - evaluate.at(_around(evaluate, place, np.diag(length)))[0]
+        fall = np.nan_to_num(np.maximum(*np.split(falls[1:], 2)), nan=np.inf)
+        if np.all((fall > 0.1) & (fall < 2.0) | (length == 0.5)):
+            break
+        length = np.minimum(length * np.clip(np.sqrt(0.5 / np.maximum(fall, 1e-9)), 0.05, 4.0), 0.5)
+    return np.diag(length)
+
+
+def _around(evaluate: Evaluator, place: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """A place and those at steps, in ranges, to both sides of it; of a place at an end, of one so far within."""
+    low, high = evaluate.ends
+    reach = np.minimum(np.max(np.abs(steps), axis=0), 0.5) * (high - low)
+    moves = np.concatenate([np.zeros((1, place.size)), steps, -steps]) * (high - low)
+    return np.clip(np.clip(place, low + reach, high - reach) + moves, low, high)
+
+
+def _parabola(offsets: np.ndarray, falls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slope and bend at 0 of the parabola nearest to falls, of which each has the weight of its likelihood."""
+    count = offsets.shape[1]
+    row, column = np.triu_indices(count)
+    falls = np.minimum(np.nan_to_num(falls, nan=np.inf), _NOTHING)
+    weight = np.exp(-np.maximum(falls, 0.0) / 2)[:, None]
+    squares = offsets[:, row] * offsets[:, column] * np.where(row == column, 0.5, 1.0)
+    terms = np.concatenate([np.ones_like(weight), offsets, squares], axis=1)
+    found = np.linalg.lstsq(terms * weight, falls * weight[:, 0], rcond=None)[0]
+    bend = np.zeros((count, count))
+    bend[row, column] = bend[column, row] = found[1 + count :]
+    return found[1 : 1 + count], bend
 
 
 class Profile(NamedTuple):
