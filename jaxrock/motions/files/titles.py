@@ -225,7 +225,7 @@ def _is_of_a_value(words: str) -> bool:
     """Whether a unit is that of a value behind it, and says nothing of the columns."""
     found = _VALUED.match(words)
     # Without a sign between them a number beside a unit of acceleration may be a factor.
-    return bool(found) and (is_any_unit if found[2] else _seconds)(_inner(found[1]))
+    return found is not None and (is_any_unit if found[2] else _seconds)(_inner(found[1]))
 
 
 def _is_plain(titles: list[Title]) -> bool:
