@@ -508,7 +508,8 @@ def test_a_part_of_g_is_not_g(file, unit):
 
 VALUES = [
     "PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal", "Peak acceleration in m/s2: 0.311",
-    "Peak acceleration in cm/s2 is 300", "Total time in minutes: 1.5", "Total time in minutes 1.5",
+    "Peak acceleration in cm/s2 is 300", "Peak acceleration in m/s2 (NS): 0.3", "Peak acc in (m/s2) at 3.2 s: 0.3",
+    "Total time in minutes: 1.5", "Total time in minutes 1.5",
 ]  # fmt: skip
 
 
