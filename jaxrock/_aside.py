@@ -59,7 +59,7 @@ def _remove(aside: Path) -> None:
 def _reach_the_disk(file: Path) -> None:
     if file.is_dir() and os.name == "nt":  # which opens no folders
         return
-    handle = os.open(file, os.O_RDONLY)
+    handle = os.open(file, os.O_RDWR if os.name == "nt" else os.O_RDONLY)  # Windows flushes only what it may write
     try:
         os.fsync(handle)
     finally:

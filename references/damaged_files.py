@@ -117,7 +117,7 @@ def _knet() -> str:
     head = {
         "Origin Time": "2011/03/11 14:46:00", "Mag.": "9.0", "Station Code": "MYG004",
         "Record Time": "2011/03/11 14:46:36", "Sampling Freq(Hz)": "100Hz", "Duration Time(s)": "0.24", "Dir.": "N-S",
-        "Scale Factor": "3920(gal)/6182761", "Max. Acc. (gal)": f"{peak:.6f}", "Memo.": "",
+        "Scale Factor": "3920(gal)/6182761", "Max. Acc. (gal)": f"{peak:.3f}", "Memo.": "",
     }  # fmt: skip
     return "".join(f"{key:<18}{value}\n" for key, value in head.items()) + _lines(counts, " %8d", 8)
 

@@ -176,6 +176,21 @@ def test_walls_of_the_pulse_in_220_digits(i):
             assert above < 1 < below
 
 
+@pytest.mark.parametrize(("duration", "shape"), [(2.0, 18.0), (2.0, 40.0), (2.0, 100.0), (60.0, 200.0)])
+@pytest.mark.parametrize(("name", "time"), [("rising_wall", 0.5), ("falling_wall", 1.0)])
+def test_walls_of_spikes(name, time, duration, shape):
+    """Where e^-shape is lost beside 1: in double, and in single precision."""
+    function = getattr(single_lobe, name)
+    found, slope = map(float, jax.value_and_grad(function, 1)(duration, shape))
+    in_single = function(np.float32(duration), np.float32(shape))
+    assert in_single.dtype == np.float32
+    with mp.workdps(400):
+        below, above = (printed("rotation", found * (1 + s), duration, shape, time) for s in (-1e-11, 1e-11))
+        assert above < 1 < below
+    assert float(in_single) == pytest.approx(found, rel=1e-5)
+    assert slope < 0
+
+
 # A minute is compiled for both. The time of the peak has the derivatives that its rotation is made of.
 PEAKS = ["peak_time", pytest.param("peak_rotation", marks=pytest.mark.slow)]
 

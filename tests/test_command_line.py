@@ -12,14 +12,18 @@ import sys
 import types
 from pathlib import Path
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.command_line import output
+from jaxrock.command_line import invert, output
+from jaxrock.command_line.fragility import _write
 from jaxrock.command_line.main import main
-from jaxrock.command_line.options import add_pulse, extent_of, pulse_of
+from jaxrock.command_line.options import add_pulse, extent_of, files_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.motions.pulses import PULSES
@@ -244,10 +248,47 @@ def test_fragility(command, column, tmp_path):
         (status == 0) == (fit.status == rk.hazard.FitStatus.successful) == (tmp_path / "out" / "fragility.xml").exists()
     )
     assert status == 0 and f"{float(fit.fragility.median):.4f}" in table["median PGA"]
+    assert table["pairs of motion and block that stand again at a higher level"] == str(int((~found.monotone).sum()))
     assert " to ".join(f"{end:.3f}" for end in found.intervals().dispersion) == table["95 % interval of the dispersion"]
     words[words.index("6")] = "0.21"  # none topples: no fit, and none of the run before in its place
     assert command("fragility", column, other, *words)[0] == 1
     assert not (tmp_path / "out" / "fragility.xml").exists()
+
+
+def test_patterns_that_no_shell_has_expanded(tmp_path):
+    names = [str(tmp_path / name) for name in ("a.AT2", "b.AT2", "[c].AT2")]
+    for name in names:
+        Path(name).touch()
+    assert files_of([str(tmp_path / "?.AT2")]) == names[:2]
+    assert files_of([names[2], "missing.AT2", "*.none"]) == [names[2], "missing.AT2", "*.none"]
+
+
+def test_spectral_velocities_are_not_written_for_openquake(tmp_path, monkeypatch, capsys):
+    """Which knows none: the command says so, and has all other files."""
+    monkeypatch.setattr(rk.plot, "fragility", lambda *_: types.SimpleNamespace(figure=plt.figure()))
+    found = rk.hazard.SimulatedFragility(
+        jnp.array([0.1, 0.2]), np.zeros((1, 2, 1), np.int8), *jnp.ones((2, 1)), ("a",), "SV(0.5)", np.ones(1)
+    )
+    report = output.Report("fragility")
+    _write(report, argparse.Namespace(out=tmp_path), found, rk.hazard.LogNormalFragility(0.3, 0.4))
+    assert "no fragility.xml: OpenQuake knows no SV(0.5)" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"fragility.csv", "stripes.csv", "fragility.png"}
+
+
+def test_no_unexceeded_motion_of_an_earlier_run(tmp_path, monkeypatch):
+    """Where all rocks toppled there is none."""
+    monkeypatch.setattr(rk.plot, "feasible_region", lambda *_: types.SimpleNamespace(figure=plt.figure()))
+    one = np.ones(1)
+    observations = types.SimpleNamespace(
+        blocks=types.SimpleNamespace(alpha=one, p=one), other=None, names=("Mój",), seen=np.ones(1, int)
+    )
+    estimate = types.SimpleNamespace(
+        names=("amplitude",), values=one, interval=[[0, 2]], open=[[False, False]], probability=one
+    )
+    region = types.SimpleNamespace(values=(one, one), names=("amplitude", "period"), log_likelihood=one, allowed=one)
+    (tmp_path / "unexceeded.csv").write_text("of an earlier run")
+    files = invert._write(tmp_path, observations, estimate, region, None)
+    assert sorted(files) == sorted(tmp_path.iterdir())
 
 
 def test_spectrum(command, column, tmp_path):
@@ -267,6 +308,26 @@ def test_spectrum(command, column, tmp_path):
         expected = [result.max_rotation / alpha, result.max_velocity / (p * alpha), result.margin]
         np.testing.assert_allclose([rotation, velocity, margin], expected, rtol=1e-7)
     assert is_figure(tmp_path / "out" / "spectrum.png")
+
+
+def test_scenes_without_a_result_are_no_results(command, column, tmp_path, monkeypatch):
+    """Neither counted as overturned nor written; what became of them is said."""
+    computed = rk.rocking_spectrum
+
+    def partly(*given):
+        result, failed = computed(*given), jnp.arange(5) < 2
+        status = jax.vmap(lambda bad, kind: rk.Status.where(bad, rk.Status.undecided, kind))(failed, result.status)
+        parts = status, result.overturned | failed
+        return eqx.tree_at(lambda x: (x.status, x.overturned), result, parts)
+
+    described = ("--dt", "0.02", "--unit", "cm/s2", "--restitution", "0.9", "--model", "linear")
+    given = (column, *described, "--shortest", 1, "--longest", 4, "--points", 5)
+    monkeypatch.setattr(rk, "rocking_spectrum", partly)
+    status, table, errors = command("spectrum", *given)
+    assert status == 1 and errors.startswith("jaxrock: 2 scenes were not computed: Too close to call")
+    assert (table["of these overturn"], table["not computed"]) == ("0", "2")
+    _, rows = table_of(tmp_path / "out" / "spectrum.csv")
+    np.testing.assert_array_equal(np.isnan(rows).sum(axis=1), [5, 5, 0, 0, 0])
 
 
 def check_map(folder, points):

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock._aside import _reach_the_disk
 from jaxrock.sweeps import devices, netcdf
 from jaxrock.sweeps.store import Store, local
 from references import damage, kills, threads
@@ -536,3 +537,14 @@ def test_the_table_of_promises_names_tests_that_are_there():
     assert len(named) > 25
     for file, name in named:
         assert f"def {name}(" in (tests / (file or "test_crashes.py")).read_text(), name
+
+
+def test_files_reach_the_disk_where_that_takes_a_right_to_write(tmp_path, monkeypatch):
+    """As it does on Windows, which flushes no file that was opened for reading."""
+    (tmp_path / "file").write_text("whole")
+    opened, flags = os.open, []
+    with monkeypatch.context() as there:
+        there.setattr(os, "name", "nt")
+        there.setattr(os, "open", lambda path, flag: flags.append(flag) or opened(path, flag))
+        _reach_the_disk(tmp_path / "file")
+    assert flags == [os.O_RDWR]

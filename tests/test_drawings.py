@@ -1,9 +1,12 @@
 """Drawings are to scale, at any rotation; films show the response and its verdict."""
 
+import base64
 import importlib.util
+import io
 import re
 
 import jax
+import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -258,6 +261,19 @@ def test_films_are_written(kind, response, tmp_path):
     rk.plot.save_animation(film, path, dpi=30)
     start = path.read_bytes()[:15]
     assert start.startswith(b"GIF89a") if kind == "gif" else start == b"<!DOCTYPE html>"
+
+
+def test_films_as_html_are_whole_and_of_their_dpi(response, tmp_path):
+    """Of another dpi a film is drawn anew; one beyond matplotlib's limit keeps its end."""
+    film, sizes = rk.plot.animate(response, fps=2, speed=30.0), []
+    for dpi in (20, 40):
+        with matplotlib.rc_context({"animation.embed_limit": 0.001}):
+            rk.plot.save_animation(film, tmp_path / "film.html", dpi=dpi)
+        frames = re.findall(r'frames\[\d+\] = "data:image/png;base64,([^"]+)"', (tmp_path / "film.html").read_text())
+        assert len(frames) == len(list(film.new_frame_seq()))
+        with Image.open(io.BytesIO(base64.b64decode(frames[0].replace("\\\n", "")))) as picture:
+            sizes.append(picture.size)
+    assert sizes[1] == tuple(2 * x for x in sizes[0])
 
 
 @pytest.mark.parametrize("fps", [7, 60])

@@ -690,6 +690,8 @@ OLD = "lon,lat,depth,poe-0.1,poe-0.4,poe-1.0\n0.00000,0.00000,-0.10000,4.528811E
     "content, kind, measure, names",
     [
         pytest.param(engine_file("max", imt="SA(0.1)"), "max", "SA(0.1)", ("", ""), id="spectral acceleration"),
+        pytest.param(engine_file(imt="CAV"), "mean", "CAV", ("", ""), id="cumulative absolute velocity"),
+        pytest.param(engine_file(imt="PGD"), "mean", "PGD", ("", ""), id="displacement"),
         pytest.param(engine_file(imt="SDi(0.3,2.0)"), "mean", "SDi(0.3,2.0)", ("", ""), id="comma in the measure"),
         pytest.param(engine_file(form="poe-%.5e"), "mean", "PGA", ("", ""), id="levels since 3.25"),
         pytest.param(engine_file(names=["0:CD", "1001"]), "mean", "PGA", ("0:CD", "1001"), id="custom site ids"),
@@ -719,7 +721,7 @@ def test_variants_of_files(file, content, kind, measure, names):
     found = rk.hazard.read_hazard_curves(str(file(content)))
     assert (found.kinds, found.curves.measure, found.names) == ((kind,), measure, names)
     first = [0.005, 0.0192] if "0.0192" in content or "1.92" in content else [0.1, 0.4]
-    per_unit = 100 if measure == "PGV" else 1  # cm/s in files, m/s here
+    per_unit = {"PGV": 100, "PGD": 100, "CAV": 1 / 9.81}.get(measure, 1)  # cm/s, cm, g s in files; m/s, m, m/s here
     np.testing.assert_allclose(found.at(0, 0).levels[:2], np.array(first) / per_unit)
     probability = 0.65 if first[0] == 0.005 else 5.589804e-2
     np.testing.assert_allclose(found.at(0, 0).rates[1], -np.log1p(-probability) / 50, rtol=1e-12)

@@ -54,6 +54,19 @@ def test_knet_takes_the_offset_off(file, name):
     assert float(record.dt) == 0.01
 
 
+def test_knet_peaks_are_rounded_in_print(file):
+    """NIED prints three decimals: of peaks below 0.5 gal that is more than a thousandth."""
+    head, body = KNET.split("Memo.")
+    counts = np.rint(np.array(body.split(), float) / 300)
+    peak = np.abs(counts - counts.mean()).max() * 3920 / 6182761
+    head = head[: head.index("Max. Acc.")]
+    written = head + "Max. Acc. (gal)   {}\nMemo.\n" + "\n".join(f"{x:.0f}" for x in counts) + "\n"
+    assert abs(round(peak, 3) - peak) > 1e-3 * peak
+    np.testing.assert_allclose(np.abs(rk.read_record(file(written.format(f"{peak:.3f}"))).samples).max(), peak / CM)
+    with pytest.raises(ValueError, match="line 9 states a peak of"):
+        rk.read_record(file(written.format(f"{peak + 0.002:.3f}")))
+
+
 @pytest.mark.parametrize(
     "text, name, message",
     [
@@ -103,7 +116,7 @@ def test_what_is_mislabelled_is_refused(file, text, name, message):
     "text, origin",
     [
         (SMC, ("Loma Prieta, CA", "San Francisco, 1295 Shafter", "360", "1989 10 18 0004", "SAF0A", "smc", "cm/s2")),
-        (KNET, ("2011/03/11 14:46:00 M9.0", "MYG004", "N-S", "2011/03/11 14:46:36", "MYG004", "knet", "cm/s2")),
+        (KNET, ("2011/03/11 14:46:00 M9.0", "MYG004", "N-S", "2011/03/11 14:46:21 JST", "MYG004", "knet", "cm/s2")),
         (FILES["AT2"].text, ("LOMA PRIETA 10/18/89", "WAHO", "090", "", "", "at2", "g")),
         (FILES["ESM"].text, ("GREECE", "", "", "", "", "esm", "cm/s2")),
     ],
@@ -389,6 +402,12 @@ def test_titles_say_which_columns_are_components(file, titles, columns, order):
         for part, column in zip((found.first, found.second, found.vertical), order):
             np.testing.assert_allclose(part.samples, column * SAMPLES)
         assert float(found.first.dt) == 0.02
+
+
+@pytest.mark.parametrize("kind", ["AT2", "ESM", "SMC", "K-NET"])
+def test_a_file_of_one_component_asks_for_the_others(file, kind):
+    with pytest.raises(ValueError, match="`paths` must be a file for each component, because .* holds one component"):
+        rk.motions.read_components(file(FILES[kind].text))
 
 
 def test_columns_that_are_not_two_or_three_must_be_said(file):

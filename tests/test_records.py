@@ -106,6 +106,14 @@ def test_at2_in_other_units(file, unit, per_g, told):
         read_record(file(content), unit="g" if per_g != 1 else "m/s2")
 
 
+def test_units_of_at2_go_before_that_of_a_peak(file):
+    for peak in ("PGA (CM/S2) = 805", "ACC (CM/S2)"):
+        content = AT2.replace(UNIT, f"{peak}\n{UNIT}")
+        assert "UNITS OF G" in UNIT and read_record(file(content)).origin.unit == "g"
+    with pytest.raises(ValueError, match="line 3 states the unit 'CM/S2', but line 4 'G'"):
+        read_record(file(AT2.replace(UNIT, f"UNITS: CM/S2\n{UNIT}")))
+
+
 @pytest.mark.parametrize(
     "content, error",
     [
@@ -498,11 +506,21 @@ def test_a_part_of_g_is_not_g(file, unit):
         read_record(file(f"time [ms],acc {unit}\n{IN_MS}"), unit="g")
 
 
-@pytest.mark.parametrize("line", ["PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal"])
+VALUES = [
+    "PGA = 300 cm/s2", "peak (cm/s2): 300", "PGA 300 cm/s2, at 3 s", "PGA, 300 gal", "Peak acceleration in m/s2: 0.311",
+    "Peak acceleration in cm/s2 is 300", "Peak acceleration in m/s2 (NS): 0.3", "Peak acc in (m/s2) at 3.2 s: 0.3",
+    "Total time in minutes: 1.5", "Total time in minutes 1.5",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", VALUES)
 @pytest.mark.parametrize("titles", ["", "time,acc\n", "time,acc [g]\n"])
 def test_a_value_in_a_header_is_no_title(file, line, titles):
-    np.testing.assert_array_equal(read_record(file(f"# {line}\n{titles}{PAIRS}"), unit="g").samples, SAMPLES)
-    np.testing.assert_array_equal(read_record(file(f"{titles}# {line}\n{PAIRS}"), unit="g").samples, SAMPLES)
+    dt = read_record(file(PAIRS), unit="g").dt
+    for header in (f"# {line}\n{titles}", f"{titles}# {line}\n"):
+        record = read_record(file(header + PAIRS), unit="g")
+        np.testing.assert_array_equal(record.samples, SAMPLES)
+        assert record.dt == dt
     if not titles:
         np.testing.assert_array_equal(read_record(file(f"# {line}\n{ONE_COLUMN}"), unit="g", dt=1).samples, SAMPLES)
 

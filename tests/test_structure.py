@@ -17,7 +17,7 @@ FILES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
-TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 MODULES = [name for name in TREES if name != "__init__"]
 
 # At the bottom: `status`, and helpers (one underscore). They import each other, and all others may import them.
@@ -401,3 +401,13 @@ def test_what_threads_share_is_known():
     """Nothing else at the level of a module changes; `functools.cache` is safe, and what is there once has a lock."""
     found = {f"{name}.{each}" for name, tree in TREES.items() for each in changed_within_functions(tree)}
     assert found == set(SHARED)
+
+
+def test_text_is_written_in_one_encoding():
+    """In utf-8, which readers expect, and not in that of the place where it runs."""
+    for name, tree in TREES.items():
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            word = getattr(call.func, "attr", getattr(call.func, "id", ""))
+            modes = [each.value for each in call.args if isinstance(each, ast.Constant)] + [""]
+            if word == "write_text" or word == "open" and set(modes) & {"w", "a", "x"}:
+                assert any(each.arg == "encoding" for each in call.keywords), f"{name}, line {call.lineno}"

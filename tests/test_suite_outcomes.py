@@ -253,5 +253,11 @@ def test_nrml(tmp_path):
     root = ElementTree.parse(path).getroot()
     assert root.find(".//n:imls", space).text == "10 20 40"  # m/s here, cm/s there
     assert root.find(".//n:poes", space).text == "0 0.7 0.6"
+    for measure, levels in {"PGD": "10 20 40", "CAV": "0.1 0.2 0.4", "IA": "0.1 0.2 0.4"}.items():
+        ours = np.array([0.1, 0.2, 0.4]) * (9.81 if measure == "CAV" else 1)  # m/s, which are g s there
+        rk.hazard.write_nrml({"topples": rk.hazard.TabulatedFragility(ours, [0.0, 0.7, 0.6])}, path, measure)
+        assert ElementTree.parse(path).getroot().find(".//n:imls", space).text == levels
+    with pytest.raises(ValueError, match="`measure` must be one that OpenQuake knows, as SA, but is 'SV"):
+        rk.hazard.write_nrml({"topples": rk.hazard.LogNormalFragility(0.2, 0.1)}, path, "SV(0.5)")
     with pytest.raises(ValueError, match="`fragilities` must hold fragilities by name"):
         rk.hazard.write_nrml({}, path)

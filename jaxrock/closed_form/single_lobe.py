@@ -146,8 +146,7 @@ def rotation(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
 
     **Source:** V 3.2, 3.4, 3.6.
     """
-    angle, _ = _history(time, uplift_strength, pulse_duration, _clipped(shape))
-    return angle
+    return _history(time, uplift_strength, pulse_duration, _clipped(shape))[0]
 
 
 @_elementwise
@@ -156,8 +155,7 @@ def velocity(time: Real, uplift_strength: Real, pulse_duration: Real, shape: Rea
 
     **Source:** V 3.3, 3.5, 3.7.
     """
-    _, speed = _history(time, uplift_strength, pulse_duration, _clipped(shape))
-    return speed
+    return _history(time, uplift_strength, pulse_duration, _clipped(shape))[1]
 
 
 @_elementwise
@@ -166,8 +164,7 @@ def peak_time(uplift_strength: Real, pulse_duration: Real, shape: Real) -> Resul
 
     **Source:** V 3.15a, 3.15b, 3.16, 3.17a and b corrected.
     """
-    time, _ = _peak(uplift_strength, pulse_duration, _clipped(shape))
-    return time
+    return _peak(uplift_strength, pulse_duration, _clipped(shape))[0]
 
 
 @_elementwise
@@ -181,8 +178,7 @@ def peak_rotation(uplift_strength: Real, pulse_duration: Real, shape: Real) -> R
 
     **Source:** V 3.2 at the time of 3.15; 3.18.
     """
-    _, angle = _peak(uplift_strength, pulse_duration, _clipped(shape))
-    return angle
+    return _peak(uplift_strength, pulse_duration, _clipped(shape))[1]
 
 
 @_elementwise
@@ -259,7 +255,11 @@ def _uplift(strength: Array, shape: Array) -> tuple[Array, Array]:
     lack = 1 - strength
     # log(1 + strength (e^shape - 1))/shape, and the same seen from the peak
     low, high = jnp.where(shape >= -_STEEP, shape, -_STEEP), jnp.where(shape <= _STEEP, shape, _STEEP)
-    left = lack * growth_ratio(-low) * logarithm_ratio(lack * low * growth_ratio(-low))
+    # Under spikes 1 - y is strength + lack e^-shape, which rounding would make 0.
+    weak, tiny = (shape > 1) & (strength < 0.5), jnp.finfo(strength.dtype).tiny
+    spiked = -jnp.log(jnp.maximum(strength + lack * jnp.exp(-low), tiny)) / jnp.where(weak, shape, 1.0)
+    left = lack * growth_ratio(-low) * logarithm_ratio(jnp.where(weak, 0.5, lack * low * growth_ratio(-low)))
+    left = jnp.where(weak, spiked, left)
     time = strength * growth_ratio(high) * logarithm_ratio(-strength * high * growth_ratio(high))
     steep = jnp.where(shape < -_STEEP, shape, -_STEEP)
     box = jnp.log(jnp.where(lack > 0, lack, 1.0) + strength * jnp.exp(steep)) / steep
@@ -293,12 +293,12 @@ def _safety_wall(duration: Array, shape: Array) -> Array:
 
 def _rising(since: Array, strength: Array, duration: Array, shape: Array) -> tuple[Array, Array]:
     """Rotation and velocity times strength at a time `since` uplift, while the pulse rises; V 3.2, H = 0."""
-    uplift, _ = _uplift(strength, shape)
+    _, left = _uplift(strength, shape)
     up, down = _parts(shape)
     # Of an increasing exponential, its value at the end is taken out, so that spikes do not overflow.
     rate, grown = duration * since, 2 * up * since
     nodes = (rate - grown, -rate - grown, 2 * down * since)
-    lift = jnp.where(shape < 0, 1 - strength + strength * jnp.exp(down), jnp.exp(-up * (1 - 2 * uplift) + grown))
+    lift = jnp.where(shape < 0, 1 - strength + strength * jnp.exp(down), jnp.exp(2 * up * (since - left)))
     push = 2 * lift / growth_ratio(down - up)
     speed = push * duration * since**2 * exponential_difference(*nodes)
     angle = push * duration**2 * since**3 * exponential_difference(*nodes, -grown)

@@ -8,7 +8,15 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock.command_line.command import Command
-from jaxrock.command_line.options import add_description, add_restitution, check_points, check_range, model_of, number
+from jaxrock.command_line.options import (
+    add_description,
+    add_restitution,
+    check_points,
+    check_range,
+    files_of,
+    model_of,
+    number,
+)
 from jaxrock.command_line.output import Entry, Report, save, whole, write_csv
 
 
@@ -34,7 +42,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     check_points(arguments.points, 3)
     check_range("--levels", arguments.levels)
     given = {"dt": arguments.dt, "unit": arguments.unit, "column": arguments.column}
-    suite = rk.motions.Suite([rk.read_record(path, **given) for path in arguments.records])
+    suite = rk.motions.Suite([rk.read_record(path, **given) for path in files_of(arguments.records)])
     block = rk.Block.from_dimensions(arguments.width, arguments.height, arguments.restitution)
     if arguments.scatter != 0:
         block = rk.blocks.draw_blocks(block, arguments.draws, alpha=arguments.scatter)
@@ -57,7 +65,7 @@ def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
     entries = [
         Entry("scenes", "scenes", found.verdict.size),
         Entry("undecided", "of these undecided", found.undecided),
-        Entry("stand_again", "blocks that stand again at a higher level", again),
+        Entry("stand_again", "pairs of motion and block that stand again at a higher level", again),
     ]
     for bound, fit in fits.items():
         if bound == "upper" and not found.undecided:
@@ -90,13 +98,15 @@ def _write(
     header = f"{found.measure},lower,upper"
     write_csv(report, folder / "fragility.csv", header, found.levels, found.lower, found.upper)
     columns = found.table()
-    with whole(folder / "stripes.csv") as aside, aside.open("w", newline="") as file:
+    with whole(folder / "stripes.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
     report.wrote(folder / "stripes.csv")
     (folder / "fragility.xml").unlink(missing_ok=True)  # of an earlier run, which may have had a fit
-    if fit is not None:
+    if fit is not None and found.measure.startswith("SV("):
+        report.say(f"no fragility.xml: OpenQuake knows no {found.measure}")
+    elif fit is not None:
         rk.hazard.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
         report.wrote(folder / "fragility.xml")
     save(report, rk.plot.fragility(found, fit).figure, folder / "fragility.png")

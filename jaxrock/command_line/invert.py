@@ -171,13 +171,13 @@ def _write(
     """Tables and the figure; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / name for name in ("estimate.csv", "probabilities.csv", "region.csv", "region.png")]
-    with whole(files[0]) as aside, aside.open("w") as file:
+    with whole(files[0]) as aside, aside.open("w", encoding="utf-8") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
         for name, value, interval, open_ in _rows(estimate):
             ends = ",".join(f"{float(x):.6g}" for x in interval)
             flags = ",".join(str(int(x)) for x in open_)
             print(f"{name},{UNITS.get(name, '')},{float(value):.6g},{ends},{flags}", file=file)
-    with whole(files[1]) as aside, aside.open("w") as file:
+    with whole(files[1]) as aside, aside.open("w", encoding="utf-8") as file:
         shapes = _shapes(observations)
         print(f"name,{','.join(shapes)},observed,probability", file=file)
         known = np.asarray(observations.seen), np.asarray(estimate.probability)
@@ -190,9 +190,10 @@ def _write(
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
     with whole(files[2]) as aside:
         np.savetxt(aside, np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
+    (folder / "unexceeded.csv").unlink(missing_ok=True)  # of an earlier run
     if wall is not None:
         files.append(folder / "unexceeded.csv")
-        with whole(files[-1]) as aside, aside.open("w") as file:
+        with whole(files[-1]) as aside, aside.open("w", encoding="utf-8") as file:
             print("duration_s,amplitude_g,rock,complete", file=file)
             columns = map(np.asarray, (wall.durations, wall.amplitude, wall.weakest, wall.complete))
             for duration, amplitude, rock, complete in zip(*columns):

@@ -56,7 +56,9 @@ def _parser() -> argparse.ArgumentParser:
         told = {"help": command.purpose, "description": command.purpose, "epilog": _epilog(command.name)}
         sub = commands.add_parser(command.name, **told, **shared)
         sub.add_argument("--json", action="store_true", help="print one JSON object, for programs")
-        sub.add_argument("-q", "--quiet", action="store_true", help="print nothing but what went wrong")
+        sub.add_argument(
+            "-q", "--quiet", action="store_true", help="print nothing but what went wrong, and the object of --json"
+        )
         sub.add_argument("-v", "--verbose", action="store_true", help="also say what the package does")
         if command.computes:
             models, folder = ("housner", "linear"), Path("results")

@@ -1,10 +1,12 @@
 """Options that several commands have, and what they stand for."""
 
 import argparse
+import glob
 import re
 from collections.abc import Callable
 from functools import partial
 from inspect import Parameter, signature
+from pathlib import Path
 from typing import Any
 
 import jaxrock as rk
@@ -38,6 +40,14 @@ def add_record(parser: argparse.ArgumentParser) -> None:
     )
     add_description(parser)
     parser.add_argument("--scale", type=number, default=1.0, help="factor on the acceleration (default 1)")
+
+
+def files_of(words: list[str]) -> list[str]:
+    """Files, those of patterns in order: shells of Windows leave them as they are typed."""
+    found = []
+    for word in words:
+        found += ([] if Path(word).exists() else sorted(glob.glob(word))) or [word]
+    return found
 
 
 def add_description(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 import jaxrock as rk
 from jaxrock._aside import written_aside
+from jaxrock._tables import items_of
 
 
 class Entry(NamedTuple):
@@ -130,8 +131,11 @@ def whole(path: Path) -> Iterator[Path]:
 
 def check_surface(report: Report, status: rk.Status) -> None:
     """Some scenes of a surface may not have been computed."""
-    if not bool(np.all(np.asarray(status == rk.Status.successful))):
-        report.failed("some scenes were not computed (impacts that do not die out)")
+    for word in items_of(status):
+        kind = getattr(rk.Status, word)
+        count = int(np.sum(np.asarray(status == kind)))
+        if count and word != "successful":
+            report.failed(f"{count} scenes were not computed: {rk.Status[kind]}")
 
 
 class _Once(logging.Handler):

@@ -36,21 +36,22 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     period = np.linspace(arguments.shortest, arguments.longest, arguments.points)
     alpha = np.arctan(1 / arguments.slenderness)
     result = rk.rocking_spectrum(alpha, record, period, arguments.restitution, model_of(arguments))
-    lost = np.asarray(result.overturned)
+    known = np.asarray(result.status == rk.Status.successful)
+    lost = np.asarray(result.overturned) & known
     longest, instead = (period[lost].max(), None) if lost.any() else (None, "none")
-    failed = int(np.sum(~np.asarray(result.status == rk.Status.successful)))
     report.title(record.name or "unnamed record")
     report.table([
         Entry("slenderness", "slenderness, height/width", arguments.slenderness, "g"),
         Entry("block_sizes", "block sizes", period.size),
         Entry("overturned", "of these overturn", int(lost.sum())),
         Entry("longest_overturned", "longest 2 pi/p that overturns", longest, ".3f", "s", instead),
-        Entry("not_computed", "not computed", failed),
+        Entry("not_computed", "not computed", int(np.sum(~known))),
     ])  # fmt: skip
     arguments.out.mkdir(parents=True, exist_ok=True)
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
-    write_csv(report, arguments.out / "spectrum.csv", header, period, result.max_rotation, result.max_velocity,
-              result.impact_count, lost, result.margin)  # fmt: skip
+    peaks = (result.max_rotation, result.max_velocity, result.impact_count, lost, result.margin)
+    columns = [np.where(known, np.asarray(each, float), np.nan) for each in peaks]  # else they look like results
+    write_csv(report, arguments.out / "spectrum.csv", header, period, *columns)
     save(report, rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
     check_surface(report, result.status)
 

@@ -10,7 +10,7 @@ from jaxrock._arguments import arguments, path_of
 from jaxrock._aside import written_aside
 from jaxrock._checks import shown
 from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility
-from jaxrock.hazard.openquake import CM_PER_M
+from jaxrock.hazard.openquake import units_of_openquake
 
 _SPACE = "http://openquake.org/xmlns/nrml/0.5"
 
@@ -31,12 +31,18 @@ def write_nrml(
     - `fragilities`: by the names of their limit states, from slight to severe: all `LogNormalFragility`, or all
       `TabulatedFragility` of the same levels.
     - `path`: the file; one that is there is replaced.
-    - `measure`: as OpenQuake calls it, such as "PGA" [g], "PGV" or "SA(0.5)" [g]. Of "PGV" the fragilities are in m/s,
-      and the file in cm/s, as OpenQuake has it.
+    - `measure`: as OpenQuake calls it, such as "PGA" [g], "IA" [m/s] or "SA(0.5)" [g]. Of "PGV" and "CAV" [m/s] and
+      "PGD" [m] the file is in cm/s, g s and cm, as OpenQuake has them. It knows no "SV(0.5)".
     - `taxonomy`, `description`: of the object.
 
-    **Raises:** ValueError for fragilities that do not go together; OSError if the file cannot be written.
+    OpenQuake draws straight lines between the levels of a table, `TabulatedFragility` straight lines over their
+    logarithms: they differ between levels far apart.
+
+    **Raises:** ValueError for fragilities that do not go together, or spectral velocities; OSError if the file cannot
+    be written.
     """
+    if measure.startswith("SV("):
+        raise ValueError(f"Argument `measure` must be one that OpenQuake knows, as SA, but is {measure!r}.")
     good = isinstance(fragilities, Mapping) and fragilities and all(isinstance(name, str) for name in fragilities)
     kinds = {type(each) for each in fragilities.values()} if good else set()
     if kinds not in ({LogNormalFragility}, {TabulatedFragility}):
@@ -44,7 +50,7 @@ def write_nrml(
             "Argument `fragilities` must hold fragilities by name, all lognormal or all tabulated, but is "
             f"{shown(fragilities)}."
         )
-    fragilities = {name: _in_unit(each, CM_PER_M if measure == "PGV" else 1.0) for name, each in fragilities.items()}
+    fragilities = {name: _in_unit(each, units_of_openquake(measure)) for name, each in fragilities.items()}
     root = ElementTree.Element("nrml", xmlns=_SPACE)
     model = ElementTree.SubElement(
         root, "fragilityModel", id="jaxrock", assetCategory="contents", lossCategory="contents"

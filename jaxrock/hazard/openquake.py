@@ -14,6 +14,7 @@ from jaxrock._arguments import arguments, list_of, path_of
 from jaxrock._checks import is_traced, placed, whole
 from jaxrock._described import described
 from jaxrock._text import check_end, file_error, text_lines
+from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.hazard.curves import HazardCurve
 
 _FRONT = {"custom_site_id", "lon", "lat", "depth"}
@@ -28,7 +29,8 @@ _KIND = re.compile(r"\bkind='([^']*)'")
 # Older files, without kind=: "# quantile-0.1, investigation_time=...", "# source_model_tree_path=('b1',), gsim_...".
 _OLD_KIND = re.compile(r"#[\s,\"]*(.*?)[\s,]*\binvestigation_time=")
 
-CM_PER_M = 100.0  # OpenQuake's peak velocities are in cm/s
+# Units of OpenQuake in one of ours, where they differ: its PGV are in cm/s, PGD in cm, and CAV in g s.
+_OF_OURS = {"PGV": 100.0, "PGD": 100.0, "CAV": 1 / GRAVITY}
 
 # Probabilities are computed in single precision from many sources, so that equal ones may differ by a little.
 _NOISE = 1e-5, 3e-7
@@ -37,8 +39,8 @@ _NOISE = 1e-5, 3e-7
 class HazardCurves(eqx.Module):
     """Hazard curves of sites, each under one or more branches, as files hold them.
 
-    - `curves`: a `HazardCurve` with arrays of shape (branches, sites, levels), in g for PGA and SA, in m/s for PGV (of
-      which files have cm/s), and in the unit of the files for others.
+    - `curves`: a `HazardCurve` with arrays of shape (branches, sites, levels), in g for PGA and SA, in m/s for PGV and
+      CAV, in m for PGD (of which files have cm/s, g s and cm), and in the unit of the files for others.
     - `longitude`, `latitude`: (sites,) [degrees].
     - `depth`: (sites,) below sea level [km]; 0 where a file has none.
     - `kinds`: what the files say of each branch, such as "mean", "rlz-000", "quantile-0.5".
@@ -107,11 +109,16 @@ def read_hazard_curves(paths: str | os.PathLike | Sequence[str | os.PathLike]) -
                 which = "sites" if what in ("names", "positions") else what
                 raise file_error(path.name, f"differs in its {which} from file `{found[0].name}`.")
     rates = np.stack([file["rates"] for file in files])
-    levels = first["levels"] / (CM_PER_M if first["measure"] == "PGV" else 1.0)
+    levels = first["levels"] / units_of_openquake(first["measure"])
     curves = HazardCurve(np.broadcast_to(levels, rates.shape), rates, first["measure"])
     kinds = tuple(file["kind"] for file in files)
     longitude, latitude, depth = placed(list(np.asarray(first["positions"]).T))
     return HazardCurves(curves, longitude, latitude, depth, kinds=kinds, names=tuple(first["names"]))
+
+
+def units_of_openquake(measure: str) -> float:
+    """How many of OpenQuake's units of a measure are one of this package's."""
+    return _OF_OURS.get(measure, 1.0)
 
 
 def _read(path: Path) -> dict:

@@ -13,7 +13,7 @@ from jaxrock.motions.files.parsing import NUMBER
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 
-# As OpenQuake calls them: with their units, and the power of a motion's scale with which they grow.
+# By OpenQuake's names (SV is none of them): with our units, and the power of a motion's scale with which they grow.
 _NAMED: dict[str, tuple[Callable, str, float]] = {
     "PGA": (intensity.peak_acceleration, "g", 1.0),
     "PGV": (intensity.peak_velocity, "m/s", 1.0),

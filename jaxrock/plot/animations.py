@@ -207,8 +207,10 @@ def save_animation(
     if kind == ".gif":
         film.save(path, writer=_gif_writer(interval), dpi=dpi)
     elif kind == ".html":
-        # 1000 // fps is what a picture lasts.
-        with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
+        vars(own).pop("_html_representation", None)  # which matplotlib keeps, whatever dpi it is of
+        # In megabytes: beyond it pictures would be left out. 1000 // fps is what a picture lasts.
+        with matplotlib.rc_context({"savefig.dpi": dpi, "animation.embed_limit": 1e6}):
+            with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
         title = html.escape(path.stem)
         path.write_text(f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}", encoding="utf-8")
     elif kind == ".mp4":

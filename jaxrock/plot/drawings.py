@@ -103,7 +103,7 @@ def _axis_over(motion: AbstractMotion | None) -> "Axes":
 
 
 def draw_ground(axis: "Axes", body: Body) -> None:
-    """The ground with its hatching, and the arrow of its acceleration."""
+    """The ground with its hatching."""
     from matplotlib.patches import Polygon
 
     size, (right, left) = body.size, (body.right, body.left)

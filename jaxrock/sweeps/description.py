@@ -93,7 +93,9 @@ class Description:
         for file in self.damaged(path):
             file.parent.mkdir(exist_ok=True)
             with written_aside(file, replace=True) as aside:
-                aside.write_text(json.dumps(self.files()[str(file.relative_to(path).as_posix())], indent=1))
+                aside.write_text(
+                    json.dumps(self.files()[str(file.relative_to(path).as_posix())], indent=1), encoding="utf-8"
+                )
 
 
 def described(path: Path, wanted: str) -> Description:

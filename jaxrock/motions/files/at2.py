@@ -13,6 +13,7 @@ from jaxrock.motions.files.parsing import (
     no_column,
     plain_numbers,
     to_float,
+    unit_named,
 )
 from jaxrock.motions.files.titles import SECONDS, SHORT, is_any_unit
 from jaxrock.motions.record import Origin
@@ -20,6 +21,7 @@ from jaxrock.motions.record import Origin
 _UNIT = re.compile(r"\bUNITS\s*(?:OF|IN|[:=])?\s*\(?\s*([^\s,;()]+)(.*)", re.IGNORECASE)
 _UNIT_ALONE = re.compile(r"(?:\bIN\b|[(\[])\s*[(\[]?\s*([^\s,;()\[\]]+)(.*)", re.IGNORECASE)
 _TIMES = re.compile(r"\s*[)\]]?\s*(?:[*×/^]|X\s*[-+.\d]|TIMES\b|DIVIDED\b)", re.IGNORECASE)  # a factor beside a unit
+_VALUED = re.compile(r"\s*[)\]]?\s*[:=]\s*[-+.]?\d")  # "PGA (CM/S2) = 805" is no unit of the samples
 _OTHER_KIND = re.compile(r"^\s*(VELOCITY|DISPLACEMENT)\s+(?:TIME|HISTORY|SERIES|IN\s+UNITS)\b", re.IGNORECASE)
 _COUNT = re.compile(r"(?<![A-Z])NPTS\s*=?\s*(\d+)", re.IGNORECASE)
 _STEP = re.compile(rf"(?<![A-Z])DT\s*=?\s*({NUMBER})\s*([A-Zµμ]*)", re.IGNORECASE)
@@ -37,6 +39,7 @@ class AT2(AbstractFormat):
 
     name = "at2"
     suffixes = (".at2",)
+    single = True
 
     def recognises(self, lines):
         return any(_counts(line) for line in lines if not line.lstrip().startswith("#"))
@@ -55,7 +58,7 @@ class AT2(AbstractFormat):
         if again:
             raise file_error(name, f"line {again[0] + 1} announces samples once more: one record to a file.")
         dt = agreed_step(name, dt, step)
-        at, written = next(((n, found) for n in range(last + 1) if (found := _unit_in(lines[n]))), (None, ""))
+        at, written = _unit_of(name, lines[: last + 1])
         unit = agreed_unit(name, (at or 0) + 1, unit, written)
         samples = announced_samples(name, lines, last + 1, count, _numbers, plain_numbers)
         check_end(name, lines, _printed(lines[last + 1 :]), by_program=True)
@@ -74,12 +77,24 @@ def _check_kind(name: str, header: list[str]) -> None:
             raise file_error(name, f"line {number} states DT in {rate[1]!r}, but it must be a time step.")
 
 
+def _unit_of(name: str, header: list[str]) -> tuple[int | None, str]:
+    """The line that states the unit, and the unit: what says UNITS goes before what stands in brackets."""
+    stated = [(number, unit) for number, line in enumerate(header) if (unit := _unit_in(line))]
+    found = [each for each in stated if _UNIT.search(header[each[0]])] or stated
+    for number, unit in found[1:]:
+        if (unit_named(unit) or unit) != (unit_named(found[0][1]) or found[0][1]):
+            told = f"line {found[0][0] + 1} states the unit {found[0][1]!r}, but line {number + 1} {unit!r}"
+            raise file_error(name, f"{told}.")
+    return found[0] if found else (None, "")
+
+
 def _unit_in(line: str) -> str:
     """The unit that a line of the header states, with a factor beside it, which makes it another; or nothing."""
     found = _UNIT.search(line)
     for alone in () if found else _UNIT_ALONE.finditer(line):
         sure = is_any_unit(alone[1]) and alone[1].lower() not in SHORT and alone[1].lower() not in SECONDS
         # A word such as G is a unit beside the word acceleration only.
+        sure = sure and not _VALUED.match(alone[2])
         if sure and (is_unit(alone[1]) and len(alone[1]) > 1 or re.search(r"\bACC", line, re.IGNORECASE)):
             found = alone
             break

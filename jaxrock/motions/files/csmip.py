@@ -89,7 +89,7 @@ def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.nd
     for row in range(start, at):
         found = _PEAK.match(lines[row])
         if found:
-            check_peak(name, row + 1, to_float(found[1]), samples)
+            check_peak(name, row + 1, found[1], samples)
 
 
 def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[str, Origin]:

@@ -13,6 +13,7 @@ from jaxrock.motions.files.parsing import (
     agreed_step,
     agreed_unit,
     announced_columns,
+    check_peak,
     fixed_numbers,
     to_float,
 )
@@ -121,8 +122,4 @@ def _check_peak(name: str, lines: list[str], at: int, samples: np.ndarray, unit:
     for row, line in enumerate(lines[at : at + _TEXT], at + 1):
         found = _PEAK.search(line)
         if found and found[2].lower() == "g" and unit == "g":
-            stated, largest = abs(to_float(found[1])), float(np.abs(samples).max())
-            if abs(largest - stated) > 0.05 * stated + 10.0 ** -len(found[1].partition(".")[2]):
-                raise file_error(
-                    name, f"line {row} states a peak of {stated:g} g, but the largest sample is {largest:g}."
-                )
+            check_peak(name, row, found[1], samples, unit="g", share=0.05)

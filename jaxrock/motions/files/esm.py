@@ -28,6 +28,7 @@ class ESM(AbstractFormat):
     """ESM ASCII."""
 
     name = "esm"
+    single = True
 
     def recognises(self, lines):
         return {_STEP, _COUNT} <= set(_header(lines))
@@ -79,7 +80,7 @@ def _check_peak(name: str, header: dict, samples: np.ndarray, unit: str) -> None
     """The largest sample is the peak that the header states."""
     line, value = header.get(_PEAK, (0, ""))
     if re.fullmatch(NUMBER, value):
-        check_peak(name, line, to_float(value), samples * (PER_G["cm/s2"] / PER_G[unit]))
+        check_peak(name, line, value, samples * (PER_G["cm/s2"] / PER_G[unit]))
 
 
 def _check_duration(name: str, header: dict, step: float, count: int) -> None:

@@ -25,10 +25,12 @@ class AbstractFormat(abc.ABC):
 
     - `name`: its word in `read_record(format=...)`.
     - `suffixes`: of file names, in lower case, that tell the format where the content does not.
+    - `single`: whether a file holds one component only.
     """
 
     name: ClassVar[str]
     suffixes: ClassVar[tuple[str, ...]] = ()
+    single: ClassVar[bool] = False
 
     @abc.abstractmethod
     def recognises(self, lines: list[str]) -> bool:
@@ -50,5 +52,11 @@ class AbstractFormat(abc.ABC):
         """
 
     def components(self, name: str, lines: list[str]) -> tuple[int, ...]:
-        """Which of the columns or channels of a file are the components of one record: the first three."""
+        """Which of the columns or channels of a file are the components of one record: the first three.
+
+        **Raises:** ValueError for a file that holds one component.
+        """
+        if self.single:
+            told = f"{self.name.upper()} file `{name}` holds one component"
+            raise ValueError(f"Argument `paths` must be a file for each component, because {told}.")
         return (0, 1, 2)

@@ -1,6 +1,7 @@
 """K-NET and KiK-net, the format of NIED: lines of a header, then counts of a digitiser."""
 
 import re
+from datetime import datetime, timedelta
 
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
@@ -20,6 +21,7 @@ _KEYS = (
     "Station Height(m)", "Record Time", "Sampling Freq(Hz)", "Duration Time(s)", "Dir.", "Scale Factor",
     "Max. Acc. (gal)", "Last Correction", "Memo.",
 )  # fmt: skip
+_TIME = "%Y/%m/%d %H:%M:%S"
 # Of KiK-net, which numbers its channels: in the borehole, and at the surface.
 _CHANNELS = {"1": "N-S", "2": "E-W", "3": "U-D", "4": "N-S", "5": "E-W", "6": "U-D"}
 
@@ -29,6 +31,7 @@ class KNET(AbstractFormat):
 
     name = "knet"
     suffixes = (".ew", ".ns", ".ud", ".ew1", ".ns1", ".ud1", ".ew2", ".ns2", ".ud2")
+    single = True
 
     def recognises(self, lines):
         header = _header(lines)
@@ -49,7 +52,8 @@ class KNET(AbstractFormat):
         samples = (samples - samples.mean()) * (gal / counts)
         if "Max. Acc. (gal)" in header:
             line, value = header["Max. Acc. (gal)"]
-            check_peak(name, line, _stated(name, header, "Max. Acc. (gal)", rf"({NUMBER})")[0], samples)
+            _stated(name, header, "Max. Acc. (gal)", rf"({NUMBER})")
+            check_peak(name, line, value, samples)
         told = {key: value for key, (_, value) in header.items()}
         component = _CHANNELS.get(told.get("Dir.", ""), told.get("Dir.", ""))
         event = " ".join(filter(None, (told.get("Origin Time"), told.get("Mag.") and "M" + told["Mag."])))
@@ -60,8 +64,17 @@ class KNET(AbstractFormat):
             agreed_step(name, dt, 1 / rate),
             unit,
             title,
-            Origin(event, code, component, told.get("Record Time", ""), code),
+            Origin(event, code, component, _start(told.get("Record Time", "")), code),
         )
+
+
+def _start(recorded: str) -> str:
+    """When the first sample was taken, in Japan's time: the header states it 15 s late, as the logger delays it."""
+    try:
+        first = datetime.strptime(recorded, _TIME) - timedelta(seconds=15)
+    except ValueError:
+        return ""
+    return f"{first.strftime(_TIME)} JST"
 
 
 def _header(lines: list[str]) -> dict[str, tuple[int, str]]:

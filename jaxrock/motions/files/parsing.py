@@ -194,10 +194,17 @@ def no_column(name: str, column: int | None, kind: str) -> None:
         raise ValueError(f"Argument `column` must be None, because {one}, but is {column}.")
 
 
-def check_peak(name: str, line: int, stated: float, samples: np.ndarray, where: str = "") -> None:
-    """The largest sample is the peak that a header states in a line [cm/s2]."""
-    stated, largest = abs(stated), float(np.abs(samples).max())
-    if abs(largest - stated) > 1e-3 * stated + 1e-6:
-        raise file_error(
-            name, f"{where or f'line {line}'} states a peak of {stated:g} cm/s2, but the largest sample is {largest:g}."
-        )
+def check_peak(
+    name: str, line: int, stated: str | float, samples: np.ndarray, where: str = "", *, unit="cm/s2", share=1e-3
+) -> None:
+    """The largest sample is the peak that a header states in a line, to a share of it and, in text, its last digit."""
+    peak, largest = abs(to_float(str(stated))), float(np.abs(samples).max())
+    if abs(largest - peak) > share * peak + max(1e-6, _last_digit(stated) if isinstance(stated, str) else 0.0):
+        told = f"a peak of {peak:g} {unit}, but the largest sample is {largest:g}"
+        raise file_error(name, f"{where or f'line {line}'} states {told}.")
+
+
+def _last_digit(printed: str) -> float:
+    """What one more in the last digit of a printed number is."""
+    digits, _, power = printed.upper().replace("D", "E").partition("E")
+    return 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))

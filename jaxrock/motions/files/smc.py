@@ -27,6 +27,7 @@ class SMC(AbstractFormat):
 
     name = "smc"
     suffixes = (".smc",)
+    single = True
 
     def recognises(self, lines):
         return len(lines) > 28 and bool(_FIRST.match(lines[0])) and _whole(lines) is not None

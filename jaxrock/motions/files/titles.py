@@ -46,6 +46,14 @@ _SAID = re.compile(
     r"\b(?:units\b\s*(?:[:=]|(?:of|in|are)\b)?|unit\s*(?:[:=]|(?:of|in|is)\b)|(?:acc\w*|times?)\s+(?:(?:is|are)\s+)?in\b)",
     re.IGNORECASE,
 )
+# "in g: 0.311", "in g at 3.2 s: 0.311", "in minutes 1.5": a value, of a peak or a duration
+_WHERE = r"(?:at|for|of|along|on)\b[^,;&\t:=]*"
+_BEHIND_UNIT = re.compile(rf"[)\]}}>]\s*(?:{_WHERE}[:=]|[:=]?)\s*[-+.]?\d", re.IGNORECASE)
+_VALUED = re.compile(
+    rf"(\s*\S.*?)(?:\s*\([^()]*\)|\s+{_WHERE})?"
+    r"(?:(\s*[:=]|\s+(?:is|was)\b)\s*[-+.]?\d|\s+[-+.\d]+\s*$)",
+    re.IGNORECASE,
+)
 _DIRECTION = re.compile(r"[NSEWUDVHXYZLTR]{1,3}\d?|[NSEWUD]-[NSEWUD]|\d{1,3}|up|down|vert\w*\.?", re.IGNORECASE)
 _VALUE = re.compile(r"(^|[\s=:])[-+\d.]+($|\s)")  # a number in what is no title then: `PGA = 0.3 g`
 _STATED = re.compile(r"[:=]\s*[-+.]?\d")
@@ -201,7 +209,7 @@ def _said(lines: list[str], width: int) -> dict:
     found: dict = {}
     for number, line in enumerate(lines, 1):
         begin = _SAID.search(line)
-        if not begin:
+        if not begin or _is_of_a_value(line[begin.end() :]):
             continue
         parts = [_inner(part) for part in re.split(r"[,;&\t]|\band\b", line[begin.end() :])]
         words = [word for part in parts for word in ([part] if is_any_unit(part) else map(_inner, part.split()))]
@@ -217,6 +225,13 @@ def _said(lines: list[str], width: int) -> dict:
         if len(times) == 1 and (known or not other):
             found.setdefault("time", (number, times[0]))
     return found
+
+
+def _is_of_a_value(words: str) -> bool:
+    """Whether a unit is that of a value behind it, and says nothing of the columns."""
+    found = _VALUED.match(words[:_LONG])
+    # Without a sign between them a number beside a unit of acceleration may be a factor.
+    return found is not None and (is_any_unit if found[2] else _seconds)(_inner(found[1]))
 
 
 def _is_plain(titles: list[Title]) -> bool:
@@ -271,7 +286,7 @@ def _title(field: str) -> Title:
     if not field:
         return Title()
     found = [(each, next((part for part in each.groups() if part), "").strip()) for each in _BRACKETS.finditer(field)]
-    found = [] if re.search(r"[)\]}>]\s*[:=]?\s*[-+.]?\d", field) else found  # a value follows: no title
+    found = [] if _BEHIND_UNIT.search(field) else found  # a value follows: no title
     known = [(each, text) for each, text in found if is_unit(text) or _seconds(text)]
     other = [(each, text) for each, text in found if _OTHER_UNIT.fullmatch(text) and not is_unit(text)]
     other = [(each, text) for each, text in other if not _seconds(text) and text.lower() not in SHORT]
@@ -290,7 +305,7 @@ def _bare(field: str) -> Title:
         return Title("", field, True)
     for mark in _BEFORE_BARE.finditer(field):
         word, unit = field[: mark.start()], field[mark.end() :]
-        named = word and not _VALUE.search(word) and (word + unit).lower() != "ns"
+        named = word and not _VALUE.search(word) and not _is_of_a_value(unit) and (word + unit).lower() != "ns"
         if named and (_is_bare(unit) or unit in ("G", "S") and re.fullmatch(r"acc\w*|t|time", word, re.IGNORECASE)):
             return Title(word, unit.replace("_", "/"), True)
     first, *within = field.split()

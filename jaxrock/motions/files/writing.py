@@ -90,4 +90,4 @@ def _check_name(title: str, lines: list[str], record: Record, kind: str, unit: s
 
 def _write(path, lines: list[str]) -> None:
     with written_aside(path_of("path", path), replace=True) as aside:
-        aside.write_text("\n".join(lines) + "\n")
+        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
