@@ -79,6 +79,29 @@ def test_the_equation_is_newtons(radius):
     assert float(work) == pytest.approx(height - 1, rel=1e-12)
 
 
+def test_the_balance_has_second_derivatives():
+    """Those of its closed form, along slenderness and radius, of an `Equation` of which only values are known, too."""
+
+    def closed(z):
+        return jnp.arctan2(jnp.sin(z[0]), jnp.cos(z[0]) - z[1])
+
+    def rolled(z):
+        return rk.models.Rolling(z[1]).moments(rk.Block(z[0], 2.0)).saddle
+
+    def written(z):
+        reach = lambda x, b: jnp.sin(b.alpha - x) + z[1] * jnp.sin(x)
+        return rk.models.Equation(reach).moments(rk.Block(z[0], 2.0)).saddle
+
+    at, way = jnp.array([0.2, 0.2]), jnp.array([1.0, 0.5])
+
+    @jax.jit
+    def bends(at):
+        along = lambda f: lambda z: jax.jvp(f, (z,), (way,))[1]
+        return [along(along(found))(at) for found in (closed, rolled, written)]
+
+    np.testing.assert_allclose(*np.broadcast_arrays(bends(at)[0], bends(at)[1:]), rtol=1e-9)
+
+
 def test_the_judge_of_records_is_newtons():
     """What is eliminated by hand is what is solved for; and a step of it, halved, errs by a sixteenth."""
     block, wheel = rolling.Rolling(0.3, 2.5, 0.3, 0.9, 0.7), Wheel(0.3, 2.5, 0.7, 0.3, 0.9)
