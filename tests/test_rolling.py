@@ -15,8 +15,10 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 import jaxrock as rk
+from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle
 from jaxrock.responses.arguments import engine_of
+from jaxrock.responses.contact import _ratio_of
 from references import rolling
 
 GRAVITY = 9.81
@@ -402,6 +404,15 @@ def test_the_plane_that_rocks_share():
     assert 0 <= shared.azimuth <= 0.07
     np.testing.assert_allclose(shared.weakest, [0.0, 0.06, 1.2], atol=np.pi / 90)
     assert shared.slenderness.min() == pytest.approx(np.arctan2(0.4, 2.0), rel=1e-3)
+
+
+def test_forces_by_its_own_inertia_ratio():
+    """A symmetric block that rolls has the one of its model, whatever its law of restitution knows."""
+    block = rk.Block(0.2, 2.0, rk.restitution.Housner(0.7))
+    scene = Scene.of(block, SINE, rk.models.Rolling(0.1, inertia_ratio=0.6))
+    assert [float(_ratio_of(scene, block, given)) for given in (None, 0.6)] == [0.6, 0.6]
+    with pytest.raises(ValueError, match="Argument `inertia_ratio` must be 0.6 as that of the `Rolling`, but is 0.75"):
+        _ratio_of(scene, block, 0.75)
 
 
 @pytest.mark.parametrize(
