@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
-from jaxrock.engines.scene import uplift_threshold
+from jaxrock.engines.scene import Scene, uplift_threshold
+from jaxrock.responses.own_block import check_own
 from references import hard_cases
 
 FOLDER = Path(__file__).parents[1] / "references" / "asymmetric"
@@ -207,6 +208,32 @@ def test_forces_are_those_of_the_response_and_its_block():
         assert rk.responses.contact_forces(response, own).keeps_contact
         with pytest.raises(ValueError, match="Argument `block` must be that of the response, whose"):
             rk.responses.contact_forces(response, rk.Block(0.2, 2.0))
+
+
+ASYMMETRIC = rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0)
+
+
+@pytest.mark.parametrize(
+    "own, other, told",
+    [
+        (rk.Block(0.2, 2.0), rk.Block(0.2, 2.0, rk.restitution.Housner(0.5)), "impacts leave"),
+        (rk.Block(0.2, 2.0, 0.9), rk.Block(0.2, 2.0, 0.8), "impacts leave"),
+        (
+            rk.Block(0.2, 2.0, rk.restitution.SpeedDependent(0.9, 0.7, 1.0)),
+            rk.Block(0.2, 2.0, rk.restitution.SpeedDependent(0.9, 0.6, 1.0)),
+            "impacts leave",
+        ),
+        (ASYMMETRIC, rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0, inertia_ratio=0.6), "frequencies of the ratio"),
+        (ASYMMETRIC, rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0, radius_ratio=1.2), "frequencies of the ratio"),
+    ],
+    ids=["inertia ratio", "restitution", "fast impacts", "its inertia ratio", "its radius ratio"],
+)
+@pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()], ids=["nonlinear", "linear"])
+def test_blocks_of_the_same_angles_are_told_apart(own, other, told, model):
+    scene = Scene.of(own, rk.SinePulse(0.4, 0.6), model)
+    check_own(scene, own)
+    with pytest.raises(ValueError, match=f"must be that of the response, whose .*{told}"):
+        check_own(scene, other)
 
 
 @pytest.mark.parametrize("model", [rk.Housner(), rk.Linear()])

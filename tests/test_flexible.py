@@ -1,5 +1,7 @@
 """Flexible blocks: against an independent integration, known histories, the rigid limit, conservation of energy."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,9 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.flexible.closeness import still_to_come
-from jaxrock.flexible.phases import Numbers, locked_phase, rocking_phase
+from jaxrock.flexible.closeness import approached, still_to_come
+from jaxrock.flexible.phases import Arc, Numbers, Phase, locked_phase, rocking_phase
+from jaxrock.flexible.stepper import FlexibleScene
 from references.flexible_column import PULSE, SHORT, TALL, beam, independent, largest_survived
 
 # ---------------------------------------------------------------- the column
@@ -83,6 +86,24 @@ HISTORIES = {
 }  # fmt: skip
 
 
+def test_undamped_columns_in_single_precision():
+    """Rates of their modes, which rounding of a nearly singular matrix must not spoil, beside those in double."""
+
+    def rates(damping):
+        block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, damping, masses=3)
+        phase, whole = rocking_phase(Numbers.of(block))
+        return phase.rates, whole
+
+    expected, _ = jax.jit(rates)(0.0)
+    unit_column.cache_clear()  # JAX remembers the precision of its arrays
+    with jax.enable_x64(False):
+        found, whole = jax.jit(lambda damping: rates(damping))(np.float32(0.0))
+    unit_column.cache_clear()
+    assert whole and found.dtype == np.complex64
+    found, expected = np.sort_complex(found), np.sort_complex(expected)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
 def test_no_verdict_is_given_while_the_ground_shakes():
     """A base that is far beyond its balance; the ground, which still shakes a little, might bring it back."""
     block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3)
@@ -92,6 +113,29 @@ def test_no_verdict_is_given_while_the_ground_shakes():
         assert found.status == rk.Status.undecided and found.margin < 0 and found.energy > 10
     found = rk.outcome(block, motion, duration=4.0)
     assert found.status == rk.Status.successful and found.overturned and found.margin < 0
+
+
+def test_the_verdict_of_a_base_that_has_little_energy_beyond_its_balance():
+    """It falls if nothing moves the ground any more; whether something does is told by the duration, not by its sum."""
+    block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=2)
+    motion = rk.SinePulse(0.01, 3.0)
+
+    @jax.jit
+    def found(stop, local):
+        scene = FlexibleScene.of(block, motion, stop)
+        beyond = {
+            "side": jnp.asarray(1.0),
+            "motion": 1.01 * scene.numbers.center,
+            "local": local,
+            "done": jnp.asarray(True),
+        }
+        return scene.conclude(dataclasses.replace(scene.start(), **beyond))
+
+    end = motion.end
+    shaking, ended, rounded = (found(*at) for at in ((end / 2, end / 2), (end, end), (end, end * (1 - 1e-15))))
+    assert shaking.energy < 1 and not shaking.overturned and shaking.status == rk.Status.undecided
+    for outcome in (ended, rounded):
+        assert outcome.overturned and outcome.status == rk.Status.successful
 
 
 @pytest.mark.parametrize(
@@ -270,6 +314,22 @@ def test_the_nearest_of_a_free_swing(amplitudes):
     outward, inward = amplitudes[0] * np.exp(grows * time), amplitudes[1] * np.exp(-decays * time)
     found = nearest_of_swing(*amplitudes, grows, decays)
     np.testing.assert_allclose(found, np.min(2 * (outward**2 + inward**2)), rtol=1e-8, atol=1e-10)
+
+
+def test_second_derivatives_of_the_nearest():
+    """Where it is nearest moves: beside the closed form 4 |outward inward|, within a step, too."""
+    rates, rows, one = jnp.array([1.0 + 0j, -1.0]), jnp.zeros((4, 2)) + 0j, jnp.asarray(1.0)
+
+    def within_a_step(z):
+        phase = Phase(rates, rows, rows.T, rates, rows)
+        path = Arc(phase, rows[:, 0].real, rows[:, 0].real, z + 0j, 2 * rates, rows[:1], rows[0].real)
+        return approached(path, one, one, one, (10 * one, 10 * one))[0]
+
+    ahead = lambda z: still_to_come(z[0], z[1], one, one)
+    for nearest in (ahead, within_a_step):
+        value, bend = jax.jit(lambda z, f=nearest: (f(z), jax.hessian(f)(z)))(jnp.array([0.1, -0.3]))
+        assert float(value) == pytest.approx(0.12, rel=1e-9)
+        np.testing.assert_allclose(bend, [[0.0, -4.0], [-4.0, 0.0]], atol=1e-8)
 
 
 @pytest.mark.slow

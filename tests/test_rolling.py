@@ -15,8 +15,10 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 import jaxrock as rk
+from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle
 from jaxrock.responses.arguments import engine_of
+from jaxrock.responses.contact import _ratio_of
 from references import rolling
 
 GRAVITY = 9.81
@@ -77,6 +79,29 @@ def test_the_equation_is_newtons(radius):
     assert float(slope) == pytest.approx(np.sin(balance) ** 2 / np.sin(alpha), rel=1e-10)
     height = np.hypot(np.sin(alpha), np.cos(alpha) - radius) + radius
     assert float(work) == pytest.approx(height - 1, rel=1e-12)
+
+
+def test_the_balance_has_second_derivatives():
+    """Those of its closed form, along slenderness and radius, of an `Equation` of which only values are known, too."""
+
+    def closed(z):
+        return jnp.arctan2(jnp.sin(z[0]), jnp.cos(z[0]) - z[1])
+
+    def rolled(z):
+        return rk.models.Rolling(z[1]).moments(rk.Block(z[0], 2.0)).saddle
+
+    def written(z):
+        reach = lambda x, b: jnp.sin(b.alpha - x) + z[1] * jnp.sin(x)
+        return rk.models.Equation(reach).moments(rk.Block(z[0], 2.0)).saddle
+
+    at, way = jnp.array([0.2, 0.2]), jnp.array([1.0, 0.5])
+
+    @jax.jit
+    def bends(at):
+        along = lambda f: lambda z: jax.jvp(f, (z,), (way,))[1]
+        return [along(along(found))(at) for found in (closed, rolled, written)]
+
+    np.testing.assert_allclose(*np.broadcast_arrays(bends(at)[0], bends(at)[1:]), rtol=1e-9)
 
 
 def test_the_judge_of_records_is_newtons():
@@ -379,6 +404,15 @@ def test_the_plane_that_rocks_share():
     assert 0 <= shared.azimuth <= 0.07
     np.testing.assert_allclose(shared.weakest, [0.0, 0.06, 1.2], atol=np.pi / 90)
     assert shared.slenderness.min() == pytest.approx(np.arctan2(0.4, 2.0), rel=1e-3)
+
+
+def test_forces_by_its_own_inertia_ratio():
+    """A symmetric block that rolls has the one of its model, whatever its law of restitution knows."""
+    block = rk.Block(0.2, 2.0, rk.restitution.Housner(0.7))
+    scene = Scene.of(block, SINE, rk.models.Rolling(0.1, inertia_ratio=0.6))
+    assert [float(_ratio_of(scene, block, given)) for given in (None, 0.6)] == [0.6, 0.6]
+    with pytest.raises(ValueError, match="Argument `inertia_ratio` must be 0.6 as that of the `Rolling`, but is 0.75"):
+        _ratio_of(scene, block, 0.75)
 
 
 @pytest.mark.parametrize(

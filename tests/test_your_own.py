@@ -12,6 +12,10 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.engines.bookkeeping import escaped
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import initial_state
+from jaxrock.models.equation import Angle
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import _outcome
 from jaxrock.studies.parameters import declarations, named
@@ -482,6 +486,13 @@ def test_a_moment_that_never_vanishes_is_for_diffrax():
     np.testing.assert_allclose(found.max_rotation, 0.2044127, rtol=1e-6)  # by SciPy's DOP853
 
 
+def test_a_moment_that_rights_again_is_for_diffrax():
+    """The free stage of the series engine knows one balance."""
+    model = OfTerms(RISING, rk.models.Terms(constant=1.0))
+    with pytest.raises(ValueError, match="must not right the block again between its balance and pi/2"):
+        rk.outcome(BLOCK, rk.SinePulse(0.5, 0.9), model)
+
+
 @pytest.mark.slow
 def test_what_no_help_is_needed_for_comes_back():
     """The arm is negative far out, where the push that helps is the one that drove before; by SciPy's DOP853."""
@@ -502,3 +513,92 @@ def test_a_law_says_that_it_depends_on_the_speed():
 
     with pytest.raises(ValueError, match="ratio of a Quiet depends on the speed of the impact, so its property"):
         Quiet()
+
+
+def rights_itself(x, block):
+    """Housner's moment and a tether that tightens from 0.3 on."""
+    return jnp.sin(block.alpha - x) + 5 * jnp.maximum(x - 0.3, 0.0) ** 2
+
+
+class OfTerms(rk.models.AbstractEquation):
+    """Any terms."""
+
+    restoring: rk.models.Terms
+    arm: rk.models.Terms
+
+    def moments(self, block):
+        return rk.models.Coefficients(*jax.tree.map(lambda c: 0 * block.alpha + c, (self.restoring, self.arm)))
+
+
+HOUSNER = rk.models.Terms(sine=-np.cos(0.2), cosine=np.sin(0.2))
+RISING = rk.models.Terms(constant=0.99, sine=-np.cos(1.2), cosine=-np.sin(1.2))  # below zero from 0.23 to 0.51 only
+
+
+@pytest.mark.parametrize(
+    "model, ceiling, opening, lost",
+    [
+        (rk.models.Rolling(rk.blocks.Edge([0.0, 0.0, 2.0, 2.0], [0.0, 0.21, 0.22, 1.5])), 1e-4, 0.205, False),
+        (rk.models.Rolling(0.01), 1e-4, 0.3, True),
+        (rk.models.Equation(rights_itself), 1e-4, 0.3, False),
+        (rk.models.Equation(lambda x, b: jnp.sin(b.alpha - x)), 1e-4, 0.3, True),
+        (OfTerms(RISING, rk.models.Terms(constant=1.0)), 1e-4, 0.3, False),
+        (OfTerms(HOUSNER, rk.models.Terms(cosine=1.0, sine=-3.0)), 0.5, 0.32, False),
+        (OfTerms(HOUSNER, rk.models.Terms(cosine=1.0, sine=-3.0)), 0.01, 0.32, True),
+        (OfTerms(HOUSNER, rk.models.Terms(constant=1.0, line=10.0)), 0.12, 0.9, False),
+    ],
+    ids=["edge", "circle", "tether", "no tether", "rising terms", "turning arm", "little help", "growing arm"],
+)
+def test_what_may_be_held_further_on_is_not_lost(model, ceiling, opening, lost):
+    """Past its balance, where nothing holds the block, it is lost only where nothing does up to pi/2."""
+
+    @jax.jit
+    def found(opening):
+        scene = Scene.of(BLOCK, rk.RectangularPulse(ceiling, 0.9), model)
+        engine = rk.Series() if model.is_series else rk.Diffrax()
+        state = initial_state(scene, opening, jnp.asarray(1e-3))
+        return escaped(engine.stepper(scene, None, history=False), state, Angle.of(state.opening))
+
+    assert bool(found(jnp.asarray(opening))) == lost
+
+
+@pytest.mark.parametrize(
+    "restoring, arm, push, opening",
+    [
+        (rk.models.Terms(constant=-0.9, sine=-np.cos(1.3), cosine=np.sin(1.3)), (1.0, 0.0, 0.0), 0.05, 0.2),
+        (rk.models.Terms(constant=0.2, sine=-0.9, cosine=0.1), (1.0, 0.0, 0.0), 0.2, 0.4),
+        (RISING, (1.0, 0.0, 0.0), 0.05, 0.235),
+        (HOUSNER, (0.0, -5.0, 1.0), 0.5, 0.5),
+        (HOUSNER, (0.0, -5.0, 1.0), 0.5, 0.1),
+        (HOUSNER, (0.0, -0.3, 1.0), 0.2, 0.3),
+        (HOUSNER, (2.0, None, -1.0), 0.2, 0.3),
+    ],
+)
+def test_speed_that_is_enough_under_the_most_helpful_forcing(restoring, arm, push, opening):
+    """No less than by the work of what holds, under a forcing of the one sign or the other, up to where that ends."""
+    arm = rk.models.Terms(*(None if c == 0.0 else c for c in (arm[0], None, *arm[1:])))
+    angles = np.linspace(opening, np.pi / 2, 200_001)
+
+    def summed(terms, x):
+        constant, _, sine, cosine = (0.0 if c is None else c for c in terms.coefficients)
+        return constant + sine * np.sin(x) + cosine * np.cos(x)
+
+    holds = summed(restoring, angles) + push * np.abs(summed(arm, angles))
+    work = np.concatenate([[0.0], np.cumsum((holds[1:] + holds[:-1]) / 2)]) * (angles[1] - angles[0])
+    moments = rk.models.Coefficients(*jax.tree.map(jnp.asarray, (restoring, arm)))
+    at = Angle.of(jnp.asarray(opening))
+    push = jnp.asarray(push)
+    hold = moments.held(at, jnp.zeros(()), push)
+    assert float(hold) == pytest.approx(holds[0], rel=1e-12)
+    assert float(hold) > 0 and float(moments.held_manifold(at, hold, push)) >= np.sqrt(2 * work.max()) * (1 - 1e-6)
+
+
+def test_factors_of_functions_multiply():
+    """As those of other moments."""
+
+    @jax.jit
+    def found(x):
+        moments = rk.models.Equation(rights_itself).moments(BLOCK)
+        return moments.times(2.0).times(3.0).restoring(Angle.of(x)), moments.restoring(Angle.of(x))
+
+    times, once = found(jnp.asarray(0.1))
+    assert float(times) == pytest.approx(6 * float(once), rel=1e-15)

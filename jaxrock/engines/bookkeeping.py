@@ -41,12 +41,13 @@ def escaped(stepper: AbstractStepper, state: State, angle: Angle) -> Flag:
     """Whether no forcing still to come can bring it back.
 
     The most helpful forcing is the bound of all that is to come, for good: the block is lost if it is past the
-    stable manifold even then.
+    stable manifold even then, and if nothing holds it here or further on.
     """
     moments = stepper.scene.moments
     ceiling, weight = stepper.scene.outlook.most_helpful(state.piece)
     hold = moments.held(angle, state.velocity, ceiling, weight)
-    needed = where(hold > 0, moments.held_manifold(angle, hold, ceiling, weight), 0.0)
+    forced = angle, hold, ceiling, weight
+    needed = where(hold > 0, moments.held_manifold(*forced), moments.unheld_manifold(*forced))
     certain = state.velocity - needed > stepper.doubt * state.spread.error_of(1.0, 1.0)
     return state.beyond & (state.velocity >= 0) & certain
 

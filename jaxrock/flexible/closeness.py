@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact, Int
 
 from jaxrock.flexible.phases import Arc, Phase
+from jaxrock.numerics.roots import carried
 
 Scalar = Inexact[Array, ""]
 _HALVINGS = 40  # of a step, in which the distance is least
@@ -45,9 +46,16 @@ def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tu
         falls = slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
-    # Least where it ceases to fall; the derivative of the least value needs no derivative of its place.
+    # Least where it ceases to fall, a place that moves, which second derivatives feel; not where it only rises.
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (0 * still, still))
     place = jax.lax.stop_gradient((low + high) / 2)
+
+    def left(x):
+        value, bend = jax.jvp(slope, (x,), (jnp.ones_like(x),))
+        inside = (low > 0) & (high < still) & (bend > 0)
+        return jnp.where(inside, value / jnp.where(inside, bend, 1.0), 0.0)
+
+    place = carried(place, left, 1)
     rocking = side != 0
     least = jnp.where(rocking, jnp.minimum(distance(place), distance(end)), jnp.inf)
     was, now = (sum(parts(x)) > 0 for x in (0 * still, end))
@@ -59,7 +67,5 @@ def still_to_come(outward: Scalar, inward: Scalar, grows: Scalar, decays: Scalar
     """The least squared distance [rad^2] of free rocking from these amplitudes on; rates [1/s], both positive."""
     safe = jnp.where(outward == 0, 1.0, outward)
     time = jnp.log(jnp.maximum(decays * inward**2 / (grows * safe**2), 1.0)) / (2 * (grows + decays))
-    time = jax.lax.stop_gradient(jnp.where(outward == 0, jnp.inf, time))
-    return 2 * (
-        jnp.where(outward == 0, 0.0, outward * jnp.exp(grows * time)) ** 2 + (inward * jnp.exp(-decays * time)) ** 2
-    )
+    nearest = 2 * ((safe * jnp.exp(grows * time)) ** 2 + (inward * jnp.exp(-decays * time)) ** 2)
+    return jnp.where(outward == 0, 0.0, nearest)

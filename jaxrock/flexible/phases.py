@@ -11,6 +11,7 @@ theta = balance side. Its rates are the zeros of one function; left and right ve
 """
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,11 +25,22 @@ from jaxrock.numerics.exponential_sums import Curve, powers
 
 Scalar = Inexact[Array, ""]
 
-# Damping ratio below which the base follows the column at once, and the least that is computed with.
-UNDAMPED, _LEAST = 1e-9, 1e-13
-_EASY = 1e-8  # damping ratio from which on eigenvalues are found as they are
+
+class _Damping(NamedTuple):
+    """Damping ratios on which it depends how a column is computed."""
+
+    felt: float  # below it the base follows the column at once
+    least: float  # that is computed with
+    easy: float  # from which on eigenvalues are found as they are
+
+
+_IN_DOUBLE, _IN_SINGLE = _Damping(1e-9, 1e-13, 1e-8), _Damping(1e-5, 1e-6, 1e-5)  # found by trial: rounding decides
 _TERMS = 21  # of the Taylor series of modes that hardly turn within a step
 _FACTORIALS = np.array([float(math.factorial(k)) for k in range(_TERMS)])
+
+
+def _limits(dtype) -> _Damping:
+    return _IN_DOUBLE if jnp.finfo(dtype).eps < 1e-10 else _IN_SINGLE
 
 
 class Numbers(eqx.Module):
@@ -54,8 +66,9 @@ class Numbers(eqx.Module):
         """Reduce a block of scalars."""
         column = unit_column(block.masses)
         dtype = jnp.result_type(block.width, block.youngs_modulus)
-        ratio = jnp.maximum(block.damping_ratio, _LEAST) + 0 * block.damping_ratio
-        damped = block.damping_ratio >= UNDAMPED
+        limits = _limits(dtype)
+        ratio = jnp.maximum(block.damping_ratio, limits.least) + 0 * block.damping_ratio
+        damped = block.damping_ratio >= limits.felt
         block = eqx.tree_at(lambda b: b.damping_ratio, block, ratio)
         mass_damping, damping = block.damping_rates
         squares = block.frequencies**2
@@ -197,8 +210,9 @@ def _characteristic(numbers: Numbers, rates) -> tuple:
 def _rocking_rates(numbers: Numbers) -> Complex[Array, " rates"]:
     """Zeros of the characteristic function: eigenvalues, polished by Newton's method, which carries derivatives."""
     held = jax.lax.stop_gradient(numbers)
+    limits = _limits(held.squares.dtype)
     # The matrix of (q, q', theta) is singular without damping: start from a little, and follow the rates from there.
-    easier = jnp.maximum(_EASY / jnp.maximum(_ratio(held), _LEAST), 1.0)
+    easier = jnp.maximum(limits.easy / jnp.maximum(_ratio(held), limits.least), 1.0)
     damping, n = held.damping * easier, held.squares.size
     looseness = jnp.sum(held.rotation**2 * damping)
     stiffness = jnp.sum(held.rotation**2 * held.squares) - held.spring_rate

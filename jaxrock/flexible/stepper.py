@@ -60,9 +60,10 @@ class FlexibleOutcome(AbstractTable):
     - `margin`: signed distance to overturning [-], by the rocking part of the motion (its unstable mode and the one
       that mirrors it, without vibrations): 1 if the base has not turned, positive if the block survives, zero where
       it comes to balance, negative if it overturns. Of rigid and undamped rocking it is (1 - peak/balance)^2.
-    - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself.
-    - `status`: a `Status`; `undecided` if, at the end, the energy suffices to overturn but the block is not lost, which
-      it is not known to be while the ground shakes.
+    - `energy`: energy at the end over that of the unstable equilibrium [-]; below 1 no block overturns by itself
+      unless it is already beyond.
+    - `status`: a `Status`; `undecided` if, at the end, the block would overturn by itself, or has the energy to, but is
+      not lost, which it is not known to be while the ground shakes.
     """
 
     max_rotation: Scalar
@@ -285,9 +286,11 @@ class FlexibleScene(eqx.Module):
     def conclude(self, state: FlexibleState) -> FlexibleOutcome:
         """What came of it, from the state at the end."""
         gone = state.fallen | self._never_returns(state)
-        lost = state.fallen | (gone & (self.time(state) >= self.knots[-1]))  # the ground may bring it back
+        # The stop itself: the sum of piece and local time is rounded.
+        until = jnp.where(state.done & (state.status == Status.successful), self.stop, self.time(state))
+        lost = state.fallen | (gone & (until >= self.knots[-1]))  # the ground may bring it back
         total = sum(self.energy(state.motion)) / self.summit
-        status = Status.where(lost | (total < 1), state.status, Status.undecided)
+        status = Status.where(lost | ((total < 1) & ~gone), state.status, Status.undecided)
         status = Status.where(state.status == Status.successful, status, state.status)
         status = Status.where(state.done, status, Status.step_budget_exhausted)
         length = jnp.cos(self.numbers.alpha) * self.block.length

@@ -9,6 +9,7 @@ A coefficient that a model does not have is None, so that nothing is computed fo
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import replace
@@ -121,6 +122,7 @@ class Terms(eqx.Module):
 
 
 _AT_REST = Basis(_ONE, None, None, _ONE)  # sin 0 is zero
+_FLAT = Angle(math.pi / 2, 1.0, 0.0)
 
 
 class Coefficients(AbstractMoments):
@@ -129,7 +131,8 @@ class Coefficients(AbstractMoments):
     **Arguments:**
 
     - `restoring_terms`: a constant and a line; or a sine, with a cosine or a constant or both. What follows from the
-      moment in closed form (balance, free swings) is known for these. It is positive at x = 0.
+      moment in closed form (balance, free swings) is known for these. It is positive at x = 0;
+      where it is so again between the balance and pi/2, only `Diffrax()` solves it.
     - `arm_terms`: any terms; positive at x = 0.
 
     **Raises:** ValueError for other terms of the restoring moment.
@@ -138,6 +141,7 @@ class Coefficients(AbstractMoments):
     restoring_terms: Terms
     arm_terms: Terms
     known_saddle: Scalar | None = None  # where it is known beforehand: it is asked for often
+    arm_lasts: bool = eqx.field(static=True, default=False)  # whether its arm is known to be positive up to pi/2
 
     def __check_init__(self) -> None:
         moment = self.restoring_terms
@@ -240,12 +244,41 @@ class Coefficients(AbstractMoments):
         distance = 2 * sine_cosine(gap / 2)[0] if self.sinusoidal else gap
         return jnp.sqrt(self.stiffness) * distance
 
+    @property
+    def _arm_may_turn(self) -> bool:
+        """Whether the arm may change its sign or grow before pi/2, by its form."""
+        arm = self.arm_terms
+        several = arm.constant is not None and arm.cosine is not None
+        return not self.arm_lasts and (arm.line is not None or arm.sine is not None or several)
+
+    @property
+    def _may_right_again(self) -> bool:
+        """Whether the restoring moment may rise again before pi/2, by its form."""
+        return self.restoring_terms.constant is not None and self.restoring_terms.cosine is not None
+
+    def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """As for any moments."""
+        held = self.held_either_way if self._arm_may_turn else super().held
+        return held(angle, velocity, push, weight)
+
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments. For a spring with a line or a constant it is more than enough: what holds stays below a
-        line from `hold` to zero. Infinite for an arm of which that is not known."""
-        moment, arm, factor = self.restoring_terms, self.arm_terms, 1.0 if weight is None else weight
+        line from `hold` to zero. Infinite for an arm, or a restoring moment, of which that is not known."""
+        arm = self.arm_terms
         if arm.line is not None:
             return jnp.full_like(hold, jnp.inf)
+        if not self._arm_may_turn:
+            return self._enough(angle, hold, push, weight)
+        # An arm without a line has at most one zero up to pi/2.
+        here, flat = self.arm(angle), arm.summed(Basis.at(_FLAT))
+        lasts = here * flat > 0
+        if arm.constant is not None and arm.cosine is not None:  # concave, so that its tangent is above it
+            lasts = lasts & (arm.constant >= 0) & (arm.cosine >= 0)
+        return where(lasts, self._enough(angle, hold, push * jnp.sign(here), weight), jnp.inf)
+
+    def _enough(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None) -> Scalar:
+        """`held_manifold` by an arm that keeps its sign, which is that of `push`."""
+        moment, arm, factor = self.restoring_terms, self.arm_terms, 1.0 if weight is None else weight
         if self.sinusoidal and self.skew is None and arm.constant is None:
             sines, cosines = (
                 Terms(*pair).summed(Basis(factor, push, None, None))
@@ -256,11 +289,25 @@ class Coefficients(AbstractMoments):
             return jnp.full_like(hold, jnp.inf)
         if not self.sinusoidal:  # its sum with an arm that is a constant, or a cosine, is concave: the tangent
             slope = self.repulsion(angle, push, weight)
-        else:  # convex up to pi/2 with a constant, concave without: the chord; the arm, a cosine, is concave
-            flat = Angle(jnp.pi / 2, 1.0, 0.0)
-            fall = factor * (self.restoring(angle) - self.restoring(flat))
-            slope = fall / jnp.maximum(jnp.pi / 2 - angle.value, jnp.finfo(hold.dtype).eps)
+        else:  # convex up to pi/2, so that it is below its chord; the arm, a cosine, is concave
+            fall = self.restoring(angle) - self.restoring(_FLAT)
+            slope = factor * fall / jnp.maximum(jnp.pi / 2 - angle.value, jnp.finfo(hold.dtype).eps)
+            if self._may_right_again:  # concave at first where the constant is negative: below its tangent or its chord
+                slope = jnp.minimum(slope, -factor * moment.summed(Basis.at(angle).derivative))
             slope = slope + push * _or_zero(arm.cosine) * angle.sine
         # Without weight the forcing alone brings it back.
         light = jnp.zeros_like(slope, bool) if weight is None else weight <= 0
+        if self._may_right_again:  # and it rights itself again where its moment does not fall any more at pi/2
+            light = light | (jnp.asarray(moment.cosine) <= 0)
         return where(light, jnp.inf, hold / jnp.sqrt(where(light, 1.0, slope)))
+
+    def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
+        """As for any moments; infinite, too, where bounds of moment and arm further on do not exclude that they hold
+        it."""
+        if not self._arm_may_turn and not self._may_right_again:
+            return 0.0
+        arm, flat = self.arm_terms, self.restoring(_FLAT)
+        most = jnp.abs(_or_zero(arm.constant)) + jnp.abs(_or_zero(arm.line)) * jnp.pi / 2
+        most = push * (most + _length(_or_zero(arm.sine), arm.cosine))
+        # The restoring moment falls, or rises again: it is largest at an end.
+        return where((flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0), jnp.inf, 0.0)

@@ -19,6 +19,7 @@ from jaxrock.blocks.rigid import Block, Side
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine
 from jaxrock.numerics.gauss_legendre import gauss_legendre_of_unit
+from jaxrock.numerics.roots import carried
 
 Scalar = Inexact[Array, ""]
 _GAUSS = gauss_legendre_of_unit(12)
@@ -92,9 +93,18 @@ class AbstractMoments(eqx.Module):
         forcing at the angle, positive.
         """
 
+    def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
+        """The same where `hold` is not positive: zero, unless something further on may hold it."""
+        return 0.0
+
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """The largest acceleration inward under a forcing of this size or less [g]."""
         return -self.acceleration(angle, velocity, push, weight)
+
+    def held_either_way(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """The same where the arm may be negative."""
+        one, other = (-self.acceleration(angle, velocity, way * push, weight) for way in (1, -1))
+        return jnp.maximum(one, other)
 
     def work(self, opening: Scalar) -> Scalar:
         """Work of the weight up to an opening angle, over m g R: half the squared speed on the ground after a free fall
@@ -162,10 +172,27 @@ class AbstractEquation(Owner):
         return True
 
 
+def last_rise(moments: AbstractMoments, like: Scalar) -> Scalar:
+    """The opening angle from which on up to pi/2 the restoring moment over the arm only falls, by a scan, without
+    derivatives: what does not hold a block there will not hold it further on. `like`: a number of the same type."""
+    grid = _grid(like)
+
+    def strength(x):
+        at = Angle.of(x)
+        return moments.restoring(at) / jnp.abs(moments.arm(at))
+
+    found = jax.vmap(strength)(grid)
+    return jax.lax.stop_gradient(jnp.max(where(found[1:] > found[:-1], grid[1:], 0.0)))
+
+
+def _grid(like: Scalar) -> Inexact[Array, " angles"]:
+    return jnp.linspace(0.0, jnp.pi / 2, 257, dtype=like.dtype)
+
+
 def first_zero(moment: Callable, like: Scalar) -> Scalar:
-    """Where a moment that rights a block first vanishes, at most pi/2: a scan, bisection, and a Newton step that
-    carries the derivatives. `like`: a number of the same type."""
-    grid = jnp.linspace(0.0, jnp.pi / 2, 257, dtype=like.dtype)
+    """Where a moment that rights a block first vanishes, at most pi/2: a scan, bisection, and the derivatives of the
+    implicit function. `like`: a number of the same type."""
+    grid = _grid(like)
     falls = jax.lax.stop_gradient(jax.vmap(moment)(grid)) <= 0
     first = jnp.argmax(falls)
 
@@ -176,6 +203,10 @@ def first_zero(moment: Callable, like: Scalar) -> Scalar:
         return where(above, middle, low), where(above, high, middle)
 
     low, _ = jax.lax.fori_loop(0, 60, halve, (grid[jnp.maximum(first - 1, 0)], grid[first]))
-    low = jax.lax.stop_gradient(low)
-    root = low - moment(low) / jax.lax.stop_gradient(jax.grad(moment)(low))
-    return where(jnp.any(falls), root, jnp.pi / 2)
+    found = jnp.any(falls)
+
+    def left(x):
+        value, slope = jax.value_and_grad(moment)(x)
+        return value / where(found, slope, 1.0)
+
+    return where(found, carried(jax.lax.stop_gradient(low), left), jnp.pi / 2)

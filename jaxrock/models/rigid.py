@@ -14,7 +14,7 @@ class Housner(AbstractEquation):
     def moments(self, block: Block | Side) -> Coefficients:
         """sin(alpha - x) = sin(alpha) cos x - cos(alpha) sin x; its arm is cos(alpha - x)."""
         sine, cosine = sine_cosine(block.alpha)  # a quotient of XLA's own becomes a tangent, which LLVM may lack
-        return Coefficients(Terms(sine=-cosine, cosine=sine), Terms(sine=sine, cosine=cosine))
+        return Coefficients(Terms(sine=-cosine, cosine=sine), Terms(sine=sine, cosine=cosine), arm_lasts=True)
 
 
 class Linear(AbstractEquation):

@@ -14,7 +14,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero, last_rise
 from jaxrock.numerics.elementary import sine_cosine
 
 Scalar = Inexact[Array, ""]
@@ -91,12 +91,14 @@ class RollingMoments(AbstractMoments):
     edge: Edge
     factor: Scalar  # of all accelerations (see `times`)
     saddle: Scalar
+    firm: Scalar | None = None  # up to where it may right itself again (`last_rise`); None: nowhere, on a circle
 
     @classmethod
     def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
         """Of a block, or a side."""
         made = cls(Angle.of(alpha), ratio, edge, jnp.ones_like(alpha), alpha)
-        return replace(made, saddle=_balance(made))
+        firm = None if edge.angle is None else _firm(made)
+        return replace(made, saddle=_balance(made), firm=firm)
 
     def times(self, factor: Scalar | float) -> "RollingMoments":
         """As for any moments."""
@@ -162,11 +164,20 @@ class RollingMoments(AbstractMoments):
         """As for any moments; infinite, because it may roll on to a firmer part."""
         return jnp.full_like(hold, jnp.inf)
 
+    def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar | float:
+        """As for any moments; on a circle nothing is firmer further on."""
+        return 0.0 if self.firm is None else jnp.where(angle.value < self.firm, jnp.inf, 0.0)
+
 
 @one_program
 def _balance(moments: RollingMoments) -> Scalar:
     """The opening angle at which the centre of mass is over the point of contact, at most pi/2."""
     return first_zero(lambda x: moments.rolled(Angle.of(x)).reach, moments.saddle)
+
+
+@one_program
+def _firm(moments: RollingMoments) -> Scalar:
+    return last_rise(moments, moments.saddle)
 
 
 def _alike(first: Edge, second: Edge) -> tuple[Edge, Edge]:

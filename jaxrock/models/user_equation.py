@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxrock._arguments import arguments
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
-from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero
+from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero, last_rise
 
 _CREEP = 1e-30  # a velocity at which nothing but what jumps is felt
 
@@ -140,6 +140,7 @@ class FunctionMoments(AbstractMoments):
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
+    firm: Scalar  # up to where it may right itself again (`last_rise`)
 
     def __init__(self, function: Callable, block: Block | Side, factor: Scalar | float | None = None):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
@@ -149,6 +150,7 @@ class FunctionMoments(AbstractMoments):
             jnp.where(moment > 0, moment, jnp.nan) for moment in (self.restoring(zero), self.arm(zero))
         )
         self.saddle = first_zero(lambda x: self.restoring(Angle.of(x)), block.alpha)
+        self.firm = last_rise(self, block.alpha)
 
     def acceleration(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """Acceleration of the opening angle per (p t)^2; push = side u, weight = 1 + v (None: 1)."""
@@ -163,7 +165,7 @@ class FunctionMoments(AbstractMoments):
 
     def times(self, factor: Scalar | float) -> "FunctionMoments":
         """As for any moments."""
-        return FunctionMoments(self.function, self.block, factor)
+        return FunctionMoments(self.function, self.block, factor if self.factor is None else factor * self.factor)
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
@@ -188,9 +190,12 @@ class FunctionMoments(AbstractMoments):
 
     def held(self, angle: Angle, velocity: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; far from rest the arm may be negative."""
-        one, other = (-self.acceleration(angle, velocity, way * push, weight) for way in (1, -1))
-        return jnp.maximum(one, other)
+        return self.held_either_way(angle, velocity, push, weight)
 
     def held_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments; infinite, because nothing is known of the function beyond this angle."""
         return jnp.full_like(hold, jnp.inf)
+
+    def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
+        """As for any moments."""
+        return jnp.where(angle.value < self.firm, jnp.inf, 0.0)

@@ -40,7 +40,7 @@ _COSINE = (
     3.95653834291857e-19,
 )
 
-# Of artanh(x)/x in x^2, |x| < 0.1716.
+# Of artanh(x)/x in x^2, |x| < 0.1725.
 _LOGARITHM = tuple(1 / (2 * k + 1) for k in range(11))
 
 # Of arctan(x)/x in x^2, |x| < tan(pi/8): interpolation as above, errors below 3e-18.
@@ -58,6 +58,10 @@ _ARCTANGENT = (
     0.03795171422296338,
     -0.017790395523288063,
 )
+
+# The first of these parts has few digits, and zeros behind them.
+_LOGARITHM_OF_2 = (0.6931471803691238, 1.9082149292705877e-10)
+_LOGARITHM_OF_2_IN_SINGLE = (0.693359375, -2.1219444005469057e-4)
 
 # Of exp(x), |x| < 0.347.
 _EXPONENTIAL = tuple(1 / math.factorial(k) for k in range(14))
@@ -127,8 +131,8 @@ def _logarithm_written(x):
     info = jnp.finfo(x.dtype)
     one, bias = 1 << info.nmant, info.maxexp - 1
     bits = jax.lax.bitcast_convert_type(x, jnp.int64 if info.bits == 64 else jnp.int32)
-    # x = 2^power times a number in [1/sqrt 2, sqrt 2).
-    power = ((bits + (one // 2 - one // 12)) >> info.nmant) - bias
+    # x = 2^power times a number in [17/24, 17/12), about [1/sqrt 2, sqrt 2).
+    power = ((bits + (one // 2 + one // 12)) >> info.nmant) - bias
     part = jax.lax.bitcast_convert_type(bits - power * one, x.dtype)
     ratio = (part - 1) / (part + 1)
     square = ratio * ratio
@@ -151,7 +155,8 @@ def _exponential_written(x):
     info = jnp.finfo(x.dtype)
     power = jnp.round(jnp.clip(x / math.log(2), info.minexp - 1, info.maxexp))
     # ln 2 in two parts: the products with the first are exact.
-    rest = (x - power * 0.6931471803691238) - power * 1.9082149292705877e-10
+    parts = _LOGARITHM_OF_2 if info.bits == 64 else _LOGARITHM_OF_2_IN_SINGLE
+    rest = (x - power * parts[0]) - power * parts[1]
     integer = jnp.int64 if info.bits == 64 else jnp.int32
 
     def power_of_two(k):

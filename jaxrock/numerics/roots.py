@@ -15,8 +15,9 @@ _MOST_STEPS = 100
 def bracketed_root(function: Callable, lower: Real, upper: Real, *parameters: Real) -> Real:
     """Where `function(x, *parameters)`, elementwise, changes its sign between `lower` and `upper`.
 
-    Where it does not, the end with the smaller value is returned. Derivatives of every order with respect to the
-    parameters (none to the bracket) come from the implicit function; `function` must not close over traced values.
+    Where it does not, the end where it is smaller in size is returned. Derivatives of every order with respect to the
+    parameters (none to the bracket) come from the implicit function, at such an end, too, where they mean nothing;
+    `function` must not close over traced values.
     """
     shape = jnp.broadcast_shapes(*(jnp.shape(value) for value in (lower, upper, *parameters)))
     return search_root(lambda x: function(x, *parameters), *(jnp.broadcast_to(end, shape) for end in (lower, upper)))
@@ -29,7 +30,7 @@ def _bracketed_root_jvp(function, primals, tangents):
     _, change_by = jax.linearize(function, root, *parameters)  # once: it may hold a search, too
     slope = change_by(jnp.ones_like(root), *map(jnp.zeros_like, parameters))
     change = change_by(jnp.zeros_like(root), *changes)
-    flat = slope == 0  # no root, or a double one
+    flat = slope == 0  # a double root, or an end that is none
     return root, jnp.where(flat, 0.0, -change / jnp.where(flat, 1.0, slope))
 
 

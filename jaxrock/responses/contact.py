@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import scalar
+from jaxrock._checks import is_traced, scalar, shown
 from jaxrock._parameters import check_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -13,6 +14,7 @@ from jaxrock.blocks.restitution import Housner, ratio_of_inertia
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
 from jaxrock.models.equation import Angle, Rolled
+from jaxrock.models.rolling import RollingMoments
 from jaxrock.motions.shaking import Shaking
 from jaxrock.responses.history import Response, evaluation
 from jaxrock.responses.own_block import check_own
@@ -69,24 +71,35 @@ def contact_forces(
 
     - `response`: of `simulate`, of one scene.
     - `block`: that of the response.
-    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; None: what its law of restitution
-      knows (of a block that was made with an inertia ratio), or 3/4, a rectangle's. An `AsymmetricBlock` has its own.
+    - `inertia_ratio`: m R^2/I about a corner [-], in (0, 1], of a symmetric `Block`; None: that of its `Rolling`, or
+      what its law of restitution knows (of a block that was made with an inertia ratio), or 3/4, a rectangle's. An
+      `AsymmetricBlock` has its own.
 
     **Returns:** a `Contact`.
 
-    **Raises:** ValueError for a value outside its range, or for another block than that of the response.
+    **Raises:** ValueError for a value outside its range, or for another block or inertia ratio than that of the
+    response.
 
     **Source:** momentum of the centre of mass, on a circle about the corner, or as it rolls (Shenton 1996 for the
     beginning of rocking); at an impact, of the impulse that angular momentum about the new corner implies.
     """
-    if inertia_ratio is None:
-        known = block.law.inertia_ratio if isinstance(block.law, Housner) else None
-        inertia_ratio = 0.75 if known is None else known
-    ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", inertia_ratio))
     check_single(block=block)
     response.trajectory.check_single()
     check_own(response.scene, block)
+    ratio = scalar("inertia_ratio", ratio_of_inertia("inertia_ratio", _ratio_of(response.scene, block, inertia_ratio)))
     return _contact(response, block, ratio)
+
+
+def _ratio_of(scene: Scene, block: Block | AsymmetricBlock, given: ArrayLike | None) -> ArrayLike:
+    """The inertia ratio that is given, or known of a symmetric block."""
+    moments = scene.moments
+    own = moments.ratio if isinstance(moments, RollingMoments) and isinstance(block, Block) else None
+    if given is None:
+        known = block.law.inertia_ratio if isinstance(block.law, Housner) else None
+        return own if own is not None else 0.75 if known is None else known
+    if own is not None and not is_traced((own, given)) and not np.allclose(own, given, rtol=1e-5, atol=0):
+        raise ValueError(f"Argument `inertia_ratio` must be {own:.6g} as that of the `Rolling`, but is {shown(given)}.")
+    return given
 
 
 @jax.jit

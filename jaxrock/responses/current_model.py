@@ -15,7 +15,7 @@ from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.models.equation import AbstractEquation
+from jaxrock.models.equation import AbstractEquation, Angle
 from jaxrock.models.spring import Spring
 from jaxrock.models.user_equation import Equation, Functions
 from jaxrock.transforms.user_function import UserFunction
@@ -85,13 +85,19 @@ def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Bl
 def _faults(model: AbstractEquation, block: Block | Side) -> dict[str, Bool[Array, ""]]:
     if isinstance(model, Equation):
         return {message: jnp.any(applies) for message, applies in model.faults(block).items()}
-    saddle = model.moments(block).saddle
-    return {_NO_BALANCE: ~jnp.all((saddle > 0) & (saddle < jnp.inf))}
+    moments = model.moments(block)
+    saddle, flat = moments.saddle, Angle.of(jnp.full_like(moments.saddle, jnp.pi / 2))
+    rights = (saddle < jnp.pi / 2) & (moments.restoring(flat) > 0)
+    return {_NO_BALANCE: ~jnp.all((saddle > 0) & (saddle < jnp.inf)), _RIGHTS_AGAIN: jnp.any(rights)}
 
 
 _NO_BALANCE = (
     "The restoring moment of `model` must fall to zero at some rotation, where the block balances; one that does not "
     "is for `Diffrax()`."
+)
+_RIGHTS_AGAIN = (
+    "The restoring moment of `model` must not right the block again between its balance and pi/2; one that does is for "
+    "`Diffrax()`."
 )
 
 

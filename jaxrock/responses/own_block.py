@@ -1,12 +1,21 @@
 """Whether a block that is given beside a response is that of the response."""
 
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Inexact
 
 from jaxrock._checks import is_traced
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.restitution import tells_sides
+from jaxrock.blocks.restitution import Reset, on_sides, tells_sides
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
+
+_SHARES = (
+    "slow to fast impacts leave {:.6g}, {:.6g}, {:.6g} of the velocity on side 1, {:.6g}, {:.6g}, {:.6g} on side 2"
+)
 
 
 def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
@@ -18,11 +27,14 @@ def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
     else:
         angles, rate, differ = [block.alpha1, block.alpha2], block.p1, True
     rtol = 1e-5 if np.asarray(scene.alpha).dtype.itemsize < 8 else 1e-9
-    for told, own, given in (
+    checks: list[tuple[str, Any, Any]] = [
         ("alpha and p are {:.6g} rad and {:.6g} rad/s", [scene.alpha, scene.p], [np.min(angles), rate]),
         ("sides uplift at {:.6g} and {:.6g} g", *_uplifts(scene, angles, rtol)),
         ("law of restitution or shape tells {:d} sides apart", [2 * (scene.far is not None)], [2 * differ]),
-    ):
+        ("sides rock at frequencies of the ratio {:.6g}", *_rates(scene, block, angles, rtol)),
+        (_SHARES, _shares(_resets_of(scene)), _shares(_resets_of(block))),
+    ]
+    for told, own, given in checks:
         if not np.allclose(own, given, rtol=rtol, atol=0, equal_nan=True):
             raise ValueError(
                 f"Argument `block` must be that of the response, whose {told.format(*own)}, but is a "
@@ -30,10 +42,44 @@ def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
             )
 
 
+def _resets_of(owner: Scene | Block | AsymmetricBlock) -> tuple[Reset, Reset]:
+    """The impacts that end stays on one side, and on the other."""
+    if isinstance(owner, Scene):
+        return owner.reset, owner.far_reset
+    one, other = on_sides(owner.law, owner.corners) if isinstance(owner, Block) else owner.corners
+    p, most = (owner.p, 1.0) if isinstance(owner, Block) else (owner.p1, np.inf)
+    return Reset.of(owner.law, one, p, most), Reset.of(owner.law, other, p, most)
+
+
+@jax.jit
+def _shares(resets: tuple[Reset, Reset]) -> Inexact[Array, " six"]:
+    """What impacts at three speeds leave, on either side."""
+    speeds = jnp.array([0.0, 0.2, 1.0])
+    return jnp.concatenate([jax.vmap(reset.ratio)(speeds) for reset in resets])
+
+
+def _is_nonlinear(scene: Scene, rtol: float) -> bool | None:
+    """Whether a scene's block uplifts as a nonlinear one does, or a linear one; None: as neither."""
+    least = np.min([moments.threshold for moments in scene.both_moments])
+    for threshold, nonlinear in ((np.tan, True), (np.asarray, False)):
+        if np.isclose(least, threshold(scene.alpha), rtol=rtol, atol=0):
+            return nonlinear
+    return None
+
+
 def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.ndarray]:
     """Accelerations that uplift a scene's block, and one of these angles, to either side [g]."""
-    own = np.array([moments.threshold for moments in scene.both_moments])
-    for threshold in (np.tan, np.asarray):  # of nonlinear models, and of linear ones
-        if np.isclose(np.min(own), threshold(scene.alpha), rtol=rtol, atol=0):
-            return own, threshold(np.array(angles))
-    return own, own  # another model: it cannot be told
+    own, nonlinear = np.array([moments.threshold for moments in scene.both_moments]), _is_nonlinear(scene, rtol)
+    if nonlinear is None:
+        return own, own  # another model: it cannot be told
+    return own, np.tan(angles) if nonlinear else np.array(angles)
+
+
+def _rates(scene: Scene, block: Block | AsymmetricBlock, angles: list, rtol: float) -> tuple[list, list]:
+    """Frequency parameter of the other side over that of the first, of a scene's block and of a given one."""
+    here, there = (float(moments.arm_at_rest) for moments in scene.both_moments)
+    nonlinear = _is_nonlinear(scene, rtol)
+    if isinstance(block, Block) or nonlinear is None:
+        return [1.0], [1.0]
+    own = np.sqrt(there / here * (np.cos(angles[0]) / np.cos(angles[1]) if nonlinear else 1.0))
+    return [own], [block.p2 / block.p1]
