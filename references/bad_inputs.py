@@ -131,7 +131,7 @@ def many():
 
 def line():
     """A probit fit, put together by hand."""
-    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0), jnp.array([0.01])
+    numbers = jnp.array(1.0), jnp.array([2.0]), jnp.eye(2), jnp.array(-3.0), jnp.array([0.01]), jnp.array([False])
     return rk.hazard.ProbitFit(("PGA",), *numbers, rk.hazard.FitStatus.successful)
 
 
