@@ -62,14 +62,25 @@ def is_none(given: Any) -> Bool[Array, ""]:
     return jnp.stack([jnp.isnan(x).any() for x in numbers]).any()
 
 
-@jax.jit
 def still_where(lost: Bool[Array, ""], values: Any) -> Any:
-    """The values, which nothing moves where `lost`: in reverse mode slopes that are no numbers end here."""
+    """The values, which nothing moves where `lost`: in reverse mode slopes that are no numbers end here. What many
+    scenes share they go on to share."""
 
     def of(x):
-        return jnp.where(lost, jax.lax.stop_gradient(x), x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
+        return _still_where(lost, x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
 
     return jax.tree.map(of, values)
+
+
+@jax.custom_jvp
+def _still_where(lost, value):
+    return value
+
+
+@_still_where.defjvp
+def _still_where_jvp(primals, tangents):
+    lost, value = primals
+    return _still_where(lost, value), jnp.where(lost, jnp.zeros_like(tangents[1]), tangents[1])
 
 
 def still_if_none(given: Any) -> Any:

@@ -1,5 +1,6 @@
 """Fragilities by any measure of intensity, which measures say something, and which explain most."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -154,6 +155,14 @@ def test_the_flag_errs_as_often_as_it_says(each):
         draws = RANDOM.random(COUNT)[clusters]
         told += float(rk.hazard.fit_probit({"x": level}, draws < 0.5, clusters=clusters).p_values[0]) <= 0.05
     assert 2 <= told <= 20
+
+
+def test_many_lists_of_measures_are_fitted_at_once():
+    """Where nobody can ask what became of a fit."""
+    levels, fell = np.random.default_rng(5).uniform(0.1, 1.0, (3, 20)), np.arange(20) % 3 == 0
+    found = jax.vmap(lambda level: rk.hazard.fit_probit({"x": level}, fell).intercept)(levels)
+    alone = [rk.hazard.fit_probit({"x": level}, fell).intercept for level in levels]
+    np.testing.assert_allclose(found, alone, rtol=1e-9)
 
 
 def test_what_parts_outcomes_well_is_not_flagged():

@@ -158,6 +158,17 @@ def test_lanes():
     np.testing.assert_allclose(found[0], with_throw, rtol=1e-13)
 
 
+def test_scenes_go_on_to_share_a_record():
+    """Of which any may be no number: a copy for each would be gigabytes."""
+    record = rk.Record(0.1 * np.sin(np.arange(123)), 0.02)
+
+    def margin(alpha):
+        return rk.outcome(rk.Block(alpha, 2.0, throw=False), record, throw=False).margin
+
+    program = jax.make_jaxpr(jax.vmap(margin))(jnp.linspace(-0.1, 0.4, 77))
+    assert "f64[77]" in str(program) and "f64[77,123]" not in str(program)
+
+
 def test_what_is_no_number_at_all_raises():
     with pytest.raises(ValueError, match="`alpha` must be a number"):
         rk.Block(True, 2.0, throw=False)

@@ -147,7 +147,7 @@ def or_separable(fit, logarithms, toppled, survived):
 
     **Source:** Albert & Anderson (1984), when no maximum exists; Konis (2007), the program.
     """
-    if is_traced(toppled) or bool(fit.status == FitStatus.successful):
+    if is_traced((fit, logarithms, toppled, survived)) or bool(fit.status == FitStatus.successful):
         return fit
     from scipy.optimize import linprog  # it takes half a second
 

@@ -309,5 +309,6 @@ class Coefficients(AbstractMoments):
         arm, flat = self.arm_terms, self.restoring(_FLAT)
         most = jnp.abs(_or_zero(arm.constant)) + jnp.abs(_or_zero(arm.line)) * jnp.pi / 2
         most = push * (most + _length(_or_zero(arm.sine), arm.cosine))
-        # The restoring moment falls, or rises again: it is largest at an end.
-        return where((flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0), jnp.inf, 0.0)
+        # The restoring moment falls, or rises again: it is largest at an end. Beyond pi/2 nothing is taken to hold it.
+        may = (flat > 0) | (_weighed(weight, jnp.maximum(self.restoring(angle), flat)) + most > 0)
+        return where(may & (angle.value < jnp.pi / 2), jnp.inf, 0.0)

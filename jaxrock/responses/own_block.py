@@ -31,7 +31,7 @@ def check_own(scene: Scene, block: Block | AsymmetricBlock) -> None:
         ("alpha and p are {:.6g} rad and {:.6g} rad/s", [scene.alpha, scene.p], [np.min(angles), rate]),
         ("sides uplift at {:.6g} and {:.6g} g", *_uplifts(scene, angles, rtol)),
         ("law of restitution or shape tells {:d} sides apart", [2 * (scene.far is not None)], [2 * differ]),
-        ("sides rock at frequencies of the ratio {:.6g}", *_rates(scene, block, angles, rtol)),
+        ("sides rock at frequencies of the ratio {:.6g}", *_rates(scene, block, angles)),
         (_SHARES, _shares(_resets_of(scene)), _shares(_resets_of(block))),
     ]
     for told, own, given in checks:
@@ -58,28 +58,20 @@ def _shares(resets: tuple[Reset, Reset]) -> Inexact[Array, " six"]:
     return jnp.concatenate([jax.vmap(reset.ratio)(speeds) for reset in resets])
 
 
-def _is_nonlinear(scene: Scene, rtol: float) -> bool | None:
-    """Whether a scene's block uplifts as a nonlinear one does, or a linear one; None: as neither."""
-    least = np.min([moments.threshold for moments in scene.both_moments])
-    for threshold, nonlinear in ((np.tan, True), (np.asarray, False)):
-        if np.isclose(least, threshold(scene.alpha), rtol=rtol, atol=0):
-            return nonlinear
-    return None
-
-
 def _uplifts(scene: Scene, angles: list, rtol: float) -> tuple[np.ndarray, np.ndarray]:
     """Accelerations that uplift a scene's block, and one of these angles, to either side [g]."""
-    own, nonlinear = np.array([moments.threshold for moments in scene.both_moments]), _is_nonlinear(scene, rtol)
-    if nonlinear is None:
-        return own, own  # another model: it cannot be told
-    return own, np.tan(angles) if nonlinear else np.array(angles)
+    own = np.array([moments.threshold for moments in scene.both_moments])
+    for threshold in (np.tan, np.asarray):  # of nonlinear models, and of linear ones
+        if np.isclose(np.min(own), threshold(scene.alpha), rtol=rtol, atol=0):
+            return own, threshold(np.array(angles))
+    return own, own  # another model: it cannot be told
 
 
-def _rates(scene: Scene, block: Block | AsymmetricBlock, angles: list, rtol: float) -> tuple[list, list]:
+def _rates(scene: Scene, block: Block | AsymmetricBlock, angles: list) -> tuple[list, list]:
     """Frequency parameter of the other side over that of the first, of a scene's block and of a given one."""
-    here, there = (float(moments.arm_at_rest) for moments in scene.both_moments)
-    nonlinear = _is_nonlinear(scene, rtol)
-    if isinstance(block, Block) or nonlinear is None:
+    if isinstance(block, Block):
         return [1.0], [1.0]
-    own = np.sqrt(there / here * (np.cos(angles[0]) / np.cos(angles[1]) if nonlinear else 1.0))
-    return [own], [block.p2 / block.p1]
+    here, there = (float(moments.arm_at_rest) for moments in scene.both_moments)
+    given, own = block.p2 / block.p1, np.sqrt(there / here)
+    either = own, own * np.sqrt(np.cos(angles[0]) / np.cos(angles[1]))  # the arm of a model is 1, or cos alpha
+    return [min(either, key=lambda rate: abs(rate - given))], [given]

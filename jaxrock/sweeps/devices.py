@@ -121,7 +121,7 @@ _SAID = 400  # bytes of what the others hear of an error
 @contextlib.contextmanager
 def all_or_none() -> Iterator[None]:
     """What every process does by itself, and then meets the others: an error in one of them is one in all, as the
-    others would go on to wait for it.
+    others would go on to wait for it. (An interrupt is not: it would have to wait for them.)
 
     **Raises:** RuntimeError where another process failed, with what it said.
     """
