@@ -19,6 +19,11 @@ Making = TypeVar("Making", bound=Callable)
 Values = ArrayLike | Sequence[float | int] | Sequence[Sequence[float | int]]
 
 
+def as_meant(number: ArrayLike) -> float:
+    """A number as it was meant: 0.01 in single precision is 0.009999999776, and that no time fits."""
+    return float(str(np.asarray(number)[()]))
+
+
 def is_traced(tree: Any) -> bool:
     """Whether any array in it is traced: within `jax.jit`, `jax.vmap` or a derivative."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

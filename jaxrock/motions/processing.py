@@ -17,6 +17,7 @@ from jaxrock._arguments import arguments, at_least, known, word_of
 from jaxrock._checks import (
     Range,
     Values,
+    as_meant,
     check_known,
     delay,
     factor as any_factor,
@@ -46,12 +47,7 @@ def __dir__() -> list[str]:
 def _samples(record: Record) -> tuple[np.ndarray, float]:
     check_single(record=record)
     check_known(record=record)
-    return np.asarray(record.samples, float), _decimal(record.dt)
-
-
-def _decimal(number: ArrayLike) -> float:
-    """A number as it was meant: 0.01 in single precision is 0.009999999776, and that no time fits."""
-    return float(str(np.asarray(number)[()]))
+    return np.asarray(record.samples, float), as_meant(record.dt)
 
 
 def _number(name: str, value: ArrayLike, allowed: Range) -> float:
@@ -60,7 +56,7 @@ def _number(name: str, value: ArrayLike, allowed: Range) -> float:
     check_known(**{name: checked})
     scalar(name, checked)
     # In all digits that were given, of which JAX may keep half.
-    return _decimal(checked if isinstance(value, jax.Array) else value)
+    return as_meant(checked if isinstance(value, jax.Array) else value)
 
 
 def _slack(record: Record) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxrock._arguments import arguments, path_of, word_of
 from jaxrock._aside import written_aside
+from jaxrock._checks import as_meant
 from jaxrock._parameters import check_single
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import accelerogram_of
@@ -16,11 +17,6 @@ from jaxrock.motions.record import Record
 def _line(text: str) -> str:
     """A text in one line that a header may hold."""
     return " ".join(text.split())
-
-
-def _step(record: Record) -> float:
-    """The step in as few digits as tell it from its neighbours: that of 0.01 s in single precision, too."""
-    return float(str(np.asarray(record.dt)[()]))
 
 
 @arguments
@@ -42,7 +38,7 @@ def write_at2(record: Record, path: str | os.PathLike) -> None:
     body = [f"{x:15.7E}" for x in samples]
     rows = ["".join(body[k : k + 5]) for k in range(0, len(body), 5)]
     head = ["PEER STRONG MOTION DATABASE RECORD", _line(title), "ACCELERATION TIME SERIES IN UNITS OF G"]
-    step = f"DT= {_step(record):.12g} SEC"
+    step = f"DT= {as_meant(record.dt):.12g} SEC"
     _check_name(
         title, [*head, f"NPTS= {_TRIAL.size}, {step}", "".join(f"{x:15.7E}" for x in _TRIAL)], record, "at2", "g"
     )
@@ -63,7 +59,7 @@ def write_csv(record: Record, path: str | os.PathLike, unit: Annotated[str, word
     would be read as a header ("NPTS= 5, DT= .1").
     """
     check_single(record=record)
-    samples, step = np.asarray(record.samples, float) * PER_G[unit], _step(record)
+    samples, step = np.asarray(record.samples, float) * PER_G[unit], as_meant(record.dt)
     head = [f"# {_line(record.name)}", f"# time [s], acceleration [{unit}]"]
     trial = [f"{step * k:.12g},{x!r}" for k, x in enumerate((_TRIAL * PER_G[unit]).tolist())]
     _check_name(record.name, [*head, *trial], record, "csv", unit)
