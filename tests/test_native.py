@@ -32,10 +32,10 @@ OTHERS = np.roll(NUMBERS, 5)
 WHOLE = np.array([0, 1, -1, 7, -7, 100, 2**31 - 1, -(2**31), 5, 6, 8, 9, 10], np.int32)
 
 
-def planned(function, leaves, shared, refilled=False, count=None, threads=1):
+def planned(function, leaves, shared, refilled=False, count=None, threads=1, lanes=None):
     """`function(leaves)` of many lanes, in machine code, to be called with such leaves."""
     like = [jax.ShapeDtypeStruct(x.shape if same else x.shape[1:], x.dtype) for x, same in zip(leaves, shared)]
-    plan = native.Plan(jax.make_jaxpr(function)(like), shared, refilled)
+    plan = native.Plan(jax.make_jaxpr(function)(like), shared, refilled, lanes=lanes)
     return jax.jit(lambda *leaves: plan(list(leaves), threads, count))
 
 
@@ -301,6 +301,10 @@ def test_threads_share_lanes(threads, refilled):
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(one[:1111], part[:1111])
     np.testing.assert_array_equal(alone[1], turns)
+    for lanes in (2, 4, 8) if threads == 2 else ():  # a vector of any width, and fewer scenes than it holds
+        for many in (3001, 1):
+            narrow = run(function, [x[:many], turns[:many]], [False, False], refilled, lanes=lanes)
+            np.testing.assert_array_equal(narrow[0], alone[0][:many])
 
 
 def test_functions_of_xla_are_where_its_header_has_them():
@@ -641,8 +645,12 @@ def test_what_is_not_known_is_said(name):
 def test_programs_have_names_of_their_own():
     """Made of the program alone, so that another process finds it again in the compilation cache."""
     program, other = (jax.make_jaxpr(lambda x, factor=factor: [jnp.exp(x) * factor])(1.0) for factor in (3, 4))
-    assert machine.registered(program, [False]) == machine.registered(program, [False])
-    assert len({machine.registered(*each) for each in ((program, [False]), (program, [True]), (other, [False]))}) == 3
+
+    def name(program, shared, lanes=8):
+        return machine.registered(program, [shared], kernels.emit, lanes)
+
+    assert name(program, False) == name(program, False)
+    assert len({name(program, False), name(program, True), name(other, False), name(program, False, lanes=2)}) == 4
 
 
 class Damper(eqx.Module):

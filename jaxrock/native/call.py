@@ -18,7 +18,13 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jaxrock.native.emitter import SMALL, is_known
 from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
-from jaxrock.native.machine import is_there as is_there, lanes_of, machine as machine, registered
+from jaxrock.native.machine import (
+    is_there as is_there,
+    lanes_for as lanes_for,
+    lanes_of,
+    machine as machine,
+    registered,
+)
 from jaxrock.native.parted import emit_parted, has_parts
 from jaxrock.native.partition import ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
@@ -38,15 +44,22 @@ class Plan:
     """A program (closed, of one lane) as machine code for many: leaves that are not `shared` are a lane's own.
 
     `refilled`: in the program's one loop a lane that is done does not wait for others. `alone`: whether there is only
-    one lane, whose long lists all lanes of a vector may then look up.
+    one lane, whose long lists all lanes of a vector may then look up. `lanes`: of a vector (None: as many as run best).
     Raises `Unsupported` if the program does what is not known in `operations`.
     """
 
-    def __init__(self, program: ClosedJaxpr, shared: list[bool], refilled: bool = False, alone: bool = False):
+    def __init__(
+        self,
+        program: ClosedJaxpr,
+        shared: list[bool],
+        refilled: bool = False,
+        alone: bool = False,
+        lanes: int | None = None,
+    ):
         program = unmarked(plain(program) if has_foreign(program.jaxpr) else program)
         program = hoisted(program, _is_before_loops)
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
-        self._shared, self._alone = shared, alone
+        self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()
         self._once, self._each, rest = ahead(program, shared, is_known, _is_large)
         self._rest, own, self._pieces = rest.inputs, self._first_own(), []
         # Of what becomes machine code only names stay: programs take more memory than all else.
@@ -54,7 +67,7 @@ class Plan:
             is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
             parted = is_loop and has_parts(part.program.jaxpr.eqns[0])
             writes = emit_parted if parted else emit_loop if is_loop else functools.partial(emit, alone=alone)
-            name = registered(part.program, [v not in own for v in part.inputs], writes)
+            name = registered(part.program, [v not in own for v in part.inputs], writes, self._lanes)
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(name, part.inputs, part.outputs))
 
@@ -94,7 +107,7 @@ class Plan:
         results (at least 1; known at run time only)."""
         values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
-        more = 0 if self._alone else room_for(size) - size
+        more = 0 if self._alone else max(size, self._lanes) - size
         told = size + more, size if count is None else count, threads
         sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
         for v in self._own_inputs:

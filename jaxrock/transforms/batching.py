@@ -113,12 +113,14 @@ class Lanes:
         return [self._plan(quick, own) for quick in ([True, False] if self._is_quick else [False])]
 
     def _plan(self, quick: bool, own: tuple[bool, ...]):
-        alone = self.size is None
+        alone, lanes = self.size is None, native.lanes_for(self.size, quick)
         key = quick, own, alone
         if key not in self.recipe.plans:
             with marking(False):
                 program = self.recipe.quick if quick else self.recipe.program
-            self.recipe.plans[key] = native.Plan(program, [not mine for mine in own], self.recipe.refilled, alone)
+            self.recipe.plans[key] = native.Plan(
+                program, [not mine for mine in own], self.recipe.refilled, alone, lanes
+            )
         return self.recipe.plans[key]
 
     @property
