@@ -271,6 +271,15 @@ def test_single_lobe_inverses():
     assert each(single_lobe.critical_duration, 1.2, 0.0) == np.inf
 
 
+def test_long_critical_durations():
+    """Of blocks that hardly uplift: log 2 times the slope at the peak, over what the strength is below 1."""
+    missing, shape = np.array([3e-2, 5e-4, 1e-8])[:, None], np.array([-5.0, -0.5, 0.0, 2, 40, 1e5])
+    duration = each(single_lobe.critical_duration, 1 - missing, shape)
+    np.testing.assert_allclose(each(single_lobe.safety_wall, duration, shape), 1 - missing + 0 * shape, rtol=1e-14)
+    slope = 2 * np.where(shape == 0, 1, shape / -np.expm1(np.where(shape == 0, 1, -shape)))
+    np.testing.assert_allclose(duration[-1] * missing[-1], np.log(2) * slope, rtol=1e-5)
+
+
 def test_single_lobe_safe_arguments():
     assert each(single_lobe.peak_rotation, 1.0, 2.0, 0.0) == 0.0
     assert each(single_lobe.peak_rotation, 0.1, 2.0, 0.0) == np.inf
@@ -462,6 +471,9 @@ def test_sine_constants_and_approximations():
     limits = each(sine_pulse.during_pulse_limit, 5.1, [0.95, 0.8])
     assert limits[0] < each(sine_pulse.impact_time_limit, 5.1)  # printed: none
     assert limits[1] == np.inf
+    lost = each(sine_pulse.no_impact_limit, 2.0) + np.array([-1e-9, 1e-9])
+    for function in (sine_pulse.peak_after_pulse, sine_pulse.restitution_scale_law):  # whatever D0* is there
+        assert np.isinf(each(function, lost, 2.0, 0.8)).tolist() == [False, True]
 
 
 def test_sine_impact_times():

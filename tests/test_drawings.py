@@ -115,6 +115,21 @@ def test_a_peak_that_is_no_amplitude_is_not_called_so(motion):
     assert " $a_g$" not in words(below) and " peak" in words(below)
 
 
+def test_corners_and_jumps_are_drawn_where_they_are():
+    """However long the motion is: the peak, too, and both sides of a jump; not half a sample beside them."""
+    samples = np.zeros(6000)
+    samples[3001] = 1.0
+    (below,) = rk.plot.scene(BLOCK, rk.Record(samples, 0.01)).child_axes
+    time, values = below.lines[0].get_xydata().T
+    np.testing.assert_allclose((time[values.argmax()], values.max(), below.lines[2].get_ydata()[0]), (30.01, 1, 1))
+    (below,) = rk.plot.scene(BLOCK, rk.RectangularPulse(0.5, 1.0)).child_axes
+    time, values = below.lines[0].get_xydata().T
+    steps = np.abs(np.diff(values)) > 0
+    np.testing.assert_allclose(time[:-1][steps], [0, 1], atol=1e-12)
+    assert np.diff(time)[steps].max() < 1e-12
+    assert {" $a_g$"} <= words(below)
+
+
 @pytest.mark.parametrize("block", [rk.Block(0.05, 2.0), rk.Block(0.2, 2.0), rk.Block(0.9, 2.0), ROCK])
 def test_a_scene_is_in_its_figure(block):
     """With all its words, from the first picture on."""
@@ -165,6 +180,17 @@ def test_a_film_follows_the_response(response):
         np.testing.assert_allclose(np.arctan2(*edge), rotation, atol=1e-9)
     assert axis.get_title().endswith("overturns" if response.overturned else "stands")
     assert f"{int(response.impact_count)} impact" in axis.get_title()
+    assert knots_drawn(film._fig.axes[2])
+
+
+def knots_drawn(axis):
+    """Whether the end of `PULSE`, and the moment before it, are among the times of a curve, whose steps miss them."""
+    time = axis.lines[0].get_xdata()
+    return np.isin([np.nextafter(1.0, 0.0), 1.0], time).all() and np.all(np.diff(time) >= 0)
+
+
+def test_a_history_has_the_knots_of_its_motion(response):
+    assert knots_drawn(rk.plot.history(response)[2])
 
 
 @pytest.mark.slow

@@ -41,6 +41,11 @@ def test_tornado():
     assert [label.get_text() for label in axis.get_yticklabels()] == ["amplitude", "alpha"]
 
 
+def test_a_tornado_is_of_one_scene():
+    with pytest.raises(ValueError, match=r"`sensitivity` must be of one scene, but is of many, of shape \(2,\)"):
+        rk.plot.tornado(sensitivity_of([[-2.0, 0.5], [1.0, 2.0]]))
+
+
 def test_a_tornado_of_a_block_that_overturns_says_so():
     """It was an empty frame."""
     told = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.SinePulse(1.4, 0.9), rk.Linear())
@@ -115,6 +120,22 @@ def test_sine_regions():
     over = rk.plot.overturning(map_of([[0, 1], [0, 2]], [1.0, 2.0], [2.0, 3.0]))
     words = over.get_ylabel()
     assert rk.plot.sine_regions(0.9, over, frequency_ratio=np.geomspace(1.0, 4.0, 8)).get_ylabel() == words
+
+
+def test_sine_regions_over_durations():
+    """As the map below: x to 2 pi / x, y to 1 / y; in the other coordinates they would say something else."""
+    given = {"frequency_ratio": np.geomspace(1.0, 4.0, 8)}
+    result = map_of([[0, 1], [0, 2]], [1.0, 2.0], [2.0, 3.0])
+    over = rk.plot.overturning(result, by_duration=True)
+    axis = rk.plot.sine_regions(0.9, over, by_duration=True, **given)
+    (curve,) = (line for line in axis.lines if line.get_label() == "case 2: no impact")
+    duration, strength = curve.get_data()
+    np.testing.assert_allclose(strength, 1 / sine_pulse.no_impact_limit(2 * np.pi / duration))
+    alone = rk.plot.sine_regions(0.9, by_duration=True, **given)
+    assert alone.get_xlabel() == axis.get_xlabel()
+    for by_duration, drawn in ((False, over), (True, rk.plot.overturning(result))):
+        with pytest.raises(ValueError, match=f"`by_duration` must be {not by_duration} for an axis over"):
+            rk.plot.sine_regions(0.9, drawn, by_duration=by_duration, **given)
 
 
 def test_found_record():
@@ -280,7 +301,16 @@ def test_places_that_are_there_twice_have_one_cell():
     assert (np.asarray(result.state) > 0).all()
     assert np.ptp(drawn.get_coordinates()[..., 0]) > 0.1 and np.ptp(axis.get_xlim()) > 0.1
     plt.close(axis.figure)
-    rk.plot.overturning(result, exact=True)
+    unsaid = rk.plot.overturning(result).collections[-1].get_array()  # of one column no borders are looked for
+    np.testing.assert_array_equal(unsaid, drawn.get_array())
+    with pytest.raises(ValueError, match="`result` must be a map of two axes, with two different values or more each"):
+        rk.plot.overturning(result, exact=True)
+
+
+def test_sizes_that_are_there_twice_are_shaded():
+    axis, _ = rk.plot.spectrum(spectrum_of([True, True, False, False], [2.0, 2.0, 3.0, 4.0]))
+    (span,) = axis.patches
+    assert (span.get_x(), span.get_width()) == (1.5, 1.0)
 
 
 def test_sizes_that_overturn_alone_are_shaded():

@@ -8,6 +8,7 @@ import pytest
 import scipy.signal
 
 import jaxrock as rk
+from jaxrock.motions.components import _together as together
 from references.damaged_files import FILES, SAMPLES
 
 CM = 980.665
@@ -81,6 +82,7 @@ def test_knet_peaks_are_rounded_in_print(file):
         (SMC.replace("        23    -32768", "        24    -32768"), "a.smc", "announces 24 samples, but 23 follow"),
         (SMC.replace("\n|\n", "\n"), "a.smc", "announces 1 lines of comments, which are not there"),
         (SMC.replace("2.0000000E+02", "0.0000000E+02"), "a.smc", "states 0 samples a second"),
+        (SMC.replace("2.0000000E+02", "1.7000000E+38"), "a.smc", "line 18 states no samples a second, so the file"),
         (SMC.replace("    -32768      ", "    -3276x      ", 1), "a.smc", "lines 12 to 27 should hold"),
         (SMC.replace("E+1", "E+2", 2), "a.smc", "the header states a peak of"),
         (KNET.replace("100Hz", "50Hz"), "a.NS", "announces 12 samples, but 24 follow"),
@@ -115,7 +117,7 @@ def test_what_is_mislabelled_is_refused(file, text, name, message):
 @pytest.mark.parametrize(
     "text, origin",
     [
-        (SMC, ("Loma Prieta, CA", "San Francisco, 1295 Shafter", "360", "1989 10 18 0004", "SAF0A", "smc", "cm/s2")),
+        (SMC, ("Loma Prieta, CA", "San Francisco, 1295 Shafter, F", "360", "1989 10 18 0004", "SAF0A", "smc", "cm/s2")),
         (KNET, ("2011/03/11 14:46:00 M9.0", "MYG004", "N-S", "2011/03/11 14:46:21 JST", "MYG004", "knet", "cm/s2")),
         (FILES["AT2"].text, ("LOMA PRIETA 10/18/89", "WAHO", "090", "", "", "at2", "g")),
         (FILES["ESM"].text, ("GREECE", "", "", "", "", "esm", "cm/s2")),
@@ -123,6 +125,43 @@ def test_what_is_mislabelled_is_refused(file, text, name, message):
 )
 def test_origin(file, text, origin):
     assert tuple(rk.read_record(file(text)).origin) == (*origin, "motion.txt")
+
+
+@pytest.mark.parametrize(
+    "said, station, component",
+    [
+        ("station = APEEL Array #2 - Redwood City  component=   up", "APEEL Array #2 - Redwood City", "up"),
+        ("station = Del Valle Dam, crest           component=     65", "Del Valle Dam, crest", "65"),
+        ("station = El Centro                      component=", "El Centro", ""),
+        ("station = El Centro", "El Centro", ""),
+        ("*", "", ""),
+    ],
+)
+def test_station_and_component_of_smc(file, said, station, component):
+    """The name ends where its place does, not at a comma; without a component a vertical one goes unnoticed."""
+    was = "station = San Francisco, 1295 Shafter, F component=    360"
+    assert rk.read_record(file(SMC.replace(was, said))).origin[1:3] == (station, component)
+
+
+USC = """CORRECTED ACCELEROGRAM  IIBB127  94.610.0 COMP {0}   FILE   0  CORRESPONDING T
+FILE     0 OF UNCORRECTED ACCELEROGRAM DATA OF VOLUME I:
+NORTHRIDGE EARTHQUAKE                                                   21
+JAN 17, 1994 -1230 GMT                                                  22
+IBB127  94.610.0 N                                                      18
+STATION USC# 0061   34 17 11N, 118 13 31W                               39
+BIG TUJUNGA STATION, ANGELES NATIONAL FOREST, CA                        48
+COMP {0}                                                               9
+   2 POINTS OF ACC DATA EQUALLY SPACED AT  .020 SEC. IN UNITS CM/SEC/SEC
+    98.067   -49.033
+"""
+
+
+def test_components_of_usc(file):
+    """They stand behind the word COMP."""
+    paths = [file(USC.format(each), each.strip()) for each in ("UP  ", "N08W", "S82W")]
+    found = rk.motions.read_components(paths)
+    assert [each.origin.component for each in (found.first, found.second, found.vertical)] == ["N08W", "S82W", "UP"]
+    assert found.first.name == "NORTHRIDGE EARTHQUAKE, BIG TUJUNGA STATION, ANGELES NATIONAL FOREST, CA, COMP N08W"
 
 
 # --------------------------------------------------------------------------------------------- V1 and V3
@@ -425,6 +464,34 @@ def test_names_of_vertical_components(file, name):
     paths = [file(FILES["AT2"].text.replace("WAHO, 090", f"WAHO, {each}"), each) for each in ("000", name)]
     with pytest.raises(ValueError, match="must hold two horizontal components, but .* are vertical"):
         rk.motions.read_components(paths)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("000", "090", "180"),
+        ("360 Deg", "90 Deg", "5 deg"),
+        ("N-S", "E-W", "N08W"),
+        ("HN1", "HNN", "HNE"),
+        ("", "E", "S"),
+        ("long", "x", "Trans"),
+        ("EW", "", "North-South"),
+    ],
+)
+def test_three_horizontal_components_are_refused(names):
+    """The last would be taken to be vertical."""
+    records = [rk.Record([0.1, 0.2], 0.01, origin=rk.motions.Origin(component=each)) for each in names]
+    with pytest.raises(ValueError, match="`paths` must hold a vertical component among three, .* but they say"):
+        together("paths", records)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("", "", ""), ("000", "090", ""), ("1", "2", "3"), ("HN1", "HN2", "HN3"), ("x", "y", "z"), ("a", "b", "c")],
+)
+def test_where_components_do_not_say_the_last_is_vertical(names):
+    records = [rk.Record([0.1, 0.2], 0.01, origin=rk.motions.Origin(component=each)) for each in names]
+    assert together("paths", list(records)).vertical.origin.component == names[2]
 
 
 @pytest.mark.parametrize(

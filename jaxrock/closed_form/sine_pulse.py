@@ -12,6 +12,7 @@ and, at frequency ratios below about 1, in further islands of intensity, after 3
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxrock._described import described
 from jaxrock.closed_form import _sine_arcs as arcs, _sine_formulas as formulas
@@ -103,11 +104,13 @@ def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) 
 
     Exact between `impact_time_limit` and `no_impact_limit`. Below, where the impact comes while the pulse lasts, it is
     what the formula gives (D&D draw it dashed), and says nothing of the block, not that it overturns either. The first
-    excursion, before the impact, may be larger: see `first_peak`. **Returns:** inf where that impact overturns.
+    excursion, before the impact, may be larger: see `first_peak`.
+
+    **Returns:** inf where that impact overturns, and where the block overturns without one.
 
     **Source:** D&D 4.13, with D0* by its definition.
     """
-    lost = restitution**2 * (1 - formulas.coordinate_product(intensity, frequency_ratio))
+    lost = _energy_after_impact(intensity, frequency_ratio, restitution)
     left = 1 - jnp.where(lost < 1, lost, 0.0)
     return jnp.where(lost < 1, 1 - jnp.sqrt(left), jnp.inf)
 
@@ -116,9 +119,17 @@ def peak_after_pulse(intensity: Real, frequency_ratio: Real, restitution: Real) 
 def restitution_scale_law(intensity: Real, frequency_ratio: Real, restitution: Real) -> Result:
     """`peak_after_pulse` for small peaks: proportional to the square of the restitution.
 
+    **Returns:** inf where the block overturns without impact.
+
     **Source:** D&D 4.14 corrected: restitution^2 (1 - D0*)/2, without the square root that is printed.
     """
-    return restitution**2 * (1 - formulas.coordinate_product(intensity, frequency_ratio)) / 2
+    return _energy_after_impact(intensity, frequency_ratio, restitution) / 2
+
+
+def _energy_after_impact(a: Array, w: Array, e: Array) -> Array:
+    """Energy after a first impact that comes after the pulse, over that of balance: restitution^2 (1 - D0*); inf where
+    no impact comes, which D0* does not tell."""
+    return jnp.where(a < formulas.no_impact(w), e**2 * (1 - formulas.coordinate_product(a, w)), jnp.inf)
 
 
 @elementwise_in_sine

@@ -209,9 +209,9 @@ def critical_duration(uplift_strength: Real, shape: Real) -> Result:
     def excess(logarithm, strength, shape):
         return _safety_wall(jnp.exp(logarithm), shape) / strength - 1
 
-    # The rectangle's duration is the shortest of all.
+    # The rectangle's is the shortest. Spikes exceed the tangents at their peak, others a triangle: log 2 slope/(1 - s).
     shortest = jnp.log(-jnp.log1p(-strength))
-    longest = jnp.maximum(jnp.log(1e3 * (1 + jnp.abs(shape))), shortest + 1)
+    longest = jnp.log(2 * (1 + jnp.maximum(shape, 0.0)) / (1 - strength))
     found = jnp.exp(bracketed_root(excess, shortest - 1e-9, longest, strength, shape))
     return jnp.where(uplift_strength < 1, found, jnp.inf)
 

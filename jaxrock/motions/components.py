@@ -25,6 +25,12 @@ _DOWN = re.compile(r"\W*D((OW|W)?N)?\W*", re.IGNORECASE)
 _VERTICAL = re.compile(
     r"\W*(U(P|D|-D|P[-/ ]?(DN|DWN|DOWN))?\d?|D((OW|W)?N)?|\d*V(ER\w*|R?T)?\d?|..?Z|Z)\W*", re.IGNORECASE
 )
+# Azimuths, points of the compass, codes of SEED, words. A number of one digit is rather that of a channel.
+_HORIZONTAL = re.compile(
+    r"\W*(0|0?\d\d|[12]\d\d|3[0-6]\d|\d{1,3} ?(°|DEG\w*)|[NS][-/ ]?(\d{1,2} ?(°|DEG)? ?)?[EW]|[NESW]|NS|EW|N-S|E-W"
+    r"|(NORTH|EAST|SOUTH|WEST)\W*(NORTH|EAST|SOUTH|WEST)?|[A-Z][GHLN][NE]|(LONG|TRANS|RADIAL|HORIZ)\w*)\W*",
+    re.IGNORECASE,
+)
 
 
 class Components(eqx.Module):
@@ -110,12 +116,13 @@ def read_components(
       all beside a first one of times.
     - `given`: `format`, `dt` and `unit`, as in `read_record`.
 
-    Which component is vertical the files say (UP, UD, Z, ...); where they do not, it is the last of three.
+    Which component is vertical the files say (UP, UD, Z, ...); where they do not, it is the last of three, unless that
+    says it is horizontal (090, N-S, E, HNE, ...).
 
     **Returns:** `Components`, the horizontal ones in the order of the files.
 
-    **Raises:** as `read_record`; ValueError for another number of components, for two that say they are vertical, and
-    as `Components`.
+    **Raises:** as `read_record`; ValueError for another number of components, for two that say they are vertical, for
+    three of which none can be, and as `Components`.
     """
     if isinstance(paths, (str, os.PathLike)):
         chosen = component_columns(paths, given.get("format")) if columns is None else columns
@@ -137,6 +144,12 @@ def _together(name: str, records: list[Record]) -> Components:
     if len(upward) > 1 or len(records) == 2 and upward:
         said = [records[k].origin.component for k in upward]
         raise ValueError(f"Argument `{name}` must hold two horizontal components, but {said} are vertical.")
+    if len(records) == 3 and not upward and _HORIZONTAL.fullmatch(records[2].origin.component):
+        said = [record.origin.component for record in records]
+        raise ValueError(
+            f"Argument `{name}` must hold a vertical component among three, or two horizontal ones alone, but they say "
+            f"{said}: give two, or `Components(first, second, vertical)` of what each of them is."
+        )
     vertical = records.pop(upward[0] if upward else 2) if len(records) == 3 else None
     if vertical is not None and _DOWN.fullmatch(vertical.origin.component):
         warnings.warn(
@@ -160,7 +173,8 @@ def components_of_stream(stream: Any, unit: Annotated[str, word_of(*PER_G)]) -> 
     **Returns:** `Components`, the horizontal ones in the order of the traces. Of a stream of many stations:
     `[components_of_stream(stream.select(station=each), unit) for each in stations]`.
 
-    **Raises:** as `record_of_trace` and `Components`; ValueError for another number of traces, or for two stations.
+    **Raises:** as `record_of_trace` and `Components`; ValueError for another number of traces, for two stations, and
+    for components as in `read_components`.
     """
     several = isinstance(stream, Iterable) and not isinstance(stream, (str, bytes))
     several = several and getattr(stream, "shape", None) != ()  # as an array of one number has it

@@ -20,7 +20,7 @@ from jaxrock.models.rigid import Housner
 from jaxrock.models.rolling import RollingMoments
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes
 from jaxrock.plot.drawings import draw, draw_ground
-from jaxrock.plot.responses import acceleration_of, why_not
+from jaxrock.plot.responses import acceleration_of, moments_seen, why_not
 from jaxrock.plot.style import BLUE, GREY, RED, SAND
 from jaxrock.responses.history import Response
 from jaxrock.responses.own_block import check_own
@@ -153,6 +153,7 @@ class _Parts:
         alpha = response.scene.block.alpha if isinstance(response, FlexibleResponse) else response.scene.alpha
         above.plot(time, np.asarray(response(time)[0]) / float(alpha), color=BLUE, linewidth=0.9)
         above.plot(self.impacts, 0 * self.impacts, "|", color=RED, markersize=6)
+        time = moments_seen(self._motion, 0.0, end, 4001)
         below.plot(time, acceleration_of(self._motion, time), color="black", linewidth=0.7)
         above.set_ylim(*np.clip(above.get_ylim(), -2.5, 2.5))
         for axis, label in ((above, r"$\theta/\alpha$"), (below, r"$\ddot u_g$ [g]")):

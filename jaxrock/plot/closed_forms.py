@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxrock.closed_form import sine_pulse, single_lobe
-from jaxrock.plot.style import GREY, RED, figure
+from jaxrock.plot.style import DURATION, GREY, RATIO, RED, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,14 +51,20 @@ def safety_regions(
             letters = {"ha": "center", "va": "center", "color": "white" if name.startswith("$O") else "black"}
             axis.text(duration[widest], middle, name[:5], **letters)
     axis.plot(duration, curves[2], color="black", linewidth=1.2)
-    axis.set(xlim=(0, longest), ylim=(0, 1), xlabel="pulse duration $p\\,t_d$", ylabel="uplift strength $g\\alpha/A_g$")
+    axis.set(xlim=(0, longest), ylim=(0, 1), xlabel=DURATION, ylabel="uplift strength $g\\alpha/A_g$")
     if legend:
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7, frameon=False)
     return axis
 
 
 @figure(1)
-def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ratio: ArrayLike | None = None) -> "Axes":
+def sine_regions(
+    restitution: float,
+    axis: "Axes | None" = None,
+    *,
+    frequency_ratio: ArrayLike | None = None,
+    by_duration: bool = False,
+) -> "Axes":
     """Draw the closed-form curves of overturning under one cycle of a sine over an axis or a map.
 
     **Arguments:**
@@ -66,8 +72,12 @@ def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ra
     - `restitution`: in [0, 1].
     - `axis`: matplotlib axis, such as `overturning` returns; None makes a figure.
     - `frequency_ratio`: (n,) omega/p; None: 0.3 to 8.
+    - `by_duration`: uplift strength over pulse duration, in place of intensity over frequency ratio: as the map is.
 
     **Returns:** the axis.
+
+    **Raises:** ValueError for an axis over pulse durations without `by_duration`, and for one over frequency ratios
+    with it.
 
     **Source:** Dimitrakopoulos & DeJong (2012), figure 4: equations 3.10, 3.18, 3.20 with 3.21, and 3.31.
     """
@@ -75,6 +85,8 @@ def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ra
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
+    elif (across := axis.get_xlabel()) == (RATIO if by_duration else DURATION):
+        raise ValueError(f"Argument `by_duration` must be {not by_duration} for an axis over {across!r}.")
     ratio = np.linspace(0.3, 8, 300) if frequency_ratio is None else np.asarray(frequency_ratio, float)
 
     def after(k):
@@ -92,11 +104,14 @@ def sine_regions(restitution: float, axis: "Axes | None" = None, *, frequency_ra
         "first impact as the pulse ends": (sine_pulse.impact_time_limit, GREY, "--"),
     }
     for name, (curve, color, style) in curves.items():
-        axis.plot(*_to_its_tips(curve, ratio), color=color, linestyle=style, linewidth=1.2, label=name)
-    axis.set_xlabel(axis.get_xlabel() or r"frequency ratio $\omega/p$")  # a map below has its own words
-    axis.set_ylabel(axis.get_ylabel() or "intensity $a_g/g\\alpha$")
+        x, y = _to_its_tips(curve, ratio)
+        x, y = (2 * np.pi / x, 1 / y) if by_duration else (x, y)
+        axis.plot(x, y, color=color, linestyle=style, linewidth=1.2, label=name)
+    words = (DURATION, "uplift strength $g\\alpha/a_g$") if by_duration else (RATIO, "intensity $a_g/g\\alpha$")
+    axis.set_xlabel(axis.get_xlabel() or words[0])  # a map below has its own words
+    axis.set_ylabel(axis.get_ylabel() or words[1])
     before = axis.get_legend()
-    axis.legend(loc="upper left" if before is None else "lower right", fontsize=7)
+    axis.legend(loc="upper left" if before is None or by_duration else "lower right", fontsize=7)
     if before is not None:
         axis.add_artist(before)  # of the map below
     return axis

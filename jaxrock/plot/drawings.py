@@ -16,7 +16,7 @@ from jaxrock.models.spring import Spring
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses.pulse import AbstractPulse
 from jaxrock.plot.bodies import AnyBlock, Body, Shapes, turned
-from jaxrock.plot.responses import acceleration_of
+from jaxrock.plot.responses import acceleration_of, moments_seen
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ def _sides(axis: "Axes", body: Body, rotation: float) -> None:
 def _motion(axis: "Axes", motion: AbstractMotion) -> None:
     """Ground acceleration against time, with the symbols of a pulse."""
     end = float(motion.end)
-    time = np.linspace(-0.05 * end, 1.1 * end, 1501)
+    time = moments_seen(motion, -0.05 * end, 1.1 * end, 1501)
     values = np.where(time < 0, 0.0, acceleration_of(motion, np.maximum(time, 0.0)))
     axis.plot(time, values, color=BLUE, linewidth=1)
     axis.axhline(0, color=GREY, linewidth=0.5)

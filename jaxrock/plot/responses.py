@@ -19,9 +19,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+_POINTS = 20_001  # of a curve
+
+
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
     """Ground acceleration at times [g]."""
     return np.asarray(motion.acceleration(time))
+
+
+def moments_seen(motion: AbstractMotion, begin: float, end: float, count: int) -> np.ndarray:
+    """Times at which a motion is drawn [s]: so many at equal steps, and all of its knots between, where it has its
+    corners and, with the moment before them, its jumps."""
+    knots = np.asarray(motion.knots)
+    # Those that lie outside stay, at the ends: one number of times, one program, for all lengths of padded records.
+    within = np.clip(np.concatenate([knots, np.nextafter(knots, -np.inf)]), begin, end)
+    return np.sort(np.concatenate([np.linspace(begin, end, count), within]))
 
 
 @jax.jit
@@ -66,7 +78,7 @@ def _ink() -> str:
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
     scene = response.scene
-    time = np.linspace(0, float(response.duration), 20001)
+    time = np.linspace(0, float(response.duration), _POINTS)
     rotation, velocity = response(time)
     alpha, p = float(scene.alpha), float(scene.p)
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
@@ -100,23 +112,25 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
         return _bending_history(response, axes)
     scene = response.scene
     time, rotation, velocity = _dense(response)
-    acceleration = acceleration_of(scene.motion, time)
+    shaken = moments_seen(scene.motion, 0.0, time[-1], _POINTS)
     impacts = np.asarray(response.impact_times)
     speeds = np.asarray(response.impact_velocities) / (float(scene.p) * float(scene.alpha))
-    for axis, curve in zip(axes, (rotation, velocity, acceleration)):
-        axis.plot(time, curve, color=BLUE if axis is not axes[2] else _ink(), linewidth=0.9)
+    axes[0].plot(time, rotation, color=BLUE, linewidth=0.9)
+    axes[1].plot(time, velocity, color=BLUE, linewidth=0.9)
+    axes[2].plot(shaken, acceleration_of(scene.motion, shaken), color=_ink(), linewidth=0.9)
+    for axis in axes:
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(impacts, speeds, ".", color=RED, markersize=3)
-    vertical = vertical_of(scene.motion, time)
+    vertical = vertical_of(scene.motion, shaken)
     if vertical is not None:
-        axes[2].plot(time, vertical, color=GREY, linewidth=0.6, label="vertical")
+        axes[2].plot(shaken, vertical, color=GREY, linewidth=0.6, label="vertical")
     for side, moments in zip((1, -1), scene.both_moments):  # positive acceleration lifts it to side -1
         label, level = "uplift threshold" if side > 0 else None, -side * float(moments.threshold)
         if vertical is None:
             axes[2].axhline(level, color=SAND, linewidth=0.9, label=label)
         else:  # what presses the block down holds it, too
-            axes[2].plot(time, level * (1 + vertical), color=SAND, linewidth=0.9, label=label)
+            axes[2].plot(shaken, level * (1 + vertical), color=SAND, linewidth=0.9, label=label)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
     axes[1].set_ylabel(r"velocity $\dot\theta/(p\alpha)$")
     axes[2].set_ylabel("ground\nacceleration [g]")
@@ -127,14 +141,16 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
 
 
 def _bending_history(response: FlexibleResponse, axes):
-    time = np.linspace(0, float(response.duration), 20001)
+    time = np.linspace(0, float(response.duration), _POINTS)
     rotation, displacement, bending = (np.asarray(x) for x in response(time))
     impacts = np.asarray(response.impact_times)
     axes[0].plot(time, rotation / float(response.scene.block.alpha), color=BLUE, linewidth=0.9)
     axes[0].plot(impacts, np.zeros_like(impacts), "|", color=RED, markersize=7, label="impact")
     axes[1].plot(time, displacement, color=BLUE, linewidth=0.9, label="top")
     axes[1].plot(time, bending, color=SAND, linewidth=0.7, label="of it bending")
-    axes[2].plot(time, acceleration_of(response.scene.ground, time), color=_ink(), linewidth=0.9)
+    ground = response.scene.ground
+    shaken = moments_seen(ground, 0.0, time[-1], _POINTS)
+    axes[2].plot(shaken, acceleration_of(ground, shaken), color=_ink(), linewidth=0.9)
     labels = (r"rotation of the base $\theta/\alpha$", "displacement [m]", "ground\nacceleration [g]")
     for axis, label in zip(axes, labels):
         axis.axhline(0, color=GREY, linewidth=0.5)

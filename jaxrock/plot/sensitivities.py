@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxrock._checks import one_of
-from jaxrock.plot.style import BLUE, RED, SAND, draw_cells, figure, in_order
+from jaxrock.plot.style import BLUE, DURATION, RED, SAND, draw_cells, figure, in_order
 from jaxrock.studies.critical import Critical
 from jaxrock.studies.sensitivities import Sensitivity, SensitivityMap, SlopeStatus
 
@@ -28,14 +28,18 @@ def tornado(sensitivity: Sensitivity, result: str = "max_rotation", axis: "Axes 
 
     **Returns:** the axis.
 
-    **Raises:** ValueError for a result without elasticities, as the peaks of a block that overturns are.
+    **Raises:** ValueError for many scenes, and for a result without elasticities, as the peaks of a block that
+    overturns are.
     """
     import matplotlib.pyplot as plt
 
     one_of("result", result, _RESULTS)
     slopes = getattr(sensitivity, result)
     elasticity = np.asarray(slopes.elasticity)
-    if elasticity.ndim == 1 and np.isnan(elasticity).all():
+    if elasticity.ndim != 1:
+        many = elasticity.shape[:-1]
+        raise ValueError(f"Argument `sensitivity` must be of one scene, but is of many, of shape {many}: draw one.")
+    if np.isnan(elasticity).all():
         lost = result != "margin" and bool(sensitivity.outcome.overturned)
         instead = "the block overturns: draw its `margin`" if lost else SlopeStatus[slopes.status]
         raise ValueError(f"Argument `sensitivity` must have elasticities of {result!r}, but has none: {instead}")
@@ -89,7 +93,7 @@ def sensitivity_map(
     picture = draw_cells(axis, x, y, values, cmap="RdBu_r", vmin=-limit, vmax=limit)
     axis.figure.colorbar(picture, ax=axis, label="elasticity")
     axis.set_title(f"{result.replace('_', ' ')} by {parameter.replace('_', ' ')}")
-    axis.set(xlabel="pulse duration $p\\,t_d$", ylabel="uplift strength (threshold/amplitude)")
+    axis.set(xlabel=DURATION, ylabel="uplift strength (threshold/amplitude)")
     return axis
 
 

@@ -1,4 +1,4 @@
-"""Colours that all figures share, cells of maps, curves with gaps, and ticks of logarithmic axes."""
+"""Colours and labels that figures share, cells of maps, curves with gaps, and ticks of logarithmic axes."""
 
 import functools
 import inspect
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BLUE, RED, GREY, SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
-
+DURATION, RATIO = "pulse duration $p\\,t_d$", r"frequency ratio $\omega/p$"  # by which axes over them are known
 
 Drawing = TypeVar("Drawing", bound=Callable)
 

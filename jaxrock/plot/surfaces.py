@@ -7,9 +7,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.plot.style import BLUE, GREY, RED, broken_curve, draw_cells, figure, in_order, limits_of, shade
+from jaxrock.plot.style import (
+    BLUE,
+    DURATION,
+    GREY,
+    RATIO,
+    RED,
+    broken_curve,
+    draw_cells,
+    figure,
+    in_order,
+    limits_of,
+    shade,
+)
 from jaxrock.status import Status
-from jaxrock.studies.borders import Borders, Region, borders_within, overturning_borders
+from jaxrock.studies.borders import Borders, Region, borders_within, has_two_axes, overturning_borders
 from jaxrock.studies.spectra import OverturningMap, Spectrum
 
 if TYPE_CHECKING:
@@ -19,7 +31,6 @@ _LOG = logging.getLogger("jaxrock")
 _SCENES = 500_000  # that exact borders of a figure may take: more than those of any pulse but the longest
 _SAFE = ("#faf7ee", "#c4a35a")  # survivors, from those at rest to those that come to balance
 _STATES = ("black", BLUE, RED)  # not computed, overturned without impact, overturned after impacts
-_DURATION = "pulse duration $p\\,t_d$"
 
 
 @figure(2)
@@ -47,9 +58,7 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     own = axes is None
     if axes is None:
         _, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), layout="constrained")
-    abscissa = np.asarray(result.pulse_duration if by_duration else result.abscissa)
-    order = np.argsort(abscissa)
-    abscissa = abscissa[order]
+    abscissa, order = in_order(result.pulse_duration if by_duration else result.abscissa)
     labels = result.uplift_strength if by_duration else result.intensity
     good = np.asarray(result.status == Status.successful)
     known = np.atleast_2d(np.broadcast_to(good, result.overturned.shape))[:, order]
@@ -64,7 +73,7 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
     axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
     axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
     self_similar = result.intensity is not None
-    across = _DURATION if by_duration else r"frequency ratio $\omega/p$"
+    across = DURATION if by_duration else RATIO
     axes[1].set_xlabel(across if self_similar else r"$2\pi/p$ [s]")
     if self_similar or axes[0].get_legend_handles_labels()[0]:
         many = own and len(lost) > 4  # would hide what it lies on
@@ -122,7 +131,7 @@ def overturning(
 
     **Returns:** the axis.
 
-    **Raises:** ValueError for a map with further axes.
+    **Raises:** ValueError for a map with further axes, and for `exact` borders of one column or one row.
     """
     import matplotlib.pyplot as plt
     from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
@@ -153,7 +162,7 @@ def overturning(
         axis.plot(x[unknown[1]], y[unknown[0]], "kx", markersize=3)
     _explain_states(axis, state, "lower right" if by_duration else "upper left")
     axis.set(xlim=limits_of(x), ylim=limits_of(y))
-    axis.set_xlabel(_DURATION if by_duration else r"frequency ratio $\omega/p$")
+    axis.set_xlabel(DURATION if by_duration else RATIO)
     axis.set_ylabel(
         "uplift strength (uplift threshold / peak acceleration)"
         if by_duration
@@ -240,13 +249,13 @@ def borders(
                 shown = scale * np.where(inside, 1 / edge if by_strength else edge, np.nan)
                 axis.plot(region.frequency_ratio, shown, label=label, **line)
                 label = None
-    axis.set_xlabel(r"frequency ratio $\omega/p$")
+    axis.set_xlabel(RATIO)
     axis.set_ylabel(("uplift strength" if by_strength else "intensity") + ("" if scale == 1 else f" times {scale:g}"))
     return axis
 
 
 def _is_quick(result: OverturningMap) -> bool:
-    if result.scene is None or min(result.state.shape) < 2:
+    if result.scene is None or not has_two_axes(result):
         return False
     *_, model, engine = result.scene
     return isinstance(engine, Series) if engine is not None else model.is_series

@@ -75,22 +75,28 @@ def overturning_borders(result: OverturningMap, *, progress: bool | None = False
     **Returns:** `Borders`. Intervals of intensities that are much narrower than a hundredth of the range and
     give no sign of themselves beside them may be missed; a safe gap between different numbers of impacts is not.
 
-    **Raises:** ValueError for a map with further axes, of one column or one row, or that was not computed by
-    `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
+    **Raises:** ValueError for a map with further axes, of one column or one row (or of several that are alike), or that
+    was not computed by `overturning_map`; TypeError within `jax.jit`, `jax.vmap` or a derivative.
     """
     if is_traced(result):
         raise TypeError(
             "Borders are searched from what was found before, so they cannot be traced (jax.jit, jax.vmap): ask "
             "`critical_amplitudes` for the lowest ends at every frequency."
         )
-    ratio, intensity = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
-    if result.parameters or result.scene is None or min(ratio.size, intensity.size) < 2 or ratio.ndim > 1:
+    if result.parameters or result.scene is None or not has_two_axes(result):
         raise ValueError(
-            "Argument `result` must be a map of two axes, with two values or more each, from `overturning_map`."
+            "Argument `result` must be a map of two axes, with two different values or more each, from "
+            "`overturning_map`."
         )
     found = borders_within(result, None, progress)
     assert found is not None  # of as many scenes as it takes
     return found
+
+
+def has_two_axes(result: OverturningMap) -> bool:
+    """Whether both axes of a map have an extent: two values or more, and not the same ones."""
+    axes = np.asarray(result.frequency_ratio), np.asarray(result.intensity)
+    return all(axis.ndim == 1 and np.ptp(axis) > 0 for axis in axes)
 
 
 def borders_within(result: OverturningMap, most: int | None, progress: bool | None = False) -> Borders | None:

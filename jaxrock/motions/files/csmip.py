@@ -92,6 +92,10 @@ def _check_peak(name: str, lines: list[str], start: int, at: int, samples: np.nd
             check_peak(name, row + 1, found[1], samples)
 
 
+# "CHAN  2: 360 DEG" of CSMIP, "COMP N08W" of USC.
+_BEFORE_COMPONENT = re.compile(r"^(?:CHAN\s*\w*\s*:|COMP(?:ONENT)?\b[.:=]?)\s*", re.IGNORECASE)
+
+
 def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[str, Origin]:
     """Event, station and channel in the lines before a channel's samples: in a title, and as what they are.
 
@@ -105,6 +109,6 @@ def told(lines: list[str], first: str, places: tuple[int, int, int]) -> tuple[st
     text = "\n".join(header[:10])
     start = re.search(r"(?:TRIGGER|START) TIME:\s*(.*)", text, re.IGNORECASE)
     code = re.search(r"STATION (?:NO\.?|ID\.)\s*(\S+)", text, re.IGNORECASE)
-    component = re.sub(r"^CHAN\s*\w*\s*:\s*", "", channel, flags=re.IGNORECASE)
+    component = _BEFORE_COMPONENT.sub("", channel)
     words = (" ".join(found[1].split()) if found else "" for found in (start, code))
     return ", ".join(filter(None, parts)), Origin(event, station, component, *words)

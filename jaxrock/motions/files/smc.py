@@ -20,6 +20,8 @@ _COMMENTS, _COUNT = 15, 16  # places among the whole numbers
 _RATE, _LARGEST, _SMALLEST = 1, 29, 31  # places among the real numbers: samples a second, peaks [cm/s2]
 _UNKNOWN = 1e38
 _WIDTH = 10
+# Thirty characters of a name stand between the two, with commas or none, and with blanks up to its end.
+_STATION = re.compile(r"\s*station\s*=\s*(.*?)\s*(?:\bcomponent\s*=\s*(.*?)\s*)?$", re.IGNORECASE)
 
 
 class SMC(AbstractFormat):
@@ -42,7 +44,11 @@ class SMC(AbstractFormat):
         whole, real = _whole(lines), _real(lines)
         if whole is None or real is None:
             raise file_error(name, "lines 12 to 27 should hold the numbers of an SMC file's headers.")
-        if not 0 < real[_RATE] < _UNKNOWN:
+        if real[_RATE] >= _UNKNOWN:
+            said = "states no samples a second, so the file holds times and samples that are not equally spaced"
+            told = "take its corrected file, or interpolate them at equal steps for a `Record`"
+            raise file_error(name, f"line {_TEXT + _WHOLE + 1} {said}: {told}.")
+        if not real[_RATE] > 0:
             raise file_error(name, f"line {_TEXT + _WHOLE + 1} states {real[_RATE]:g} samples a second.")
         unit = agreed_unit(name, 1, unit, "cm/s2")
         start = _TEXT + _WHOLE + _REAL + max(whole[_COMMENTS], 0)
@@ -79,7 +85,7 @@ def _real(lines: list[str]) -> list[float] | None:
 
 def _origin(lines: list[str]) -> Origin:
     """What the lines of text say: they have fixed places."""
-    station = re.match(r"\s*station\s*=\s*(.*?)(?:,\s*\S*\s*component\s*=\s*(.*))?$", lines[5].rstrip(), re.IGNORECASE)
+    station = _STATION.match(lines[5])
     time = re.match(r"\s*(\d+\s+\d+\s+\d+\s+\d+)\s+(.*)", lines[3].rstrip())
     return Origin(
         " ".join(time[2].split()) if time else "",
