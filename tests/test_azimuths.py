@@ -125,6 +125,7 @@ def test_a_suite_of_components_has_azimuths():
     for motion, (pair, angle) in zip(suite.motions(), [(PAIR, 0.0), (PAIR, 0.5), (PAIR, 1.0)]):
         np.testing.assert_array_equal(motion.samples, pair.along(angle).samples)
     found = rk.hazard.suite_outcomes(oval(0.0), suite, SCALE, **QUICK)
+    assert rk.hazard.simulated_fragility(oval(0.0), suite, 0.4 * SCALE, **QUICK).turns == 3
     table = found.table()
     row = np.flatnonzero((table["source"] == "two") & (table["azimuth"] == 0.5) & (table["scale"] == 0.8))
     alone = rk.outcome(oval(0.0), 0.8 * rk.motions.Components(NORTH, EAST).along(0.5), QUICK["model"],

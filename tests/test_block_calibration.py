@@ -10,6 +10,7 @@ import scipy.integrate
 import scipy.stats
 
 import jaxrock as rk
+from jaxrock.inverse.calibration_grid import Axis, blocks_of_cells
 
 RANDOM = np.random.default_rng(1)
 COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
@@ -140,6 +141,34 @@ def test_a_parameter_that_tests_do_not_tell():
         )
         assert flat.status == rk.inverse.CalibrationStatus.not_told
         assert np.isinf(list(flat.standard_errors.values())).all()
+
+
+def test_a_likelihood_is_not_flat_at_the_ends_of_a_range():
+    """Without scatter the outermost cells are the ends: shares of cells that rise rise up to there."""
+    axis = Axis.of("p", rk.inverse.Unknown(1.5, 6.0), None, 8)
+    np.testing.assert_allclose(axis.values[[0, -1]], [1.5, 6.0], rtol=1e-15)
+    p = np.exp(np.log(1.5) + np.array([0, 0.2, 0.4, 6.6, 6.8, 7]) * axis.width)
+    shares = [float(axis.weights({"p": each}, "p") @ np.arange(8.0)) for each in p]
+    np.testing.assert_allclose(np.array(shares)[[0, -1]], [0, 7], atol=1e-12)
+    assert (np.diff(shares)[[0, 1, 3, 4]] > 0.05).all()
+
+
+class Firm(rk.restitution.AbstractRestitution):
+    """A law whose numbers nobody declares: all blocks share them."""
+
+    firm: jax.Array
+    speed: jax.Array
+
+    def ratio(self, corners, speed):
+        return self.firm / (1 + speed / self.speed)
+
+
+def test_blocks_of_cells_share_what_belongs_to_a_law_of_ones_own():
+    axes = {"alpha": Axis.of("alpha", UNKNOWN, SPREAD, 8)}
+    blocks = blocks_of_cells(lambda alpha: rk.Block(alpha, P, Firm(0.9, 4.0)), axes)
+    assert blocks.alpha.shape == (8,) and (float(blocks.law.firm), float(blocks.law.speed)) == (0.9, 4.0)
+    with pytest.raises(ValueError, match="declares its parameters .*, but `law.firm` is not declared, and differs"):
+        blocks_of_cells(lambda alpha: rk.Block(alpha, P, Firm(1 - alpha, 4.0)), axes)
 
 
 def test_names_in_any_order():

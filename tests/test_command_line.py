@@ -21,7 +21,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.command_line import invert, output
-from jaxrock.command_line.fragility import _write
+from jaxrock.command_line.fragility import _entries, _write
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, files_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
@@ -253,6 +253,17 @@ def test_fragility(command, column, tmp_path):
     words[words.index("6")] = "0.21"  # none topples: no fit, and none of the run before in its place
     assert command("fragility", column, other, *words)[0] == 1
     assert not (tmp_path / "out" / "fragility.xml").exists()
+
+
+def test_errors_of_one_record_are_not_known():
+    """It says nothing of others, whatever its blocks did."""
+    levels = jnp.geomspace(0.2, 6.0, 12)
+    verdict = (np.arange(12)[:, None] > np.array([3, 6, 9])).astype(np.int8)[None]
+    found = rk.hazard.SimulatedFragility(levels, verdict, *jnp.ones((2, 1)), ("a",), "PGA")
+    entries = {entry.label: entry for entry in _entries(found, {"lower": found.fit()})}
+    errors = entries["standard errors of their logarithms"]
+    assert errors.text == "not known" and output.plain(errors.value) == [None, None]
+    assert not any("interval" in label for label in entries) and float(entries["median PGA"].text) > 0
 
 
 def test_patterns_that_no_shell_has_expanded(tmp_path):

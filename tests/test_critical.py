@@ -10,6 +10,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.studies import ends
+from jaxrock.studies.lowest_ends import _closed
 
 SCENES = json.loads((Path(__file__).parents[1] / "references" / "critical.json").read_text())["scenes"]
 PULSES = {"sine": rk.SinePulse, "exponential": rk.ExponentialPulse, "half sine": rk.HalfSinePulse}
@@ -70,6 +71,23 @@ def test_what_is_not_known_is_no_end():
     values = (np.array([0.5]), np.array([np.nan]), np.ones(1), np.ones(1, int))
     *_, single, more = ends.halved(np, sides, values, np.array([6]))
     assert not single.any() and not more.any()
+
+
+def ramp(z, numbers):
+    """Margins that fall through zero at the root of one half, and are not known close to it, but for a point there."""
+    margin = numbers.asarray(30 * (np.sqrt(0.5) - z))
+    return numbers.where((abs(margin) < 1e-4) & (abs(margin) > 1e-9), numbers.nan, margin), 0 * z - 30, 0 * z
+
+
+def test_points_on_the_way_to_an_end_that_are_not_known_are_told():
+    grid = np.linspace(0, 1, 5)
+    found = ends.roots_of(lambda z, index: ramp(z, np), ends.brackets_of(lambda z, index: ramp(z, np), grid[None])[0])
+    assert found["known"].tolist() == [False]
+    for here in (True, False):  # what is no bracket asks nothing
+        z = jnp.array([[0.5], [1.0]])
+        sides = [z, *ramp(z, jnp)]
+        _, known = _closed(lambda z: ramp(z, jnp), sides, jnp.array([here]), z[0, 0])
+        assert bool(known) != here
 
 
 def least(numbers, amplitude):

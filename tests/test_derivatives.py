@@ -1,5 +1,6 @@
 """Derivatives: against 40-digit differences, of every order, forward and reverse, and where they do not exist."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxrock.engines.taylor.expansion import End, Start, arrive, expand
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.polynomial import jet
 from jaxrock.responses.outcome import has_one_peak
+from jaxrock.studies.sensitivities import _told
 from jaxrock.transforms.differentiation import differentiable
 from references.in_jaxrock import MODELS, PULSES
 from references.smooth_differences import gradient
@@ -559,6 +561,26 @@ def test_a_block_that_does_not_uplift_has_no_slopes():
     for slopes in (found.max_rotation, found.max_velocity):
         assert slopes.value == 0 and np.isinf(slopes.reach) and slopes.status == rk.studies.SlopeStatus.useful
         assert not np.any(slopes.derivative) and not np.any(slopes.elasticity)
+
+
+def test_nothing_is_far_of_a_scene_that_was_not_computed():
+    """NaN says that no distance is known: infinite would be safe. Nor is one known without a slope."""
+    still = rk.Record([0.0, 0.0, 0.0], 0.01)
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), still, rk.Linear(), engine=rk.Series(order=4))  # as above
+    assert found.boundary_distance == found.graze_distance == np.inf  # computed, and nothing moves it
+    rows, names, result = np.zeros((4, 5)), found.names[:-1], found.outcome
+    numbers = found.values[:-1], jnp.asarray(0.2)
+    assert len(names) == 5
+
+    def distances(rows, **known):
+        told = _told(names, *numbers, jnp.asarray(rows), dataclasses.replace(result, **known))
+        return float(told.graze_distance), float(told.boundary_distance)
+
+    nan = jnp.asarray(np.nan)
+    failed = distances(rows, status=rk.Status.step_budget_exhausted, margin=nan, clearance=nan)
+    assert np.isnan(failed).all()
+    rows[2], rows[3] = np.nan, 0.1
+    assert distances(rows)[0] == np.inf and np.isnan(distances(rows)[1])
 
 
 def two_lobes(restitution, *numbers):

@@ -281,6 +281,38 @@ def test_survival_against_direct_quadrature():
     np.testing.assert_allclose(rk.hazard.survival_probability(ROCKS, AGES, CURVE), np.exp(-exponent), rtol=1e-7)
 
 
+class Edge(rk.hazard.AbstractFragility):
+    """A user's fragility without numbers of its own."""
+
+    def __call__(self, level):
+        return jnp.where(level < 0.4, 0.0, 1.0)
+
+    @property
+    def knots(self):
+        return jnp.array([0.4])
+
+
+class Halved(rk.hazard.LogNormalFragility):
+    """A user's variant of the package's own: every second rock is gone."""
+
+    def __call__(self, level):
+        return super().__call__(level) / 2
+
+
+def test_fragilities_without_numbers():
+    """They topple together, so that the oldest counts."""
+    found = rk.hazard.survival_probability([Edge(), Edge()], [200.0, 300.0], CURVE)
+    np.testing.assert_allclose(found, np.exp(-300 * CURVE.rate(0.4)), rtol=1e-13)
+    jax.eval_shape(lambda age: rk.hazard.allowed_scale(Edge(), age, CURVE), 300.0)
+
+
+def test_a_variant_of_the_lognormal_fragility_has_its_own_rate():
+    rock = Halved(0.35, 0.4)
+    np.testing.assert_allclose(
+        rk.hazard.toppling_rate(rock, CURVE), rk.hazard.toppling_rate(ROCK, CURVE) / 2, rtol=1e-9
+    )
+
+
 def test_limits_of_survival():
     rate = float(CURVE.rate(0.4))
     step = Step(0.4)

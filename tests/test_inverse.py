@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import jaxrock as rk
 from jaxrock.command_line.main import main
@@ -15,7 +16,7 @@ from jaxrock.inverse.observation_files import _COLUMNS
 from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.profile_likelihood import shape_at
-from jaxrock.inverse.scatter import rocks_at
+from jaxrock.inverse.scatter import Possible, levels_around, rocks_at
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import climb
 
@@ -169,6 +170,47 @@ def test_slopes_that_were_not_computed_are_refused(what):
         jax.eval_shape(
             jax.grad(lambda a: getattr(likelihood, what)(dict(amplitude=a, period=1.0), **options).sum()), 0.3
         )
+
+
+@pytest.mark.parametrize("scatter", [0.2, 0.45])
+def test_slopes_by_the_scatter(scatter):
+    """Of margins that are straight: P = Phi(ln(critical/amplitude)/scatter), and its slope."""
+    critical, strength = np.log([0.22, 0.27, 0.36, 0.4] * 3), np.log(0.3)
+    found, slopes = stands(scatter, critical, strength)
+    z = (critical - strength) / scatter
+    np.testing.assert_allclose(found, scipy.stats.norm.cdf(z), atol=1e-3)
+    np.testing.assert_allclose(slopes, -z / scatter * scipy.stats.norm.pdf(z), rtol=0.015)
+
+
+@jax.jit
+def stands(scatter, critical, strength):
+    """Probabilities that rocks stand, which are lost above amplitudes, and their slopes by the scatter."""
+
+    def probabilities(scatter):
+        seen = rk.inverse.Observations(np.full(12, 0.2), np.full(12, 3.0), ["survived"] * 12)
+        levels, where = levels_around(seen, scatter, strength)
+        y = (critical - jax.lax.stop_gradient(levels.strength))[:, None]  # nodes are fixed, as in a likelihood
+        margin, rotation = jnp.where(y < 0, 1 - jnp.exp(-2 * y), jnp.sqrt(1 + 4 * jnp.maximum(y, 0.0)) - 1), 0 * y
+        found = Possible.of(where[:, None], margin, rotation, y == y, y < 0, rotation + 1).log_probabilities()
+        return jnp.exp(found[0]), jnp.exp(found[0])
+
+    slopes, found = jax.jacfwd(probabilities, has_aux=True)(scatter)
+    return found, slopes
+
+
+@pytest.mark.parametrize("what", ["rocks", "rocks and values", "the motion's function"])
+def test_slopes_that_there_are_not_are_refused(what):
+    """By rocks a likelihood was differentiated without what their own response changes by."""
+
+    def height(x):
+        alpha, amplitude, factor = (x if part in what else 1.0 for part in ("rocks", "values", "function"))
+        likelihood = rk.inverse.Likelihood(
+            rocks(["survived"] * 12, alpha * ALPHA), lambda amplitude, period: rk.SinePulse(amplitude, factor * period)
+        )
+        return likelihood.log_terms({"amplitude": 0.3 * amplitude, "period": 1.0}).sum()
+
+    with pytest.raises(NotImplementedError, match="not by the rocks, nor by what the functions of motion and model"):
+        jax.eval_shape(jax.grad(height), 1.0)
 
 
 def truth(seed, scatter=SCATTER):

@@ -2,12 +2,18 @@
 
 import xml.etree.ElementTree as ElementTree
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
 
 import jaxrock as rk
+from jaxrock.blocks.random import _drawn, _drawn_sides
+from jaxrock.hazard.suites import measures_by_name
+from jaxrock.studies import azimuths, suite_scenes
+from jaxrock.studies.suite_scenes import of_motion, stacked
 
 RANDOM = np.random.default_rng(4)
 RECORDS = [
@@ -60,6 +66,47 @@ def test_turning_round_a_symmetric_block_changes_nothing():
     np.testing.assert_allclose(turned.rotation[:, 0, 0, 0], found.rotation[:, 0, 1, 0], rtol=1e-9)
 
 
+class Tabulated(rk.restitution.AbstractRestitution):
+    """A law of one's own, with a declared list and a number that nobody declares."""
+
+    ratios: jax.Array = rk.parameter("-", "share", axes=1)
+    factor: jax.Array | float = 1.0
+
+    def ratio(self, corners, speed):
+        return self.factor * jnp.interp(speed, jnp.arange(3.0), self.ratios)
+
+
+def test_draws_share_what_belongs_to_the_law():
+    law, factors = Tabulated(jnp.array([0.9, 0.8, 0.7]), 0.99), jax.device_put((np.linspace(0.9, 1.1, 5), np.ones(5)))
+    rock = rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0, restitution=law)
+    for drawn in (_drawn(rk.Block(0.2, 2.0, law), *factors, 0.0, factors[1]), _drawn_sides(rock, *factors, 0.0)):
+        drawn = stacked(drawn)
+        assert jax.tree.leaves(drawn)[0].shape == (5,)
+        np.testing.assert_array_equal(drawn.law.ratios, law.ratios)
+        assert float(drawn.law.factor) == 0.99
+
+
+def test_numbers_of_a_law_of_ones_own_go_through_suites(monkeypatch):
+    """And through azimuths; scenes are traced only, which says whether they are of one block each."""
+    seen = []
+
+    def traced(motion, blocks, *rest):
+        seen.append(blocks.law)
+        return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(of_motion, motion, blocks, *rest))
+
+    for module in (suite_scenes, azimuths):
+        monkeypatch.setattr(module, "of_motion", traced)
+    law, components = Tabulated(jnp.array([0.9, 0.8, 0.7]), 0.99), rk.motions.Components(RECORDS[0], RECORDS[0])
+    blocks, given = rk.Block(np.array([0.2]), 2.0, law), {"scale": SCALE, "progress": False} | QUICK
+    found = rk.hazard.suite_outcomes(blocks, RECORDS[:1], **given)
+    assert found.verdict.shape == (1, 3, 1, 1) and "law.factor" not in found.table()
+    rk.studies.azimuth_outcomes(lambda _: rk.Block(0.2, 2.0, law), components, [0.0], **given)
+    for each in seen:
+        np.testing.assert_array_equal(each.ratios, law.ratios)
+        assert float(each.factor) == 0.99
+    assert len(seen) == 2
+
+
 def by_hand():
     """A block that comes back, one that does not topple, one undecided."""
     verdict = np.array([[0, 1, 0, 1], [0, 0, 0, 0], [0, -1, 1, 1]], np.int8)[:, :, None, None]
@@ -105,10 +152,23 @@ def test_long_table(found):
     assert frame.groupby("motion").size().eq(12).all()
 
 
-@pytest.mark.parametrize("measures", [{"a": "SA"}, ["Arias"]])
+def test_a_column_is_what_its_name_was_given_for():
+    arias = by_hand().table(["IA"])["IA"]
+    np.testing.assert_array_equal(by_hand().table({"PGA": "IA"})["PGA"], arias)
+    np.testing.assert_allclose(by_hand().table({"PGA": "PGA"})["PGA"], by_hand().table()["PGA"])
+
+
+@pytest.mark.parametrize("measures", [{"a": "SA"}, ["Arias"], ["IA", "IA"], {"verdict": "IA"}, {"p": "IA"}])
 def test_measures_of_other_names(measures):
     with pytest.raises(ValueError, match="`measures` must"):
         by_hand().table(measures)
+
+
+@pytest.mark.parametrize("measures", [[lambda m: 1.0, lambda m: 2.0], [rk.intensity.arias], {1: "IA", "1": "CAV"}])
+def test_measures_without_names_of_their_own(measures):
+    """The last would be taken for all of them."""
+    with pytest.raises(ValueError, match="`measures` must (hold names, or functions by name|have each name once)"):
+        measures_by_name(measures)
 
 
 @pytest.mark.parametrize(
@@ -187,6 +247,17 @@ def test_errors_for_few_motions():
             inside[kind] += abs(float(fit.intercept)) < 1.96 * float(fit.standard_errors[0])
     shares = {kind: count / repetitions for kind, count in inside.items()}
     assert shares["information"] < 0.75 < 0.85 < shares["clusters"] <= shares["jackknife"], shares
+
+
+def test_a_jackknife_of_what_parts_without_one_row():
+    """Without the third of them no line is the best: errors are not known, the fit is."""
+    levels, fell = np.resize([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], 300), np.resize([0, 0, 1, 0, 1, 1], 300)
+    labels = np.where(np.arange(300) % 6 == 2, 2, np.arange(300) % 15 + (np.arange(300) % 15 == 2))  # 15, as above
+    fit = rk.hazard.fit_probit({"PGA": levels}, fell, clusters=labels, errors="jackknife")
+    assert fit.status == rk.hazard.FitStatus.successful and np.isnan(fit.standard_errors).all()
+    other = rk.hazard.fit_probit({"PGA": levels}, fell, clusters=labels, errors="clusters")
+    for name in ("intercept", "slopes", "log_likelihood", "p_values"):
+        np.testing.assert_allclose(getattr(fit, name), getattr(other, name), rtol=1e-9)
 
 
 def test_a_single_measure_is_the_lognormal_fit():

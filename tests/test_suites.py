@@ -1,5 +1,6 @@
 """Fragility by simulation: against closed forms of toppling, known probabilities, and resampled suites."""
 
+import dataclasses
 import functools
 
 import jax
@@ -12,6 +13,7 @@ from scipy.special import ndtr
 
 import jaxrock as rk
 from jaxrock.hazard.intervals import intervals_of_motions
+from jaxrock.hazard.surfaces import _verdict
 from jaxrock.motions.suite import repeated
 
 G = 9.81
@@ -142,6 +144,14 @@ def test_rocks_of_two_sides_both_ways_round():
     np.testing.assert_array_equal(alone.verdict, found.verdict[..., :4])
     grid = rk.hazard.simulated_surface(rock, [rk.RectangularPulse], levels, DURATIONS, facing="both", **quick)
     np.testing.assert_array_equal(grid.verdict[0], np.swapaxes(found.verdict, 0, 1))
+    assert grid.ways == 2
+
+
+def test_a_surface_of_what_is_made_of_samples():
+    """Each period has a record of its own: a scene is of one of them (it is traced only)."""
+    group = jax.vmap(lambda t: rk.Record([0.0, 0.3, 0.0], t))(jnp.array([0.4, 0.5]))
+    scene = rk.Block(np.array([0.2]), np.array([2.0])), group, rk.Linear(), rk.Series(order=4)
+    assert jax.eval_shape(_verdict, 0, 0, 1.0, scene).shape == ()
 
 
 def test_draws_of_two_sides():
@@ -261,7 +271,7 @@ def test_intervals_of_one_block_are_those_of_a_sample():
 
 def test_intervals_that_cannot_be_told():
     rises = np.repeat([0, 1], LEVELS.size // 2)[:, None]
-    for verdict, status in (([rises], "separable"), ([rises, 1 - rises], "not_growing")):
+    for verdict, status in (([rises], "separable"), ([rises, 1 - rises, 1 - rises], "not_growing")):
         found = table(verdict).intervals()
         assert found.status == getattr(rk.hazard.FitStatus, status)
         assert np.isnan(found.median).all() and np.isnan(found.dispersion).all()
@@ -274,6 +284,38 @@ def test_no_intervals_where_all_motions_did_the_same():
     assert np.isfinite(found.fit().fragility.median) and np.isnan(found.fit().covariance).all()
     assert found.intervals().status == rk.hazard.FitStatus.alike
     assert np.isnan(found.intervals().median).all() and np.isnan(found.intervals().dispersion).all()
+
+
+def test_turns_of_a_record_are_one_motion():
+    """Three records at four azimuths each: the sandwich of records by NumPy's sums."""
+    capacity = np.array([[0.3], [0.4], [0.6]]) * np.array([0.7, 1.0, 1.1, 1.6])
+    fell = LEVELS > capacity[:, :, None]  # (records, turns, levels)
+    ones, names = jnp.ones(12), tuple(f"motion {k}" for k in range(12))
+    verdict = fell.reshape(12, -1, 1).astype(np.int8)
+    found = rk.hazard.SimulatedFragility(jnp.asarray(LEVELS), verdict, ones, ones, names, "PGA", turns=4)
+    fit, plain = found.fit(), rk.hazard.fit_fragility(LEVELS, fell.sum(axis=(0, 1)), 12.0)
+    z = np.log(LEVELS / float(fit.fragility.median)) / float(fit.fragility.dispersion)
+    residual = scipy.stats.norm.pdf(z) / (ndtr(z) * ndtr(-z)) * (fell - ndtr(z))
+    rows = np.stack([np.full(12, -1 / float(fit.fragility.dispersion)), -z])
+    scores = np.einsum("rtl,il->ri", residual, rows)
+    expected = 3 / 2 * plain.covariance @ scores.T @ scores @ plain.covariance
+    np.testing.assert_allclose(fit.covariance, expected, rtol=1e-6)
+    draws = table(np.swapaxes(fell, 1, 2), LEVELS)  # what one does to four blocks goes together, too
+    assert float(fit.p_value) == pytest.approx(float(draws.fit().p_value), rel=1e-9)
+    np.testing.assert_allclose(found.intervals().median, draws.intervals().median, rtol=1e-9)
+    again = dataclasses.replace(found, verdict=np.tile(verdict[:4], (3, 1, 1)))
+    assert again.intervals().status == rk.hazard.FitStatus.alike  # records did the same, though turns did not
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_one_record_tells_nothing_of_others(turns):
+    verdict = (LEVELS > 0.3 * np.arange(1.0, 4)[:, None]).astype(np.int8)
+    verdict = verdict.T[None] if turns == 1 else verdict[:, :, None]  # three draws, or three azimuths
+    ones, names = jnp.ones(turns), tuple("abc"[:turns])
+    found = rk.hazard.SimulatedFragility(jnp.asarray(LEVELS), verdict, ones, ones, names, "PGA", turns=turns)
+    fit = found.fit()
+    assert np.isfinite(fit.fragility.median) and np.isnan(fit.covariance).all() and np.isnan(fit.p_value)
+    assert np.isnan(found.intervals().median).all()
 
 
 def test_motions_that_are_the_same():
@@ -379,6 +421,21 @@ def test_fit_of_a_surface():
         assert failed.status == rk.hazard.FitStatus.separable and np.isnan(failed.fragility.median)
 
 
+def test_a_surface_of_turned_records_is_one_of_clusters():
+    random = np.random.default_rng(7)
+    levels = jax.device_put(np.geomspace(0.1, 1.6, 1000))  # as many rows as above: one program
+    verdict = (random.uniform(size=(4, 1000, 3)) < ndtr(np.log(levels / 0.4) / 0.4)[:, None]).astype(np.int8)
+    ones, speed = jax.device_put((np.ones(4), np.geomspace(0.5, 2.0, 4)))
+    found = rk.hazard.SimulatedFragility(levels, verdict, ones, speed, tuple("abcd"), "PGA", turns=2)
+    rows = found.table()
+    ratio = rows["peak_velocity"] / (G * rows["peak_acceleration"])
+    records = np.repeat(["one", "two"], 2000)
+    fit = rk.hazard.fit_surface(rows["peak_acceleration"], ratio, rows["toppled"], rows["trials"], records)
+    np.testing.assert_allclose(rk.hazard.surface_of(found).covariance, fit.covariance, rtol=1e-12)
+    one = rk.hazard.surface_of(dataclasses.replace(found, turns=4))
+    assert one.fragility.median == fit.fragility.median and np.isnan(one.covariance).all()
+
+
 def test_fit_of_a_simulated_surface():
     """All cells of a grid, draws as clusters: nearly as certain as independent outcomes, which these are."""
     acceleration, ratio = np.geomspace(0.1, 1.5, 20), np.geomspace(0.03, 0.3, 20)
@@ -393,6 +450,13 @@ def test_fit_of_a_simulated_surface():
     assert np.all((0.5 < errors) & (errors < 2.0))
     alone = rk.hazard.SimulatedSurface(*jax.device_put((acceleration, ratio)), verdict[..., :1]).fit()
     assert np.isfinite(alone.fragility.median) and np.isnan(alone.covariance).all()  # a block says nothing of others
+    # A block and its mirror image are one draw, both ways under one pulse as under two.
+    other = verdict[..., ::-1]
+    both = dataclasses.replace(found, verdict=np.concatenate([verdict, other], axis=3), ways=2).fit()
+    pulses = np.concatenate([verdict, other])
+    np.testing.assert_allclose(both.covariance, dataclasses.replace(found, verdict=pulses).fit().covariance, rtol=1e-12)
+    mirrored = dataclasses.replace(found, verdict=np.repeat(verdict[..., :1], 2, axis=3), ways=2).fit()
+    assert np.isfinite(mirrored.fragility.median) and np.isnan(mirrored.covariance).all()
     verdict[0, 5, 5, 0] = -1
     with pytest.raises(ValueError, match="1 of 4000 scenes are undecided"):
         found.fit()

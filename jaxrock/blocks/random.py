@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike
 
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import not_negative, positive, scalar
-from jaxrock._parameters import check_single
+from jaxrock._parameters import broadcast, check_single
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
@@ -89,7 +89,7 @@ def _drawn(block: Block, alpha: Array, p: Array, restitution: float, key: Array)
     if restitution != 0 and tells_sides(block.law, block.corners):
         raise ValueError("Argument `restitution` must be 0 for a block whose law of restitution tells its sides apart.")
     if restitution == 0:
-        law = _each(block.law, alpha.shape)
+        law = broadcast(block.law, alpha.shape)
     else:
         ends = (0 - block.restitution) / restitution, (1 - block.restitution) / restitution
         law = block.restitution + restitution * jax.random.truncated_normal(key, *ends, alpha.shape)
@@ -99,13 +99,10 @@ def _drawn(block: Block, alpha: Array, p: Array, restitution: float, key: Array)
 def _drawn_sides(block: AsymmetricBlock, alpha: Array, p: Array, restitution: float) -> AsymmetricBlock:
     if restitution != 0:
         raise ValueError("Argument `restitution` must be 0 for an AsymmetricBlock, whose sides have each its own.")
-    inertia, radius, law = _each((block.inertia_ratio, block.given_radius_ratio, block.law), alpha.shape)
+    ratios, law = (block.inertia_ratio, block.given_radius_ratio), broadcast(block.law, alpha.shape)
+    inertia, radius = jax.tree.map(lambda x: jnp.broadcast_to(x, alpha.shape), ratios)
     angles = alpha * block.alpha1, alpha * block.alpha2
     return _made(AsymmetricBlock, *angles, p * block.p1, inertia, radius, law)
-
-
-def _each(tree: Any, shape: tuple[int, ...]) -> Any:
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), tree)
 
 
 def _tolerances(name: str, value) -> tuple[float, float]:

@@ -73,10 +73,11 @@ def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
         errors = np.sqrt(np.diag(np.asarray(fit.covariance)))
         words, key = ("", "") if not found.undecided else (f", {bound} bound", f"_{bound}")
         said = "standard errors of their logarithms"
+        known = f"{errors[0]:.3f}, {errors[1]:.3f}" if np.isfinite(errors).all() else "not known"  # one record has none
         entries += [
             Entry(f"median{key}", f"median {found.measure}{words}", float(fit.fragility.median), ".4f", unit),
             Entry(f"dispersion{key}", f"dispersion{words}", float(fit.fragility.dispersion), ".4f"),
-            Entry(f"standard_errors{key}", f"{said}{words}", errors, shown=f"{errors[0]:.3f}, {errors[1]:.3f}"),
+            Entry(f"standard_errors{key}", f"{said}{words}", errors, shown=known),
         ]
         intervals = found.intervals(bound)
         for name, ends in (("median", intervals.median), ("dispersion", intervals.dispersion)):

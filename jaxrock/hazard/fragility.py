@@ -206,7 +206,7 @@ class FragilityFit(AbstractTable):
     - `status`: a `FitStatus`.
     - `p_value`: how probably outcomes that have nothing to do with the levels give such a slope (Rao's score test
       with the observed information): above 0.05 this measure of intensity is useless here. It holds of separable
-      outcomes, too; 1 where all ended alike.
+      outcomes, too; 1 where all ended alike; NaN of a simulation of one record, which tells nothing of others.
     """
 
     fragility: LogNormalFragility

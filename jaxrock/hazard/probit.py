@@ -23,7 +23,8 @@ class ProbitFit(AbstractTable):
     P = Phi(intercept + sum of slopes times ln measure).
 
     - `names`: of the measures; `intercept`; `slopes`: (measures,).
-    - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes.
+    - `covariance`: (1 + measures, 1 + measures) of the intercept and the slopes; of a jackknife NaN where outcomes can
+      be parted once a cluster is left out, so that a line without it is not known.
     - `log_likelihood`: at the maximum, without the binomial coefficients.
     - `p_values`: (measures,) how probably outcomes that have nothing to do with a measure, given the others, give such
       a slope (Rao's score test with the observed information, of clusters where there are any); they hold of separable
@@ -107,7 +108,8 @@ def fit_probit(
     - `errors`: what the covariance is. "information": the inverse of the observed information, for independent
       outcomes (the default without clusters). "clusters": a sandwich of clusters times C/(C - 1) (the default with
       them), which is too narrow for few. "jackknife": every cluster (without clusters, every row) left out once, which
-      for few, 10 to 40, is the safer one: somewhat too wide rather than too narrow.
+      for few, 10 to 40, is the safer one: somewhat too wide rather than too narrow. NaN where what is left can
+      be parted.
 
     **Returns:** a `ProbitFit`.
 
@@ -178,6 +180,7 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
     likelihood, by_z, curvature = probit(line @ rows, toppled, survived)
     covariance, told = inverse_information(rows, curvature, toppled + survived)
+    told &= jnp.all(jnp.isfinite(covariance))
     if errors == "clusters":
         scores = jnp.zeros((count, len(rows))).at[labels].add((rows * by_z).T)
         covariance = covariance @ (scores.T @ scores * count / (count - 1)) @ covariance
@@ -193,8 +196,7 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     # In the logarithms themselves: intercept = line[0] - sum(line[k] centre[k]/size[k]).
     back = jnp.diag(jnp.concatenate([jnp.ones(1), 1 / size])).at[0, 1:].set(-centre / size)
     # Where outcomes can be parted, probabilities come to 0 or 1 and the line goes on for ever.
-    converged &= known & jnp.all(jnp.isfinite(covariance)) & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
-    converged &= told & (likelihood < -1e-6)
+    converged &= known & told & (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0) & (likelihood < -1e-6)
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
     numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood

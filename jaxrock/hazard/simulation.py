@@ -15,13 +15,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int8
 
 from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, checked, one_of
+from jaxrock._checks import Values, checked, one_of, placed
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.hazard.fragility import (
-    FitStatus,
     FragilityFit,
     TabulatedFragility,
     fit_fragility,
@@ -68,6 +67,7 @@ class SimulatedFragility(AbstractTable):
       before they were scaled; the measure grows with the `power` of the scale.
     - `verdict`: (motions, levels, draws) 1 toppled, 0 stood, -1 undecided (the verdict was too close to call, or could
       not be computed).
+    - `turns`: so many motions, one after the other, are one record at several azimuths.
     """
 
     levels: Float[Array, " levels"]
@@ -78,6 +78,7 @@ class SimulatedFragility(AbstractTable):
     measure: str = eqx.field(static=True)
     strength: Float[np.ndarray, " motions"] | None = None
     power: float = eqx.field(static=True, default=1.0)
+    turns: int = eqx.field(static=True, default=1)
 
     @property
     def unit(self) -> str:
@@ -130,24 +131,28 @@ class SimulatedFragility(AbstractTable):
 
         - `bound`: as in `counts`.
 
-        **Returns:** a `FragilityFit`. Its covariance takes motions as what is random: what one motion does at one level
-        and to one block goes with what it does at others (a sandwich of clusters; two motions or more). Standard
-        errors from it are too small for few motions: `intervals` hold. Of motions that all did the same it is NaN.
-        Blocks are taken as drawn often enough. Look at `monotone` and `falls` before a curve that only rises is used.
+        **Returns:** a `FragilityFit`. Its covariance and `p_value` take records as what is random: what one does at one
+        level, at one azimuth and to one block goes with what it does at others (a sandwich of clusters). Standard
+        errors from it are too small for few records: `intervals` hold. Of one record both are NaN; of records that all
+        did the same the covariance is. Blocks are taken as drawn often enough. Look at `monotone` and `falls` before a
+        curve that only rises is used.
 
         **Raises:** ValueError if a bound is needed.
 
         **Source:** Baker (2015), the fit to stripes; Liang & Zeger (1986), the covariance of clusters.
         """
-        toppled = self.counts(bound)
-        motions, _, draws = self.verdict.shape
-        fit = fit_fragility(self.levels, toppled.sum(axis=0), float(motions * draws))
-        if motions == 1 or fit.status != FitStatus.successful:
-            return fit
+        # Scores of what one record does add up, and go with the counts: as if its turns were draws.
+        toppled = self.counts(bound).reshape(self._records, self.turns, -1).sum(axis=1)
+        trials = float(self.turns * self.verdict.shape[2])
+        fit = fit_fragility(self.levels, toppled.sum(axis=0), self._records * trials)
+        unknown = jnp.full_like(fit.covariance, jnp.nan)
+        if self._records == 1:
+            covariance, test = unknown, unknown[0, 0]
+        else:
+            covariance, test = _clustered(fit, self.levels, *placed((toppled, np.asarray(trials))))
         if np.all(toppled == toppled[0]):
-            return eqx.tree_at(lambda f: f.covariance, fit, jnp.full_like(fit.covariance, jnp.nan))
-        clustered = _clustered(fit, self.levels, jnp.asarray(toppled), float(draws))
-        return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, clustered)
+            covariance = unknown
+        return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, (covariance, test))
 
     def intervals(self, bound: str | None = None, confidence: ArrayLike = 0.95) -> FragilityIntervals:
         """Confidence intervals of the fit's median and dispersion, which hold for few motions: Student's t for the
@@ -158,16 +163,21 @@ class SimulatedFragility(AbstractTable):
         - `bound`: as in `counts`.
         - `confidence`: in (0, 1).
 
-        **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, of one motion only, and
-        (`FitStatus.alike`) of motions that all did the same.
-        They take the capacities under motions as lognormal, as the fit does. How often intervals of 95 % held the truth
+        **Returns:** a `FragilityIntervals`; NaN with the status of the fit where that failed, of one record only, at
+        however many azimuths, and (`FitStatus.alike`) of records that all did the same.
+        They take the capacities under records as lognormal, as the fit does. How often intervals of 95 % held the truth
         of made suites of 5 to 40 motions stands in benchmarks/few_motions.md.
 
         **Raises:** ValueError if a bound is needed, or for a confidence outside its range.
 
         **Source:** Fisher (1925), t and chi-squared; Liang & Zeger (1986), the variance between motions.
         """
-        return intervals_of_motions(self.fit(bound), len(self.verdict), confidence)
+        return intervals_of_motions(self.fit(bound), self._records, confidence)
+
+    @property
+    def _records(self) -> int:
+        """Number of records: of motions that say something of their own."""
+        return len(self.verdict) // self.turns
 
     @property
     def monotone(self) -> Bool[np.ndarray, "motions draws"]:
@@ -207,7 +217,7 @@ class SimulatedFragility(AbstractTable):
 
 @eqx.filter_jit
 def _clustered(fit: FragilityFit, levels, toppled, draws):
-    """Covariance of (ln median, ln dispersion), and the test of the slope, where what one motion (a row) does at all
+    """Covariance of (ln median, ln dispersion), and the test of the slope, where what one record (a row) does at all
     levels is one outcome."""
     median, dispersion = fit.fragility.median, fit.fragility.dispersion
     z = jnp.log(levels / median) / dispersion
@@ -268,8 +278,8 @@ def simulated_fragility(
     strongest = factors * np.asarray(suite.peak_acceleration)[:, None]
     checked("levels", strongest.max(axis=0), "keep all motions at 1e9 g or below", lambda x: x <= 1e9)
     found = scenes(stacked(block), suite, both_ways(factors, facing), model, engine, progress)
-    peaks = suite.peak_acceleration, suite.peak_velocity
-    return SimulatedFragility(levels, as_draws(found.verdict, facing), *peaks, suite.names, kind.name, strength, power)
+    peaks, verdict = (suite.peak_acceleration, suite.peak_velocity), as_draws(found.verdict, facing)
+    return SimulatedFragility(levels, verdict, *peaks, suite.names, kind.name, strength, power, suite.turns)
 
 
 def _factors(levels, strength, power: float) -> np.ndarray:

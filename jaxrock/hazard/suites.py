@@ -109,10 +109,11 @@ class SuiteOutcomes(AbstractTable):
           motion by the names of their columns, such as `{"Arias": rk.intensity.arias}`; each is taken of the motion as
           it was scaled. None: none beside the peaks.
 
-        **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters,
-        PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1 toppled, 0 stood, -1 undecided).
+        **Returns:** motion, (of components: source and azimuth [rad],) scale, facing, block, the block's parameters
+        (but for what all blocks share), PGA [g], PGV [m/s], the measures, rotation_over_alpha, margin, verdict (1
+        toppled, 0 stood, -1 undecided).
 
-        **Raises:** ValueError for measures that are no functions, or other names.
+        **Raises:** ValueError for measures that are no functions, or other names, and for names that are there twice.
         """
         kinds = measures_by_name(measures)
         motion, scale, facing, block = (places.ravel() for places in np.indices(self.verdict.shape))
@@ -121,13 +122,15 @@ class SuiteOutcomes(AbstractTable):
         if self.suite.azimuth is not None:
             columns |= {"source": np.array(self.suite.sources)[motion], "azimuth": self.suite.azimuth[motion]}
         columns |= {"scale": strength, "facing": np.array(self.facing)[facing], "block": block}
-        columns |= {leaf.name: np.asarray(leaf.value)[block] for leaf in leaves_of(self.blocks)}
+        columns |= {leaf.name: np.asarray(leaf.value)[block] for leaf in leaves_of(self.blocks) if not leaf.is_shared}
         peaks = {"PGA": self.suite.peak_acceleration, "PGV": self.suite.peak_velocity}
         columns |= {name: np.asarray(peak)[motion] * strength for name, peak in peaks.items()}
-        for name, kind in kinds.items():
-            if name not in peaks or kind.power is None:
-                columns[name] = scaled_strengths(kind, self.suite, self.scale)[motion, scale]
         results = {"rotation_over_alpha": self.rotation, "margin": self.margin, "verdict": self.verdict}
+        for name, kind in kinds.items():
+            if name not in peaks and name in (columns | results):
+                raise ValueError(f"Argument `measures` must not have names of other columns, but has {name!r}.")
+            if name not in peaks or name != kind.name or kind.power is None:
+                columns[name] = scaled_strengths(kind, self.suite, self.scale)[motion, scale]
         return columns | {name: each.ravel() for name, each in results.items()}
 
 
@@ -136,10 +139,15 @@ def measures_by_name(measures) -> dict[str, Measure]:
     if measures is None:
         return {}
     if isinstance(measures, Mapping):
-        return {str(name): measure_of("measures", each) for name, each in measures.items()}
-    if isinstance(measures, (list, tuple)):
-        return {kind.name: kind for kind in (measure_of("measures", each) for each in measures)}
-    raise ValueError(f"Argument `measures` must hold names, or functions by name, but is {shown(measures)}.")
+        named = [(str(name), measure_of("measures", each)) for name, each in measures.items()]
+    elif isinstance(measures, (list, tuple)) and not any(map(callable, measures)):
+        named = [(kind.name, kind) for kind in (measure_of("measures", each) for each in measures)]
+    else:
+        raise ValueError(f"Argument `measures` must hold names, or functions by name, but is {shown(measures)}.")
+    found = dict(named)
+    if len(found) < len(named):
+        raise ValueError(f"Argument `measures` must have each name once, but is {shown(measures)}.")
+    return found
 
 
 @arguments

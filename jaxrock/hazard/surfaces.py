@@ -191,13 +191,23 @@ def surface_of(found: SimulatedFragility, bound: str | None = None) -> SurfaceFi
     - `found`: from `simulated_fragility`, under motions of different PGV/PGA.
     - `bound`: as in `SimulatedFragility.counts`.
 
-    **Returns:** a `SurfaceFit`, motions taken as clusters.
+    **Returns:** a `SurfaceFit`, records taken as clusters (at all of their azimuths); of one its covariance is NaN.
 
     **Raises:** ValueError if a bound is needed.
     """
     table = found.table()
     ratio = table["peak_velocity"] / (GRAVITY * table["peak_acceleration"])
-    return fit_surface(table["peak_acceleration"], ratio, found.counts(bound).ravel(), table["trials"], table["motion"])
+    toppled = found.counts(bound)
+    records = np.indices(toppled.shape)[0].ravel() // found.turns
+    return _of_clusters(table["peak_acceleration"], ratio, toppled.ravel(), table["trials"], records)
+
+
+def _of_clusters(acceleration, ratio, toppled, trials, clusters: np.ndarray) -> SurfaceFit:
+    """As `fit_surface`; of one cluster, too, whose covariance nothing tells."""
+    if clusters.max() > 0:
+        return fit_surface(acceleration, ratio, toppled, trials, clusters)
+    fit = fit_surface(acceleration, ratio, toppled, trials)
+    return eqx.tree_at(lambda f: f.covariance, fit, jnp.full_like(fit.covariance, jnp.nan))
 
 
 class SimulatedSurface(eqx.Module):
@@ -205,6 +215,7 @@ class SimulatedSurface(eqx.Module):
 
     - `acceleration`: (rows,) [g]; `ratio`: (columns,) PGV/PGA [s].
     - `verdict`: (pulses, rows, columns, draws) 1 toppled, 0 stood, -1 undecided.
+    - `ways`: 2 where the second half of the draws are the blocks of the first, turned round.
     """
 
     __repr__ = described
@@ -212,6 +223,7 @@ class SimulatedSurface(eqx.Module):
     acceleration: Float[Array, " rows"]
     ratio: Float[Array, " columns"]
     verdict: Int8[np.ndarray, "pulses rows columns draws"]
+    ways: int = eqx.field(static=True, default=1)
 
     @property
     def lower(self) -> Float[np.ndarray, "rows columns"]:
@@ -254,19 +266,17 @@ class SimulatedSurface(eqx.Module):
 
         - `bound`: as in `SimulatedFragility.counts`.
 
-        **Returns:** a `SurfaceFit`. Draws are taken as what is random (clusters): its covariance tells how far their
-        number lets the fit be known, for the pulses as they are; of a single block it is not known, and NaN.
+        **Returns:** a `SurfaceFit`. Draws are taken as what is random (clusters; both ways round together): its
+        covariance tells how far their number lets the fit be known, for the pulses as they are; of a single block it is
+        not known, and NaN.
         """
         toppled = counts(np.moveaxis(self.verdict, 0, -1), bound)  # (rows, columns, draws), of all pulses
+        toppled = toppled.reshape(*toppled.shape[:2], self.ways, -1).sum(axis=2)
         cells = np.meshgrid(
             np.asarray(self.acceleration), np.asarray(self.ratio), np.arange(toppled.shape[-1]), indexing="ij"
         )
         acceleration, ratio, draws = (x.ravel() for x in cells)
-        trials = float(len(self.verdict))
-        if toppled.shape[-1] > 1:
-            return fit_surface(acceleration, ratio, toppled.ravel(), trials, draws)
-        fit = fit_surface(acceleration, ratio, toppled.ravel(), trials)
-        return eqx.tree_at(lambda f: f.covariance, fit, jnp.full_like(fit.covariance, jnp.nan))
+        return _of_clusters(acceleration, ratio, toppled.ravel(), float(self.ways * len(self.verdict)), draws)
 
 
 @arguments
@@ -311,7 +321,7 @@ def simulated_surface(
         factors = both_ways(np.broadcast_to(np.asarray(acceleration) / peak, (ratio.size, acceleration.size)), facing)
         verdict = _verdicts(blocks, group, factors, model, engine, progress)
         parts.append(as_draws(verdict, facing).swapaxes(0, 1))
-    return SimulatedSurface(acceleration, ratio, np.stack(parts))
+    return SimulatedSurface(acceleration, ratio, np.stack(parts), len(FACINGS[facing]))
 
 
 def _unit(pulse: Callable) -> AbstractMotion:
@@ -347,6 +357,7 @@ def _verdicts(
 
 def _verdict(index, draw, factor, scene):
     blocks, group, model, engine = scene
-    result = outcome(one_of_many(blocks, draw), felt(one_of_many(group, index), factor), model, engine=engine)
+    motion = jax.tree.map(lambda x: x[index], group)  # `jax.vmap` has made all of it, shared arrays, too, one for each
+    result = outcome(one_of_many(blocks, draw), felt(motion, factor), model, engine=engine)
     verdict = jnp.where(result.overturned, TOPPLED, STOOD)
     return jnp.where(result.status == Status.successful, verdict, UNDECIDED).astype(jnp.int8)

@@ -32,6 +32,8 @@ def _one_or_many(name: str, value: Any) -> tuple[AbstractFragility, ...]:
 
 Fragilities = Annotated[AbstractFragility | Sequence[AbstractFragility], _one_or_many]
 
+_Stack = tuple[AbstractFragility, int]  # how many are in it, which a fragility without numbers does not tell
+
 # Where `allowed_scale` looks for its factor: 20 steps a decade.
 _FACTORS = np.geomspace(1e-4, 1e4, 161)
 
@@ -131,7 +133,7 @@ def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, pr
     return _allowed_scale(*_rocks(fragilities, ages), curve, -jnp.log(probability))
 
 
-def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragility, ...], Inexact[Array, " rocks"]]:
+def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[_Stack, ...], Inexact[Array, " rocks"]]:
     """The rocks, all with fragilities of one kind stacked into one, and an age for each in the order of the stacks."""
     rocks = _one_or_many("fragilities", fragilities)
     ages = not_negative("ages", ages)
@@ -152,7 +154,7 @@ def _rocks(fragilities: Fragilities, ages: Values) -> tuple[tuple[AbstractFragil
     stacks = []
     for members in kinds.values():
         numbers, rest = eqx.partition([rocks[index] for index in members], eqx.is_array_like)
-        stacks.append(eqx.combine(jax.tree.map(_stacked, *numbers), rest[0]))
+        stacks.append((eqx.combine(jax.tree.map(_stacked, *numbers), rest[0]), len(members)))
     order = np.concatenate(list(kinds.values()))
     return tuple(stacks), ages[order] if isinstance(ages, jax.core.Tracer) else placed(ages[order])
 
@@ -166,7 +168,7 @@ def _stacked(*numbers: Any) -> Array:
 
 @eqx.filter_jit
 def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
-    if isinstance(fragility, LogNormalFragility):
+    if type(fragility) is LogNormalFragility:  # what is made of it may have other probabilities
         return _lognormal_rate(fragility, curve)
     levels, rates = shakings(curve, fragility.knots)
     return rates @ fragility(levels)
@@ -195,14 +197,18 @@ def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number
 
 
 @eqx.filter_jit
-def _topplings(rocks: tuple[AbstractFragility, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
+def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
     """Expected number of shakings that topple at least one of the rocks that are fragile by then."""
-    knots = [eqx.filter_vmap(lambda rock: rock.knots)(rock).ravel() for rock in rocks]
+
+    def of_each(function):
+        return [eqx.filter_vmap(function, axis_size=count)(rock) for rock, count in rocks]
+
+    knots = [each.ravel() for each in of_each(lambda rock: rock.knots)]
     levels, rates = shakings(curve, jnp.concatenate(knots))
     # With the oldest rock first, the first k rocks count from the age of rock k to that of the next.
     order = jnp.argsort(-ages)
     ages = ages[order]
-    single = jnp.concatenate([eqx.filter_vmap(lambda rock: rock(levels))(rock) for rock in rocks])[order]
+    single = jnp.concatenate(of_each(lambda rock: rock(levels)))[order]
     # 1 - (1 - F)(1 - G), in which small probabilities do not cancel.
     joint = jax.lax.associative_scan(lambda f, g: f + g * (1 - f), single)
     return (ages - jnp.append(ages[1:], 0.0)) @ (joint @ rates)

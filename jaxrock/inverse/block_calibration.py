@@ -18,7 +18,7 @@ from jaxrock._arguments import arguments, at_least, known, list_of
 from jaxrock._checks import Range, Values, as_real, below_one, share, shown, whole
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.calibration_grid import STILL, Axis, Table, weighed
+from jaxrock.inverse.calibration_grid import STILL, Axis, Table, blocks_of_cells, weighed
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -215,7 +215,8 @@ def calibrate_block(
     - `facing`: 1 if motion and block have the same positive direction in a test, -1 if not, 0 not known: one number or
       (tests,). Of a symmetric block it changes nothing.
     - `cells`: of the grid over every parameter, or by its name; the scenes are their product. The grid goes 2.5 of the
-      largest deviation beyond the ranges; `alpha`, `alpha1` and `alpha2` to 0.9 rad, `restitution` to 0 and 1.
+      largest deviation beyond the ranges, and without scatter to their ends; `alpha`, `alpha1` and `alpha2` to 0.9 rad,
+      `restitution` to 0 and 1.
     - `lapse`: share of tests that end either way, whatever the block is: so that one odd test cannot decide all.
     - `groups`: (tests,) labels of motions for cross-validation, such as the record that was scaled; None: each test.
     - `folds`: into how many parts the groups are dealt for it; 0: no cross-validation.
@@ -231,7 +232,7 @@ def calibrate_block(
     places = {**unknowns, **{f"{name}_sd": each for name, each in scatter.items() if isinstance(each, Unknown)}}
     places = {name: places[name] for name in sorted(places)}  # as JAX orders what a program is given
     seen, ways, told = _tests(len(suite), toppled, facing, rotation)
-    lanes, dealt = _blocks(block, axes), _dealt(groups, len(suite), folds)
+    lanes, dealt = blocks_of_cells(block, axes), _dealt(groups, len(suite), folds)
     found = scenes(
         lanes, suite, np.array([1.0, -1.0]) if (ways <= 0).any() else np.array([1.0]), model, engine, progress
     )
@@ -278,15 +279,6 @@ def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarra
     if (np.isfinite(told) & (seen == 1)).any():
         raise ValueError("Argument `rotation` must be NaN for tests that toppled.")
     return seen, ways, told
-
-
-def _blocks(block: Callable, axes: dict[str, Axis]):
-    """The blocks of all cells, the last parameter changing fastest."""
-    grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
-    try:
-        return jax.vmap(lambda *each: block(**dict(zip(axes, each))))(*(jnp.asarray(x.ravel()) for x in grid))
-    except TypeError as error:
-        raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
 
 
 def _numbered(labels) -> np.ndarray:

@@ -1,11 +1,16 @@
 """The grid of a calibration: cells over each parameter, what a distribution has in each, and what became of scenes."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
+from jaxrock._parameters import leaves_of, shared
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
 
@@ -32,7 +37,10 @@ class Axis(eqx.Module):
     def of(cls, name: str, unknown: Unknown, scatter, count: int) -> "Axis":
         """The cells over a range, and what scatter adds to it."""
         low, high = (float(x) for x in unknown.ends)
-        widest = 0.0 if scatter is None else float(scatter.high) if isinstance(scatter, Unknown) else float(scatter)
+        if scatter is None:  # the outermost middles are the ends themselves: beyond them a likelihood would be flat
+            middles = np.linspace(low, high, count)
+            return cls(middles, (high - low) / (count - 1), None, False, unknown.log)
+        widest = float(scatter.high) if isinstance(scatter, Unknown) else float(scatter)
         low, high = low - _BEYOND * widest, high + _BEYOND * widest
         # Scatter takes no parameter beyond what it can be, nor a median's range there.
         ends = [
@@ -41,8 +49,8 @@ class Axis(eqx.Module):
         ]
         low, high = max(low, min(ends[0], float(unknown.ends[0]))), min(high, max(ends[1], float(unknown.ends[1])))
         width = (high - low) / count
-        known = None if scatter is None or isinstance(scatter, Unknown) else float(scatter)
-        return cls(low + width * (np.arange(count) + 0.5), width, known, scatter is not None, unknown.log)
+        known = None if isinstance(scatter, Unknown) else float(scatter)
+        return cls(low + width * (np.arange(count) + 0.5), width, known, True, unknown.log)
 
     @property
     def count(self) -> int:
@@ -69,6 +77,20 @@ class Axis(eqx.Module):
         edges = self.middles[:-1] + self.width / 2
         below = ndtr((edges - place) / deviation)
         return jnp.diff(jnp.concatenate([jnp.zeros(1), below, jnp.ones(1)]))
+
+
+def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
+    """The blocks of all cells, the last parameter changing fastest; what all blocks share is there once."""
+    grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
+    try:
+        blocks = jax.vmap(lambda *each: block(**dict(zip(axes, each))))(*(jnp.asarray(x.ravel()) for x in grid))
+    except TypeError as error:
+        raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
+    for leaf in leaves_of(blocks):
+        if leaf.is_shared and np.any(np.asarray(leaf.value) != np.asarray(leaf.value)[:1]):
+            said = f"declares its parameters (`jaxrock.parameter`), but `{leaf.name}` is not declared, and differs"
+            raise ValueError(f"Argument `block` must make blocks of a class that {said} from cell to cell.")
+    return jax.tree.map(lambda x, own: x[0] if own else x, blocks, shared(blocks))
 
 
 class Table(eqx.Module):

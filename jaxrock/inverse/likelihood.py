@@ -313,6 +313,11 @@ def _sloping(values: Real, rows: Real, parameters: Real, *lanes) -> Real:
 
 @_sloping.def_jvp
 def _(primals, tangents):
+    if jax.tree.leaves((tangents[0], tangents[3:])):
+        raise NotImplementedError(
+            "A likelihood has derivatives by the values of the motion's parameters, by scatter and lapse, but not by "
+            "the rocks, nor by what the functions of motion and model hold."
+        )
     _, rows, parameters, *lanes = primals
     rows = _bending(rows, parameters, *lanes)
     values = _sloping(*primals)  # the values alone would have no derivatives of higher order

@@ -68,8 +68,10 @@ def levels_around(observations: Observations, scatter: ArrayLike, strength: Real
     weaker = seen.weaker_alpha
     by_alpha = seen.alpha_sd / seen.alpha * weaker / (jnp.sin(weaker) * jnp.cos(weaker))  # of ln tan(alpha)
     by_p = _BY_P * seen.p_sd / seen.p
-    deviation = jnp.sqrt(scatter**2 + by_alpha**2 + by_p**2) / _SPREAD
-    step = _APART * deviation
+    variance = scatter**2 + by_alpha**2 + by_p**2
+    # A change of the scatter moves weights, and not the nodes: what the intervals between them add stays, too.
+    deviation = jnp.sqrt(variance - jax.lax.stop_gradient((1 - 1 / _SPREAD**2) * variance))
+    step = _APART * jax.lax.stop_gradient(deviation)
     strength = strength[..., None]
     base = jnp.floor(jax.lax.stop_gradient(strength) / step)
     number = base + _in_front(np.arange(NODES) - _EACH_SIDE, base[None])

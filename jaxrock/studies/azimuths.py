@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Float, Int8
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, direction, placed, scalar, shown
-from jaxrock._parameters import check_single
+from jaxrock._parameters import check_single, shared
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -105,12 +105,12 @@ def azimuth_outcomes(
     first = float(scalar("orientation", direction("orientation", orientation)))
     blocks = _blocks(rock, angles)
     model = current_model(model, blocks, components.first, scales)
-    known = jax.tree.map(np.asarray, blocks)
+    known, alike = jax.tree.map(np.asarray, blocks), shared(blocks)  # alike in all scenes of a plane
     bar, found = Progress(angles.size * scales.size, "azimuths", progress), []
     for index, angle in enumerate(angles):
         motion = components.in_plane(angle - first, vertical)
-        lanes = placed(jax.tree.map(lambda x, at=index: np.full(scales.shape, x[at]), known))
-        found.append(of_motion(with_room(motion), lanes, placed(scales), model, engine))
+        lanes = jax.tree.map(lambda x, own, at=index: x[at] if own else np.full(scales.shape, x[at]), known, alike)
+        found.append(of_motion(with_room(motion), placed(lanes), placed(scales), model, engine))
         bar.add(scales.size)
     parts = (np.stack([np.asarray(x) for x in part]) for part in zip(*found))
     return AzimuthOutcomes(angles, scales, blocks, *parts)

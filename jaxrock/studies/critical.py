@@ -269,6 +269,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
 
     brackets, told = brackets_of(at, np.asarray(grid))
     ends = roots_of(at, brackets)
+    told["complete"][ends["index"][~ends["known"]]] = False
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
     units = _units(kind, scenes.both, grid.shape[0])

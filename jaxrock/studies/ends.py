@@ -79,9 +79,10 @@ def _may_hide(numbers: ModuleType, z, margin, slope, impacts):
 
 
 def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The end in every bracket to rounding, by Newton's method, which bisection keeps within it."""
+    """The end in every bracket to rounding, by Newton's method, which bisection keeps within it; and whether all points
+    on the way could be decided (`known`)."""
     index, sides = brackets["index"], [brackets[name].copy() for name in ("z", "margin", "slope", "impacts")]
-    columns = np.arange(index.size)
+    columns, known = np.arange(index.size), np.ones(index.size, bool)
     for count in range(MOST_POINTS):
         open_ = is_wide(np, sides)
         if not open_.any():
@@ -89,10 +90,11 @@ def roots_of(at: Callable, brackets: dict[str, np.ndarray]) -> dict[str, np.ndar
         with np.errstate(invalid="ignore"):
             trial = next_point(np, sides, count)[open_]
         values = (trial, *at(trial, index[open_]))
+        known[open_] &= ~np.isnan(values[1])
         onto = ((values[1] < 0) == (sides[1][1, open_] < 0)).astype(int)
         for array, new in zip(sides, values):
             array[onto, columns[open_]] = new
-    return {"index": index} | ends_of(np, sides)
+    return {"index": index, "known": known} | ends_of(np, sides)
 
 
 MOST_POINTS = 120  # to close a bracket

@@ -71,22 +71,24 @@ def lowest_ends(at: Callable, grid: Float[Array, " points"], most: int) -> dict[
 
     complete = ~jnp.isnan(values[1]).any()
     _, kept, complete = jax.lax.while_loop(unfinished, step, (line, kept, complete))
-    sides = _closed(many, kept.sides, kept.here, grid[0])
-    return ends_of(jnp, sides) | {"found": kept.here, "complete": complete, "from_the_least": values[1][0] < 0}
+    sides, known = _closed(many, kept.sides, kept.here, grid[0])
+    return ends_of(jnp, sides) | {"found": kept.here, "complete": complete & known, "from_the_least": values[1][0] < 0}
 
 
-def _closed(many: Callable, sides: Sides, here: Bool[Array, " n"], elsewhere: Float[Array, ""]) -> Sides:
-    """Brackets as narrow as rounding."""
+def _closed(many: Callable, sides: Sides, here: Bool[Array, " n"], elsewhere: Float[Array, ""]) -> tuple[Sides, Array]:
+    """Brackets as narrow as rounding; and whether every point on the way could be decided."""
 
     def is_open(sides):
         return here & is_wide(jnp, sides)
 
     def step(carry):
-        sides, count = carry
+        sides, known, count = carry
         open_ = is_open(sides)
         trial = jnp.where(open_, next_point(jnp, sides, count), elsewhere)
         values = (trial, *many(trial))
         onto = jnp.arange(2)[:, None] == ((values[1] < 0) == (sides[1][1] < 0))
-        return [jnp.where(onto & open_, new, old) for new, old in zip(values, sides)], count + 1
+        known &= ~(jnp.isnan(values[1]) & open_).any()
+        return [jnp.where(onto & open_, new, old) for new, old in zip(values, sides)], known, count + 1
 
-    return jax.lax.while_loop(lambda c: is_open(c[0]).any() & (c[1] < MOST_POINTS), step, (sides, 0))[0]
+    start = sides, jnp.asarray(True), 0
+    return jax.lax.while_loop(lambda c: is_open(c[0]).any() & (c[2] < MOST_POINTS), step, start)[:2]

@@ -76,7 +76,7 @@ class Sensitivity(AbstractTable):
     - `condition`: length of the vector of elasticities of `max_rotation`: relative errors grow by up to that much.
     - `graze_distance`: relative change of the parameters (of all together, in the worst direction, to first order) that
       makes a grazing impact appear or vanish before the peak, and with it changes the number of impacts; infinite if
-      the block has been far from any graze.
+      the block has been far from any graze, NaN where the response was not computed, or has no slope.
     - `boundary_distance`: the same for overturning, or for not overturning: margin over its slope.
     """
 
@@ -183,8 +183,8 @@ def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> S
     def distance(name, value):
         """To first order, the relative change of all parameters together that makes a result zero."""
         steep = steepest(name)
-        near = jnp.isfinite(value) & (steep > 0)
-        return jnp.where(near, jnp.abs(value) / jnp.where(near, steep, 1.0), jnp.inf)
+        far = (steep == 0) | (value == jnp.inf)
+        return jnp.where(successful, jnp.where(far, jnp.inf, jnp.abs(value) / jnp.where(far, 1.0, steep)), jnp.nan)
 
     rotation = slopes("max_rotation", valid)
     return Sensitivity(

@@ -4,6 +4,7 @@ Motions go one after the other, the scenes of one all at once: they share its sa
 samples as the next power of two, so that a few programs serve a suite of any lengths.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._checks import Values, placed, shown, size
-from jaxrock._parameters import one_of_many
+from jaxrock._parameters import leaves_of, one_of_many, shared
 from jaxrock._progress import Progress
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
@@ -44,11 +45,17 @@ class Scenes(NamedTuple):
 
 
 def stacked(block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
-    """A block with parameters of shape (draws,)."""
-    shape = np.broadcast_shapes((1,), *(np.shape(leaf) for leaf in jax.tree.leaves(block)))
+    """A block with parameters of shape (draws,); what all draws share stays."""
+    shape = np.broadcast_shapes((1,), *(np.shape(leaf.value) for leaf in leaves_of(block) if not leaf.is_shared))
     if len(shape) > 1:
         raise ValueError(f"The parameters of `block` must be numbers or lists, but have shape {shape}.")
-    return jax.tree.map(lambda x: placed(np.broadcast_to(np.asarray(x), shape)), block)
+    return _of_each(block, lambda x: np.broadcast_to(x, shape))
+
+
+def _of_each(blocks: Block | AsymmetricBlock, function: Callable[[np.ndarray], np.ndarray]):
+    """Blocks with another array of every number of a block; what all share stays."""
+    arrays = jax.tree.map(np.asarray, blocks)
+    return jax.tree.map(lambda x, own: placed(x if own else function(x)), arrays, shared(blocks))
 
 
 def is_symmetric(block: Block | AsymmetricBlock) -> bool:
@@ -97,7 +104,7 @@ def scenes(
     factors = np.broadcast_to(factors, (len(suite), np.shape(factors)[-1]))
     draws, count = jax.tree.leaves(blocks)[0].shape[0], factors.shape[1]
     # Neighbours differ by the factor: they move alike.
-    lanes = jax.tree.map(lambda x: placed(np.repeat(np.asarray(x), count)), blocks)
+    lanes = _of_each(blocks, lambda x: np.repeat(x, count))
     model = current_model(model, lanes, next(suite.motions()), factors)
     bar = Progress(factors.size * draws, "suite", progress)
     found = []
