@@ -388,3 +388,14 @@ def test_an_impact_may_hasten_a_block(engine):
         np.testing.assert_allclose(found.max_velocity, rebound, rtol=1e-6)
     times = np.linspace(0, float(response.duration), 20_001)
     assert np.abs(response(times)[1]).max() <= response.max_velocity * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("engine", [rk.Series(), rk.Diffrax(rtol=1e-10)])
+def test_impacts_after_the_motion_are_counted_up_to_a_fall(engine):
+    """Back and forth to the weaker side over a still ground: a fall after two impacts; then one that comes to rest."""
+    block = rk.blocks.AsymmetricBlock.from_frequencies(0.25, 0.1, 2.0, 2.0, 0.5)
+    still = -1 * (rk.RectangularPulse(0.0, 0.01) + rk.TriangularPulse(0.0, 0.01))  # compiled for the test before
+    for velocity, count in ((0.3, 2), (0.1, 0)):
+        found = rk.outcome(block, still, initial=(-0.01, velocity), engine=engine)
+        assert found.status == rk.Status.successful
+        assert bool(found.overturned) == (count > 0) and found.impact_count == count
