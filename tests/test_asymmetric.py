@@ -193,6 +193,7 @@ def test_vertical_motion_and_contact_forces():
     np.testing.assert_allclose(found.least_normal, float(result["normal_min"][0]), rtol=1e-6)
     np.testing.assert_allclose(found.friction_at_impact, [float(x) for x in result["impact_friction"]], rtol=1e-12)
     assert found.keeps_contact and found.sticks(0.3) and not found.sticks(0.2)
+    assert found.impacted[1] and not found.impacted[0]
 
 
 def test_forces_are_those_of_the_response_and_its_block():
@@ -264,6 +265,7 @@ def test_housner_friction():
     np.testing.assert_allclose(found.friction_at_impact, 3 * tangent / (4 + tangent**2), rtol=1e-14)
     np.testing.assert_allclose(found.largest_friction, 0.2, rtol=1e-3)
     assert found.least_normal == 1
+    assert found.sticks(0.21) and not found.sticks(0.19) and not any(found.impacted)
 
 
 @needs_references
@@ -388,3 +390,16 @@ def test_an_impact_may_hasten_a_block(engine):
         np.testing.assert_allclose(found.max_velocity, rebound, rtol=1e-6)
     times = np.linspace(0, float(response.duration), 20_001)
     assert np.abs(response(times)[1]).max() <= response.max_velocity * (1 + 1e-9)
+    peaks = response.peak_times  # both motions begin at once, and the piece between has no length
+    assert peaks[0] == 0 and (np.diff(peaks) > 0).all()
+
+
+@pytest.mark.parametrize("engine", [rk.Series(), rk.Diffrax(rtol=1e-10)])
+def test_impacts_after_the_motion_are_counted_up_to_a_fall(engine):
+    """Back and forth to the weaker side over a still ground: a fall after two impacts; then one that comes to rest."""
+    block = rk.blocks.AsymmetricBlock.from_frequencies(0.25, 0.1, 2.0, 2.0, 0.5)
+    still = -1 * (rk.RectangularPulse(0.0, 0.01) + rk.TriangularPulse(0.0, 0.01))  # compiled for the test before
+    for velocity, count in ((0.3, 2), (0.1, 0)):
+        found = rk.outcome(block, still, initial=(-0.01, velocity), engine=engine)
+        assert found.status == rk.Status.successful
+        assert bool(found.overturned) == (count > 0) and found.impact_count == count

@@ -219,6 +219,16 @@ def test_a_function_of_traced_numbers_keeps_its_kind_of_derivatives():
     assert jax.jvp(of, (2.0,), (1.0,))[1] == 9.0
 
 
+def test_a_few_at_once():
+    """By more numbers there is no Jacobian, but the change in one direction."""
+    squares = differentiable(lambda x: x**2, derivatives="a few at once")
+    for size, directions in ((64, 0), (65, 1)):
+        x = jnp.arange(1.0, size + 1)
+        asked = jax.make_jaxpr(lambda d, x=x: jax.jvp(squares, (x,), (d,))[1])(x)
+        assert recipe_in(asked.jaxpr).directions == directions
+        np.testing.assert_array_equal(jax.jvp(squares, (x,), (x,))[1], 2 * x**2)
+
+
 @pytest.mark.parametrize(
     "motion, most", [(rk.SinePulse(0.5, 1.0), 2500), (rk.example_record(), 2000)], ids=["pulse", "record"]
 )

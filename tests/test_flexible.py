@@ -1,6 +1,7 @@
 """Flexible blocks: against an independent integration, known histories, the rigid limit, conservation of energy."""
 
 import dataclasses
+import operator
 
 import equinox as eqx
 import jax
@@ -113,6 +114,17 @@ def test_no_verdict_is_given_while_the_ground_shakes():
         assert found.status == rk.Status.undecided and found.margin < 0 and found.energy > 10
     found = rk.outcome(block, motion, duration=4.0)
     assert found.status == rk.Status.successful and found.overturned and found.margin < 0
+
+
+def test_what_no_constructor_has_seen_has_a_status():
+    """A step of an optimiser changes numbers of blocks and motions as they are."""
+    block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3)
+    motion = rk.RectangularPulse(0.6, 0.9) + rk.SinePulse(0.01, 3.0)  # compiled for the test before
+    for name, value in (("damping_ratio", -0.1), ("damping_ratio", 1.1), ("width", -0.5), ("density", -1.0)):
+        changed = eqx.tree_at(operator.attrgetter(name), block, jnp.array(value, float))
+        assert rk.outcome(changed, motion, duration=4.0).status == rk.Status.not_finite
+    backwards = eqx.tree_at(lambda m: m.second.period, motion, jnp.array(-3.0, float))
+    assert rk.outcome(block, backwards, duration=4.0).status == rk.Status.not_finite
 
 
 def test_the_verdict_of_a_base_that_has_little_energy_beyond_its_balance():
@@ -509,6 +521,50 @@ def test_second_derivatives():
     assert float(bent(at)) == pytest.approx(float(slope(at + 1e-5) - slope(at - 1e-5)) / 2e-5, rel=1e-6)
     twice = (float(value(at + step)) - 2 * float(value(at)) + float(value(at - step))) / step**2
     assert float(bent(at)) == pytest.approx(twice, rel=5e-3)
+
+
+def test_an_undamped_column_moves_with_its_damping():
+    """As damped ones do, where less damping is computed with the least there is, too."""
+
+    @jax.jit
+    def slope(ratio):
+        block = lambda ratio: rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, ratio, masses=3)
+        return jax.jvp(lambda ratio: Numbers.of(block(ratio)).damping, (ratio,), (jnp.ones(()),))[1]
+
+    for ratio in (0.0, 1e-14, 1e-11):  # none, less than the least, less than is felt
+        np.testing.assert_allclose(slope(ratio), slope(0.01), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_an_undamped_block_moves_with_its_damping():
+    """Its peak, as that of one with very little damping, which is differentiated as it is."""
+
+    def peak(ratio):
+        block = rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, ratio, masses=3)
+        return rk.outcome(block, rk.SinePulse(0.5, 1.6), duration=8.0).max_rotation
+
+    slope = jax.jit(jax.grad(peak))
+    for ratio in (0.0, 1e-14, 1e-11):
+        assert float(slope(ratio)) == pytest.approx(float(slope(2e-8)), rel=1e-4)
+    assert float(slope(0.0)) == pytest.approx(float(peak(1e-5) - peak(0.0)) / 1e-5, rel=1e-2)
+
+
+def _end(ratio):
+    block = rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, ratio, masses=3)
+    return rk.simulate(block, rk.SinePulse(0.5, 1.6), duration=4.0, samples=2).rotation[-1]
+
+
+def test_histories_have_a_reverse_mode():
+    assert jax.eval_shape(jax.grad(_end), 0.05).shape == ()
+
+
+@pytest.mark.slow
+def test_slopes_of_histories_in_both_modes():
+    """By the damping, and differences."""
+    value = jax.jit(_end)
+    forward, reverse = (float(jax.jit(mode(_end))(0.05)) for mode in (jax.jacfwd, jax.grad))
+    assert reverse == pytest.approx(forward, rel=1e-12)
+    assert forward == pytest.approx(float(value(0.05 + 1e-6) - value(0.05 - 1e-6)) / 2e-6, rel=1e-6)
 
 
 def test_compiled_by_the_user():

@@ -4,6 +4,8 @@ Judges: free rocking of the linear block in closed form (the speed of every impa
 with a law of its own, a law that only seems to depend on the speed, and the other engine.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from scipy.integrate import solve_ivp
 
 import jaxrock as rk
 from jaxrock.blocks.restitution import Corners, Reset, on_sides, tells_sides
+from jaxrock.engines.impact import impact
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import initial_state
 from jaxrock.studies.parameters import named, rebuilt
 
 SOFT = rk.restitution.SpeedDependent(0.95, 0.6, 0.3)  # changes much within the speeds that occur here
@@ -489,6 +494,32 @@ def test_a_stiff_column_rocks_as_the_rigid_block_on_its_base(law, base):
 def test_what_a_law_with_a_scale_of_its_own_has_not(refused):
     with pytest.raises(ValueError, match="depend"):
         refused()
+
+
+def test_an_elastic_pair_in_single_precision():
+    """Whose product rounding makes more than 1."""
+    with jax.enable_x64(False):
+        assert rk.restitution.PerSide(1.7, 1 / 1.7).first == np.float32(1.7)
+        with pytest.raises(ValueError, match="at most 1"):
+            rk.restitution.PerSide(1.7, 1.00001 / 1.7)
+
+
+def test_a_block_that_keeps_no_velocity_is_thrown_on():
+    """By the ground at once: by how much the velocity changes with the restitution is the speed of the impact."""
+
+    @jax.jit
+    def after(ground, restitution):
+        scene = Scene.of(rk.Block(0.2, 2.0, restitution), PULSE, rk.Linear())
+        stepper = SHORT.stepper(scene, None, history=True)
+        state = initial_state(scene, jnp.asarray(0.1), jnp.asarray(0.0))
+        still = jnp.zeros(()), None
+        state = impact(stepper, state, jnp.asarray(True), jnp.asarray(-0.3), (ground, None), still, jnp.asarray(0.1))
+        return state.velocity, state.side
+
+    for ground, slope, side in ((0.5, 0.3, -1.0), (0.0, 0.0, 0.0)):  # the second holds it down
+        (velocity, found), (moved, _) = jax.jvp(functools.partial(after, ground), (0.0,), (1.0,))
+        assert (float(velocity), float(found)) == (0.0, side)
+        assert float(moved) == pytest.approx(slope, abs=1e-15)
 
 
 @pytest.mark.parametrize("given", [(1.2, 0.5, 1.0), (0.9, -0.1, 1.0), (0.9, 0.5, 0.0)])

@@ -52,8 +52,8 @@ class Wheel(NamedTuple):
 
 
 @jax.jit
-def of_rolling(radius, alpha, p, ratio, states, balance):
-    """Accelerations at states, threshold, balance, its slope by the radius, and the work up to a given angle."""
+def of_rolling(radius, alpha, p, ratio, states, openings):
+    """Accelerations at states, threshold, balance, its slope by the radius, and the work up to given angles."""
     moments = rk.models.Rolling(radius, inertia_ratio=ratio).moments(rk.Block(alpha, p))
 
     def told(state):
@@ -61,7 +61,7 @@ def of_rolling(radius, alpha, p, ratio, states, balance):
         return p**2 * moments.acceleration(Angle.of(opening), speed / p, push, 1 + lift)
 
     slope = jax.grad(lambda r: rk.models.Rolling(r).moments(rk.Block(alpha, p)).saddle)(radius)
-    return jax.vmap(told)(states), moments.threshold, moments.saddle, slope, moments.work(balance)
+    return jax.vmap(told)(states), moments.threshold, moments.saddle, slope, jax.vmap(moments.work)(openings)
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.3, 0.8])
@@ -71,14 +71,15 @@ def test_the_equation_is_newtons(radius):
     wheel = Wheel(alpha, p, ratio, radius, 0.9)
     states = np.array([(0.0, 0.4, 0.5, 0.0), (0.25, 1.0, -0.2, 0.3), (0.7, 2.0, 0.1, -0.4)])
     balance = float(np.arctan2(np.sin(alpha), np.cos(alpha) - radius))
-    told, threshold, saddle, slope, work = jax.device_get(of_rolling(radius, alpha, p, ratio, states, balance))
+    openings = np.array([1e-8, 0.2, balance])
+    told, threshold, saddle, slope, work = jax.device_get(of_rolling(radius, alpha, p, ratio, states, openings))
     for acceleration, state in zip(told, states):
         assert float(acceleration) == pytest.approx(wheel.forces(*state)[0], rel=1e-12)
     assert float(threshold) == pytest.approx(np.tan(alpha), rel=1e-14)
     assert float(saddle) == pytest.approx(balance, rel=1e-12)
     assert float(slope) == pytest.approx(np.sin(balance) ** 2 / np.sin(alpha), rel=1e-10)
-    height = np.hypot(np.sin(alpha), np.cos(alpha) - radius) + radius
-    assert float(work) == pytest.approx(height - 1, rel=1e-12)
+    rises = 2 * np.sin(openings / 2) * np.sin(alpha - openings / 2) + 2 * radius * np.sin(openings / 2) ** 2
+    np.testing.assert_allclose(work, rises, rtol=1e-12)  # of the centre of mass over where it was at rest
 
 
 def test_the_balance_has_second_derivatives():
@@ -217,6 +218,18 @@ def test_sides_of_their_own():
     found, _ = by_newton(wheels, lambda t: 0.35 * np.sin(2 * np.pi * t / 0.9), DIPS["level"], (0.05, 0.2), times, 0.9)
     assert (found[0] < -0.01).any() and (found[0] > 0.01).any()
     np.testing.assert_allclose(response(times), found[:2], atol=2e-8)
+
+
+@pytest.mark.slow
+def test_it_may_fall_to_the_side_from_which_it_came():
+    """Over a still ground, to the stronger side and back: with sharp edges as Housner's block."""
+    block = rk.blocks.AsymmetricBlock(0.5, 0.2, 2.0, restitution=(0.95, 0.95))
+    scene = block, rk.RectangularPulse(0.0, 0.01)
+    for velocity, lost in ((0.83, True), (-0.3, False)):
+        usual = rk.outcome(*scene, initial=(-0.02, velocity))
+        found = rk.outcome(*scene, rk.models.Rolling(0.0), initial=(-0.02, velocity), **EXACT)
+        assert bool(found.overturned) == bool(usual.overturned) == lost
+        np.testing.assert_allclose(found.margin, usual.margin, rtol=1e-7)
 
 
 @pytest.mark.slow

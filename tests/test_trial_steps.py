@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 import jaxrock as rk
 from jaxrock.blocks import AsymmetricBlock
+from jaxrock.responses.current_model import standing
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=12)}
 BLOCK, SINE = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.3, 1.0)
@@ -106,6 +107,31 @@ def test_scenes(block, motion, more):
     assert no_result(outcome, [outcome.margin, outcome.max_rotation, outcome.time_of_max, outcome.error])
     history = rk.simulate(block, motion, **QUICK, **more, duration=2.0, samples=5, throw=False)
     assert no_result(history, [history.rotation, history.velocity, history.max_rotation, history.margin])
+
+
+class Softer(rk.models.AbstractEquation):
+    """A model of a user's own, which balances where its strength is positive."""
+
+    strength: jax.Array = rk.parameter("-")
+
+    def moments(self, b):
+        s, c = jnp.sin(b.alpha), jnp.cos(b.alpha)
+        restoring = rk.models.Terms(sine=-self.strength * c, cosine=self.strength * s)
+        return rk.models.Coefficients(restoring, rk.models.Terms(sine=s, cosine=c))
+
+
+def test_a_model_of_ones_own_does_not_raise():
+    """Neither of a block that is none, nor where a parameter leaves no balance."""
+    none, series = SCENES["alpha"][0], rk.Series()
+    for block, strength in ((none, 0.9), (BLOCK, -0.9), (BLOCK, 0.9)):
+        model = Softer(jnp.asarray(strength))
+        found = standing(block, model, series, throw=False)
+        if block is BLOCK and strength > 0:
+            np.testing.assert_array_equal(jax.tree.leaves(found), jax.tree.leaves(block))
+            continue
+        assert np.isnan(found.alpha)
+        with pytest.raises(ValueError, match="must fall to zero"):
+            standing(block, model, series)
 
 
 def test_a_history_that_is_none_tells_no_numbers_and_has_no_slopes():

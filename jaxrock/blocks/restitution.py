@@ -203,7 +203,9 @@ class PerSide(AbstractRestitution):
         self.first, self.second = (not_negative(f"restitution[{i}]", e) for i, e in enumerate((first, second)))
         check_shapes(**{"restitution[0]": self.first, "restitution[1]": self.second})
         keeps = "be a pair whose product, the speed kept by two impacts, is at most 1"
-        product = checked("restitution", self.first * self.second, keeps, lambda x: x <= 1 + 1e-12)
+        product = self.first * self.second
+        rounding = max(1e-12, 4 * float(jnp.finfo(product.dtype).eps))
+        product = checked("restitution", product, keeps, lambda x: x <= 1 + rounding)
         self.first = where(jnp.isnan(product), product, self.first)
 
     def ratio(self, corners: Corners, speed: Real) -> Real:

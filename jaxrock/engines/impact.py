@@ -91,7 +91,8 @@ def _rests_if_soon(
     """As `_rests`, which is not asked where the next hop alone takes too long for that."""
     given = stepper, state, hit, after, steepest, reach
     stepper, state, hit, after, steepest, reach = fixed(given)
-    soon = hit & ((8 * after.speed <= reach * stepper.scene.p * after.here) | (after.speed == 0))
+    # Of no speed it is; unless the ground throws the block on at once, which then moves on as from any speed.
+    soon = hit & (8 * after.speed <= reach * stepper.scene.p * after.here)
 
     def never():
         return jnp.zeros_like(hit), jnp.zeros_like(state.impacts), jnp.zeros_like(reach)

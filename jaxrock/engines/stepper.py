@@ -77,6 +77,11 @@ class AbstractStepper(eqx.Module):
     def advance(self, state: State) -> State:
         """The state at the next event or step."""
 
+    def to_the_end(self, state: State) -> State:
+        """A state at time 0, brought to the end of the motion, or to where the block is lost."""
+        budget = self.engine.budget(self.scene, history=False)
+        return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: self.advance(s), state, budget)
+
     @abc.abstractmethod
     def finish(self, state: State) -> State:
         """A state at the end of the motion, brought to the end of the free stage: peak, verdict and margin."""

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Complex, Inexact
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.numerics.exponential_sums import Curve, powers
+from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, ""]
 
@@ -67,7 +68,8 @@ class Numbers(eqx.Module):
         column = unit_column(block.masses)
         dtype = jnp.result_type(block.width, block.youngs_modulus)
         limits = _limits(dtype)
-        ratio = jnp.maximum(block.damping_ratio, limits.least) + 0 * block.damping_ratio
+        # An undamped column is the limit of damped ones, and moves with its damping as they do.
+        ratio = with_derivatives_of(jnp.maximum(block.damping_ratio, limits.least), block.damping_ratio)
         damped = block.damping_ratio >= limits.felt
         block = eqx.tree_at(lambda b: b.damping_ratio, block, ratio)
         mass_damping, damping = block.damping_rates

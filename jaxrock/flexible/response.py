@@ -228,15 +228,18 @@ def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
 
 @eqx.filter_jit
 def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajectory]:
-    scene = scene_of(block, motion, stop)
-
     def loop(unfinished, step, carry, budget):
         return jax.lax.while_loop(unfinished, step, carry)
 
-    state, nodes = followed(lambda s: scene.advance(s), scene.start(), budget, loop)
-    times = times_of(scene.time, nodes, state)
-    impacted = nodes.impacted & (jnp.arange(times.size) > 0) & jnp.isfinite(times)
-    return scene.conclude(state), Trajectory(scene, nodes, times, impacted, stop)
+    def run(given):
+        scene = scene_of(*given)
+        state, nodes = followed(lambda s: scene.advance(s), scene.start(), budget, loop)
+        times = times_of(scene.time, nodes, state)
+        impacted = nodes.impacted & (jnp.arange(times.size) > 0) & jnp.isfinite(times)
+        return scene.conclude(state), Trajectory(scene, nodes, times, impacted, given[-1])
+
+    # Slopes of all steps by every sample of a record would be too many.
+    return differentiable(run, derivatives="a few at once")((block, motion, stop))
 
 
 @eqx.filter_jit

@@ -90,6 +90,15 @@ def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
     return tuple(Reset.of(block.law, each, jnp.ones_like(block.alpha), 1.0) for each in corners)
 
 
+def _may_be(block: FlexibleBlock, ground: AbstractMotion) -> Bool[Array, ""]:
+    """Whether no step of an optimiser has made of block or motion what a constructor refuses."""
+    sizes = jnp.stack([block.width, block.height, block.youngs_modulus, block.density, block.gravity])
+    damped = (block.damping_ratio >= 0) & (block.damping_ratio < 1)
+    knots = ground.knots
+    forward = (knots[0] >= 0) & (knots[-1] >= 0) & (ground.lengths >= 0).all()
+    return (sizes > 0).all() & damped & forward
+
+
 def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:
     ratios = [reset.ratio(speed) for reset in resets]
     return ratios[0] if len(ratios) == 1 else jnp.where(side < 0, ratios[1], ratios[0])
@@ -120,7 +129,7 @@ class FlexibleScene(eqx.Module):
         """At rest at time 0."""
         n = 2 * self.numbers.rotation.size + 1
         zero, count, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        finite = jnp.isfinite(self.rocking.rates).all() & jnp.isfinite(self.stop)
+        finite = jnp.isfinite(self.rocking.rates).all() & jnp.isfinite(self.stop) & _may_be(self.block, self.ground)
         status = Status.where(finite, Status.successful, Status.not_finite)
         return FlexibleState(
             piece=count,

@@ -140,8 +140,10 @@ class RollingMoments(AbstractMoments):
         return jax.grad(lambda x: self.acceleration(Angle.of(x), still, push, weight))(angle.value)
 
     def work(self, opening: Scalar) -> Scalar:
-        """By height: the moment of inertia there does not matter."""
-        return self.factor * (self.rolled(Angle.of(opening)).height - 1)
+        """By how much the centre of mass rises: the moment of inertia there does not matter."""
+        half, (_, sine, cosine) = Angle.of(opening / 2), self.slenderness
+        over_a_corner = 2 * half.sine * (sine * half.cosine - cosine * half.sine)  # cos(alpha - x) - cos(alpha)
+        return self.factor * (over_a_corner + self.edge.rise(opening))
 
     @property
     def restoring_at_rest(self) -> Scalar:

@@ -30,7 +30,9 @@ class Contact(AbstractTable):
     - `horizontal`, `normal`: (samples,) force of the ground, in the direction of positive ground acceleration and
       upward, over m g [-].
     - `friction`: (samples,) coefficient of friction needed, |horizontal|/normal [-]; infinite without contact.
-    - `friction_at_impact`: pair of those that the impacts need which end the stay on side 1, and on side 2 [-].
+    - `friction_at_impact`: pair of those that the impacts need which end the stay on side 1, and on side 2 [-]; where
+      there is none, what any would.
+    - `impacted`: pair of whether there is an impact that ends the stay on side 1, and on side 2.
     - `largest_friction`, `least_normal`: extremes over the rocking below the unstable equilibrium, impacts not
       included, by parabolas through points of every step (1e-6 off where tests judge it). A toppling block may need
       any friction in the end.
@@ -42,6 +44,7 @@ class Contact(AbstractTable):
     normal: Inexact[Array, " samples"]
     friction: Inexact[Array, " samples"]
     friction_at_impact: tuple[Scalar, Scalar]
+    impacted: tuple[Bool[Array, "..."], Bool[Array, "..."]]
     largest_friction: Scalar
     least_normal: Scalar
 
@@ -56,8 +59,10 @@ class Contact(AbstractTable):
         return self.least_normal > 0
 
     def sticks(self, friction: ArrayLike) -> Bool[Array, "..."]:
-        """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at impacts."""
-        needed = jnp.maximum(self.largest_friction, jnp.maximum(*self.friction_at_impact))
+        """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at the impacts."""
+        needed = self.largest_friction
+        for happened, by_impacts in zip(self.impacted, self.friction_at_impact):
+            needed = jnp.where(happened, jnp.maximum(needed, by_impacts), needed)
         return self.keeps_contact & (jnp.asarray(friction) >= needed)
 
 
@@ -116,18 +121,21 @@ def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) 
     horizontal, normal = jax.vmap(lambda *at: _forces(response.scene, sides, *at))(time, rotation, velocity)
     largest, least = _extremes(response, sides)
     corners = [(r * jnp.sin(a), r * jnp.cos(a)) for r, a in zip(radii, alphas)]
-    needed = _at_impacts(response, 1.0, *corners), _at_impacts(response, -1.0, *corners[::-1])
+    first, needed = _at_impacts(response, 1.0, *corners)
+    second, needed2 = _at_impacts(response, -1.0, *corners[::-1])
     friction = _friction(horizontal, normal)
     # Between steps, and where the block rests for good and no step is taken.
     saddles = [moments.saddle for moments in response.scene.both_moments]
     below = jnp.abs(rotation) < jnp.where(rotation < 0, saddles[1], saddles[0])
     largest = jnp.maximum(largest, jnp.max(jnp.where(below, friction, 0.0)))
     least = jnp.minimum(least, jnp.min(jnp.where(below, normal, jnp.inf)))
-    return Contact(time, horizontal, normal, friction, needed, largest, least)
+    return Contact(time, horizontal, normal, friction, (needed, needed2), (first, second), largest, least)
 
 
-def _at_impacts(response: Response, side: float, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]) -> Scalar:
-    """The most friction that the impacts need which end a stay on a side, or any impact would, if there is none.
+def _at_impacts(
+    response: Response, side: float, here: tuple[Scalar, Scalar], there: tuple[Scalar, Scalar]
+) -> tuple[Bool[Array, ""], Scalar]:
+    """Whether impacts end a stay on a side, and the most friction that they need, or any would, if there is none.
 
     `here`, `there`: horizontal and vertical distance of the centre from the corner that it leaves, and from the other.
     """
@@ -138,7 +146,7 @@ def _at_impacts(response: Response, side: float, here: tuple[Scalar, Scalar], th
     speeds = jnp.where(ours, speeds, speeds.max()) if scene.reset.depends_on_speed else speeds[:1]
     e = jax.vmap(scene.reset.ratio)(speeds)
     # The centre's velocity turns from across one corner's radius to across the other's.
-    return jnp.max(jnp.abs(here[1] - e * there[1]) / (here[0] + e * there[0]))
+    return ours.any(), jnp.max(jnp.abs(here[1] - e * there[1]) / (here[0] + e * there[0]))
 
 
 def _friction(horizontal, normal):

@@ -53,7 +53,8 @@ def standing(
     block: Block | AsymmetricBlock, model: AbstractEquation, engine: AbstractEngine, throw: bool = True
 ) -> Block | AsymmetricBlock:
     """The block, with checks that it stands by an equation of the user's own (of `current_model`), which is one, or
-    balances on a spring, or by a model of the user's own that `engine` solves by its balance.
+    balances on a spring, or by a model of the user's own that `engine` solves by its balance. Where nothing is to be
+    raised (`throw`), one that does not is not a number.
 
     Here and not where the engines ask for moments: what they compile then calls back to nothing, and JAX can keep it.
     """
@@ -64,9 +65,17 @@ def standing(
     for side in (block,) if isinstance(block, Block) else block.sides:
         # Known numbers: one call, not fifty. Of others checks within the functions belong to this trace.
         found = _faults(model, side) if is_traced((model, side)) else _compiled_faults(model, side)
+        if not throw:
+            block = _none_where(jnp.stack(list(found.values())).any(), block)
+            continue
         for message, applies in found.items():
             block = guarded(block, applies, message)
     return block
+
+
+@jax.jit
+def _none_where(bad: Bool[Array, ""], block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
+    return jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), block)
 
 
 def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Block | AsymmetricBlock:

@@ -177,6 +177,8 @@ def _impacts_of(path: Trajectory) -> tuple:
 def _peaks_of(path: Trajectory) -> tuple:
     nodes = path.nodes
     turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
+    # A step through a piece without a length leaves a block that turns where it is.
+    turned = turned.at[1:].set(turned[1:] & ~(turned[:-1] & (nodes.opening[1:] == nodes.opening[:-1])))
     return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
 
 

@@ -39,8 +39,9 @@ class Outcome(AbstractTable):
     - `max_rotation`: largest |rotation| [rad]; infinite if the block overturned.
     - `max_velocity`: largest |angular velocity| [rad/s]; infinite if the block overturned.
     - `time_of_max`: when `max_rotation` was reached [s]; infinite if the block overturned.
-    - `impact_count`: impacts during the motion, and the one after it if that one decides the verdict. The
-      impacts without end of a block that comes to rest are counted down to hops of rounding height.
+    - `impact_count`: impacts during the motion, and those after it if the block overturns after them (one, of an
+      asymmetric block up to two). The impacts without end of a block that comes to rest are counted down to hops of
+      rounding height.
     - `overturned`: the verdict.
     - `margin`: signed distance to overturning [-]: positive safe, negative overturned, zero on the boundary.
     - `differentiable`: whether the derivatives of `max_rotation` are those of a smooth function here: not where two
@@ -204,7 +205,7 @@ def _passes(rounds: bool) -> Passes:
     return Passes(
         begin=begin,
         quickly=follow,
-        carefully=_to_the_end,
+        carefully=lambda stepper, state: stepper.to_the_end(state),
         unfinished=lambda stepper, state: ~state.done & (state.steps < most_steps(stepper.scene.most_pieces)),
         conclude=result_of,
         round=POLICY.round if rounds else None,
@@ -215,14 +216,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, None, history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    return conclude(stepper, stepper.end_on_tape(state) if taped else _to_the_end(stepper, state))
-
-
-def _to_the_end(stepper: AbstractStepper, state: State) -> State:
-    """Follow a block to the end of the motion."""
-    engine = stepper.engine
-    budget = engine.budget(stepper.scene, history=False)
-    return engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+    return conclude(stepper, stepper.end_on_tape(state) if taped else stepper.to_the_end(state))
 
 
 def has_one_peak(peak: Scalar, second: Scalar, clearance: Scalar, alpha: Scalar) -> Bool[Array, "..."]:

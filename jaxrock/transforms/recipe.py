@@ -18,7 +18,7 @@ from jaxrock.keeping.folder import name_of
 from jaxrock.numerics.xla_cpu import are_marked
 from jaxrock.transforms.fingerprint import Program
 
-Derivatives = Literal["at once", "by directions", "in a direction", "on a tape"]
+Derivatives = Literal["at once", "a few at once", "by directions", "in a direction", "on a tape"]
 
 
 class Passes(NamedTuple):
@@ -61,9 +61,10 @@ class Recipe:
     - `in_lanes`, `refilled`: whether machine code may run it, and refill the lanes of its loop.
     - `order`: of the derivatives that it computes.
     - `derivatives`: how forward mode makes more of them: value and Jacobian at once (by more than eight numbers a few
-      directions at a time); the Jacobian by directions, which are scenes of their own, as of all that computes
-      derivatives already; value and change in one direction alone, which does not transpose; or the change alone, which
-      does, since reverse mode goes through the function's code.
+      directions at a time); the same, but by many numbers, where the Jacobian would be too large, value and change in
+      one direction; the Jacobian by directions, which are scenes of their own, as of all that computes derivatives
+      already; value and change in one direction alone, which does not transpose; or the change alone, which does, since
+      reverse mode goes through the function's code.
     - `directions`: how many of the last leaves are the direction of a change that it computes; that of what, by which
       leaves, is told by `origin`.
     """

@@ -122,7 +122,8 @@ def _pushed(leaves, changes, *, recipe, own, size):
         value = scenes_p.bind(*leaves, recipe=recipe, own=own, size=size)
         taped = recipe if recipe.derivatives == "on a tape" else recipe.taped
         return value, _pushed_in_a_direction(leaves, moves, moving, taped, own, size)[1]
-    if recipe.derivatives == "in a direction":
+    too_many = recipe.derivatives == "a few at once" and numbers > _MANY
+    if too_many or recipe.derivatives == "in a direction":
         return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
     if recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes):
         value, jacobian = _jacobian_by_directions(leaves, moves, recipe, own, size)

@@ -31,6 +31,7 @@ from jaxrock.engines.diffrax.guards import (
     field,
     first_guard,
     first_step,
+    is_hop,
     usual_step,
 )
 from jaxrock.engines.events import WATCHED, Events, landed
@@ -278,8 +279,20 @@ class ArcStepper(AbstractStepper):
         stepper = ArcStepper(self.scene, None, False, self.engine)
         moving = (state.side != 0) & ~state.overturned & (state.piece >= self.scene.pieces)
         state = replace(state, done=~moving | ~state.done, steps=jnp.zeros_like(state.steps))
-        budget = self.engine.budget(self.scene, False)
-        return self.engine.loop(lambda s: ~s.done & (s.steps < budget), lambda s: stepper.advance(s), state, budget)
+        return stepper.to_the_end(state)
+
+    def to_the_end(self, state: State) -> State:
+        """Through the free stage, too, whose impacts count if the block is lost after them."""
+        budget, pieces = self.engine.budget(self.scene, history=False), self.scene.pieces
+
+        def step(carry):
+            state, counted = carry
+            after = self.advance(state)
+            return after, jnp.where(state.piece < pieces, after.impacts, counted)
+
+        carry = state, state.impacts
+        state, counted = self.engine.loop(lambda c: ~c[0].done & (c[0].steps < budget), step, carry, budget)
+        return replace(state, impacts=jnp.where(state.overturned, state.impacts, counted))
 
     def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
@@ -299,25 +312,6 @@ class ArcStepper(AbstractStepper):
         opening, velocity = y + shift * flow + shift**2 / 2 * bent
         return opening, velocity * self.scene.p
 
-    def _is_hop(self, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:
-        """Whether the block comes back to the ground at once, without a peak or a speed that matters.
-
-        From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
-        than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
-        faster than 2 v.
-        """
-        moments, v = self.scene.moments, state.velocity
-        back = jnp.where(acceleration < 0, -acceleration, 1.0)
-        flight, height = 4 * v / (back * self.scene.p), v * v / back
-        weight = forcing.shaking.now[1]
-        pull = moments.stiffness * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
-        change = moments.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
-        certain = (change <= back / 2) & (flight <= jnp.minimum(self.room(state), forcing.reach))
-        least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
-        small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
-        starts = (state.opening == 0) & (v > 0) & (acceleration < 0)
-        return starts & certain & small & (not self.history)
-
     def _rock(self, state: State, forcing: Forcing, rocking: Flag) -> State:
         """Rocking: an arc up to its event, the knot, or the stop."""
         scene, engine = self.scene, self.engine
@@ -328,7 +322,7 @@ class ArcStepper(AbstractStepper):
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)
-        arc = replace(arc, hop=self._is_hop(state, arc.start_acceleration, forcing))
+        arc = replace(arc, hop=is_hop(self, state, arc.start_acceleration, forcing))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
         solution, time, y = engine.locate(arc, engine.limits(scene, state.piece), length, event)
@@ -380,10 +374,6 @@ class ArcStepper(AbstractStepper):
         down = after.opening >= jnp.pi / 2
         gone = before.overturned | lost | escaped(self, after, Angle.of(after.opening))
         overturned = gone | down if scene.falls_flat else gone
-        if not self.history:
-            # The impact after the motion counts if the block is lost after it.
-            decisive = (after.impact_time > scene.motion.end) & overturned
-            after = replace(after, impacts=jnp.where(quiet, before.impacts + decisive, after.impacts))
         exhausted = result == diffrax.RESULTS.max_steps_reached
         failed = ~exhausted & ~diffrax.is_okay(result)
         balanced = quiet & (before.velocity == 0) & (jnp.abs(arc.start_acceleration) <= arc.noise) & (before.side != 0)

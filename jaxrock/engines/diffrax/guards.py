@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State
+from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking
@@ -78,6 +79,26 @@ class Forcing(eqx.Module):
     def steepest(self) -> tuple[Scalar, Scalar | None]:
         """Bounds of how fast the acceleration changes within `reach`, horizontal and vertical [g/s]."""
         return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
+
+
+def is_hop(stepper: AbstractStepper, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:
+    """Whether a block that leaves the ground comes back at once, without a peak or a speed that matters.
+
+    From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
+    than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
+    faster than 2 v.
+    """
+    moments, v = stepper.scene.moments, state.velocity
+    back = jnp.where(acceleration < 0, -acceleration, 1.0)
+    flight, height = 4 * v / (back * stepper.scene.p), v * v / back
+    weight = forcing.shaking.now[1]
+    pull = moments.stiffness * (1.0 if weight is None else weight) + moments.restoring_at_rest + back
+    change = moments.change_at_rest(*forcing.steepest) * flight + 2 * height * pull
+    certain = (change <= back / 2) & (flight <= jnp.minimum(stepper.room(state), forcing.reach))
+    least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
+    small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
+    starts = (state.opening == 0) & (v > 0) & (acceleration < 0)
+    return starts & certain & small & (not stepper.history)
 
 
 class Arc(eqx.Module):
