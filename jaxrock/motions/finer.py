@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.motions.shaking import Bounds
 from jaxrock.numerics.choice import where
+from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.given import given, is_zero
 
 Scalar = Inexact[Array, ""]
 _FEW = 32  # pieces that are compared, one with all; more are sorted
@@ -38,7 +40,10 @@ class Finer(NamedTuple):
     @property
     def knots(self) -> Inexact[Array, " finer"]:
         """Where they end, and the first begins [s]."""
-        return jnp.sort(jnp.concatenate([self.first, self.second]))  # which keeps the order of those that are alike
+        knots = jnp.concatenate([self.first, self.second])
+        if knots.size > _FEW:
+            return jnp.sort(knots)  # which keeps the order of those that are alike
+        return given(_in_order, jnp.sort(fixed(knots)), (self.first, self.second))
 
     @property
     def _passed(self) -> Int[Array, " pieces"]:
@@ -86,6 +91,20 @@ class Finer(NamedTuple):
             terms = None if each is None else each(place.piece, begin - knots[place.piece] + local, unit, order)
             found.append(None if terms is None else [where(place.moving, u, 0.0) for u in terms])
         return found
+
+
+def _in_order(_, knots: tuple, changes: tuple) -> Inexact[Array, " finer"]:
+    """Changes of few knots that are sorted: JAX would sort their numbers, too, and look them up, which becomes no
+    machine code where it is done at every step."""
+    first, second = fixed(knots)
+    count = [jnp.arange(x.size, dtype=jnp.int32) for x in (first, second)]
+    before_first = jnp.sum(second < first[:, None], axis=1, dtype=jnp.int32)
+    before_second = jnp.sum(first <= second[:, None], axis=1, dtype=jnp.int32)
+    numbers, found = jnp.arange(first.size + second.size, dtype=jnp.int32)[:, None], 0.0
+    for place, change in zip((count[0] + before_first, count[1] + before_second), changes):
+        if not is_zero(change):
+            found = found + jnp.sum(where(place == numbers, change, 0.0), axis=1)
+    return jnp.asarray(found)
 
 
 @jax.custom_jvp
