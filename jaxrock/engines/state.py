@@ -1,6 +1,9 @@
 """The state of a lane: one block under one motion, on its way."""
 
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, Int
 
@@ -9,6 +12,7 @@ from jaxrock.engines.uncertainty import Spread
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.given import given, is_zero
 from jaxrock.status import Status
 from jaxrock.transforms.differentiation import with_derivatives_of
 
@@ -48,6 +52,11 @@ class State(eqx.Module):
 
 
 ROUNDING = 4096  # units of rounding that peaks of one height may be apart
+# What depends on a block's numbers once it has rocked.
+_MOVES = (
+    "local", "opening", "velocity", "peak", "peak_time", "fastest", "impact_time", "impact_velocity", "closeness",
+    "closeness_beyond", "clearance", "peak_clearance", "second",
+)  # fmt: skip
 _MOST = 1e30  # [g], [rad/s], [s]
 
 
@@ -108,6 +117,25 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
         status=Status.where(finite, Status.successful, Status.not_finite),
         steps=count,
     )
+
+
+def all_moving(state: State, scene: Scene) -> State:
+    """The state; where any number of the scene moves, so does all that moves later. Or else JAX would trace the loop
+    over all steps twice when it differentiates it: as what moves at first has it, and as what comes to move on the
+    way, which is a sixth of the time of a first Hessian."""
+    path = [getattr(state, name) for name in _MOVES]
+    numbers = [x for x in jax.tree.leaves(scene) if not jnp.shape(x)]
+    return replace(state, **dict(zip(_MOVES, given(_all_move, path, (path, numbers)))))
+
+
+def _all_move(values: list, _, changes: tuple) -> list:
+    own, numbers = changes
+    moving = [d for d in (*own, *numbers) if not is_zero(d) and jnp.issubdtype(d.dtype, jnp.inexact)]
+    if not moving:
+        return own
+    # Zeros that differ from lane to lane, if changes do, under `jax.vmap` over directions.
+    none = where(jnp.zeros((), bool), moving[0], 0.0).astype(values[0].dtype)
+    return [none if is_zero(d) else d for d in own]
 
 
 def surpasses(value: Scalar, best: Scalar) -> Flag:

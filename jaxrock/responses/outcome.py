@@ -12,7 +12,7 @@ from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import ROUNDING, State, initial_state
+from jaxrock.engines.state import ROUNDING, State, all_moving, initial_state
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.engines.taylor.follow import follow, most_steps
@@ -196,7 +196,8 @@ def _passes(rounds: bool) -> Passes:
         block, motion, model, initial, engine = scene
         scene = Scene.of(block, motion, model, in_place=True)
         stepper = engine.stepper(scene, None, history=False)
-        return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+        state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+        return stepper, all_moving(state, scene)
 
     def result_of(stepper, state):
         result = conclude(stepper, state)
@@ -216,7 +217,7 @@ def _to_outcome(block, motion, model, initial, engine, *, taped: bool) -> Outcom
     scene = Scene.of(block, motion, model)
     stepper = engine.stepper(scene, None, history=False, taped=taped)
     state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    return conclude(stepper, stepper.end_on_tape(state) if taped else stepper.to_the_end(state))
+    return conclude(stepper, stepper.end_on_tape(state) if taped else stepper.to_the_end(all_moving(state, scene)))
 
 
 def has_one_peak(peak: Scalar, second: Scalar, clearance: Scalar, alpha: Scalar) -> Bool[Array, "..."]:
