@@ -72,19 +72,20 @@ def _made() -> _Machine:
 
 
 def lanes_of() -> int:
-    """Lanes of a vector, at most."""
+    """Lanes of a vector, at most: of numbers in double precision two registers, in single precision one."""
     return _machine().lanes
 
 
-def lanes_for(scenes: int | None, quick: bool) -> int:
-    """Lanes of a vector for so many scenes (None: one), which a quick program follows, or a careful one.
+def lanes_for(scenes: int | None, quick: bool, single: bool) -> int:
+    """Lanes of a vector for so many scenes (None: one), which a quick program follows or a careful one, in `single`
+    precision or double.
 
     Code for two registers takes LLVM twice as long as for one, and only a quick program, whose values have room in all
     registers, runs faster so. Of one scene, two lanes are compiled in no more time than one, and take half of the time
     that sixteen take."""
     if scenes is None:
         return 2
-    return lanes_of() if quick else lanes_of() // 2
+    return lanes_of() if quick or single else lanes_of() // 2
 
 
 def machine() -> str:

@@ -113,7 +113,8 @@ class Lanes:
         return [self._plan(quick, own) for quick in ([True, False] if self._is_quick else [False])]
 
     def _plan(self, quick: bool, own: tuple[bool, ...]):
-        alone, lanes = self.size is None, native.lanes_for(self.size, quick)
+        alone, single = self.size is None, not any(x.dtype == jnp.float64 for x in self.recipe.like)
+        lanes = native.lanes_for(self.size, quick, single)
         key = quick, own, alone
         if key not in self.recipe.plans:
             with marking(False):
