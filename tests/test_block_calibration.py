@@ -4,6 +4,7 @@ import functools
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -144,13 +145,17 @@ def test_a_parameter_that_tests_do_not_tell():
 
 
 def test_a_likelihood_is_not_flat_at_the_ends_of_a_range():
-    """Without scatter the outermost cells are the ends: shares of cells that rise rise up to there."""
+    """Without scatter the outermost cells are the ends: shares of cells that rise straight do so up to there."""
     axis = Axis.of("p", rk.inverse.Unknown(1.5, 6.0), None, 8)
     np.testing.assert_allclose(axis.values[[0, -1]], [1.5, 6.0], rtol=1e-15)
-    p = np.exp(np.log(1.5) + np.array([0, 0.2, 0.4, 6.6, 6.8, 7]) * axis.width)
-    shares = [float(axis.weights({"p": each}, "p") @ np.arange(8.0)) for each in p]
-    np.testing.assert_allclose(np.array(shares)[[0, -1]], [0, 7], atol=1e-12)
-    assert (np.diff(shares)[[0, 1, 3, 4]] > 0.05).all()
+
+    def share(place):
+        return axis.weights({"p": 1.5 * jnp.exp(place * axis.width)}, "p") @ np.arange(8.0)
+
+    places = np.array([0, 0.2, 0.5, 1, 3.3, 6, 6.6, 7])
+    shares, slopes = jax.jit(jax.vmap(jax.value_and_grad(share)))(places)
+    np.testing.assert_allclose(shares, places, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(slopes, 1.0, rtol=1e-12)
 
 
 class Firm(rk.restitution.AbstractRestitution):
@@ -169,6 +174,25 @@ def test_blocks_of_cells_share_what_belongs_to_a_law_of_ones_own():
     assert blocks.alpha.shape == (8,) and (float(blocks.law.firm), float(blocks.law.speed)) == (0.9, 4.0)
     with pytest.raises(ValueError, match="declares its parameters .*, but `law.firm` is not declared, and differs"):
         blocks_of_cells(lambda alpha: rk.Block(alpha, P, Firm(1 - alpha, 4.0)), axes)
+    unknown = blocks_of_cells(lambda alpha: rk.Block(alpha, P, Firm(0.9, jnp.nan)), axes)  # the same in all
+    assert np.isnan(unknown.law.speed) and unknown.law.speed.shape == ()
+
+
+class Stepped(rk.restitution.AbstractRestitution):
+    """A law with a list that is declared."""
+
+    ratios: jax.Array = rk.parameter("-", axes=1)
+
+    def ratio(self, corners, speed):
+        return jnp.interp(speed, np.arange(2.0), self.ratios)
+
+
+def test_lists_of_a_law_belong_to_all_cells():
+    axes = {"alpha": Axis.of("alpha", UNKNOWN, SPREAD, 8)}
+    blocks = blocks_of_cells(lambda alpha: rk.Block(alpha, P, Stepped(jnp.array([0.9, 0.8]))), axes)
+    np.testing.assert_array_equal(blocks.law.ratios, [0.9, 0.8])
+    with pytest.raises(ValueError, match=r"shares its lists, but `law.ratios` is declared as one \(axes=1\), and diff"):
+        blocks_of_cells(lambda alpha: rk.Block(alpha, P, Stepped(jnp.stack([1 - alpha, 0.8]))), axes)
 
 
 def test_names_in_any_order():

@@ -138,6 +138,23 @@ def test_sine_regions_over_durations():
             rk.plot.sine_regions(0.9, drawn, by_duration=by_duration, **given)
 
 
+@pytest.mark.parametrize(
+    "by_duration, upward, mine",
+    [
+        (False, "uplift strength", "intensity"),
+        (False, "intensity times 2", "intensity"),
+        (True, "uplift strength times 0.5", "uplift strength"),
+        (True, "intensity", "uplift strength"),
+    ],
+)
+def test_sine_regions_over_what_is_upward(by_duration, upward, mine):
+    """Labels as `borders` writes them."""
+    _, axis = plt.subplots()
+    axis.set_ylabel(upward)
+    with pytest.raises(ValueError, match=f"`axis` must have the {mine} upward, but has '{upward}'"):
+        rk.plot.sine_regions(0.9, axis, by_duration=by_duration, frequency_ratio=np.geomspace(1.0, 4.0, 8))
+
+
 def test_found_record():
     """Both records, what lies between them, and their spectra."""
     number, start = jnp.zeros(()), rk.Record([0.1, 0.2, -0.3, 0.0], 0.5, "a start")

@@ -11,6 +11,7 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.blocks.cantilever import unit_column
+from jaxrock.blocks.flexible import is_possible
 from jaxrock.flexible.closeness import approached, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, locked_phase, rocking_phase
 from jaxrock.flexible.stepper import FlexibleScene
@@ -120,11 +121,23 @@ def test_what_no_constructor_has_seen_has_a_status():
     """A step of an optimiser changes numbers of blocks and motions as they are."""
     block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3)
     motion = rk.RectangularPulse(0.6, 0.9) + rk.SinePulse(0.01, 3.0)  # compiled for the test before
-    for name, value in (("damping_ratio", -0.1), ("damping_ratio", 1.1), ("width", -0.5), ("density", -1.0)):
+    for name, value in (
+        ("damping_ratio", -0.1), ("damping_ratio", 1.1), ("width", -0.5), ("density", -1.0), ("width", 4.5),
+        ("youngs_modulus", 1e5), ("youngs_modulus", 1e21),
+    ):  # fmt: skip
         changed = eqx.tree_at(operator.attrgetter(name), block, jnp.array(value, float))
         assert rk.outcome(changed, motion, duration=4.0).status == rk.Status.not_finite
     backwards = eqx.tree_at(lambda m: m.second.period, motion, jnp.array(-3.0, float))
     assert rk.outcome(block, backwards, duration=4.0).status == rk.Status.not_finite
+
+
+def test_what_a_constructor_refuses_is_not_possible():
+    """A column that is stiffer than its base, and bends under its own weight; a law."""
+    block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3, p_delta=True, restitution=0.9)
+    possible = jax.jit(is_possible)
+    assert possible(block)
+    for name, value in (("youngs_modulus", 3e6), ("law.value", 1.1)):
+        assert not possible(eqx.tree_at(operator.attrgetter(name), block, jnp.array(value, float)))
 
 
 def test_the_verdict_of_a_base_that_has_little_energy_beyond_its_balance():

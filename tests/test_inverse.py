@@ -176,15 +176,28 @@ def test_slopes_that_were_not_computed_are_refused(what):
 def test_slopes_by_the_scatter(scatter):
     """Of margins that are straight: P = Phi(ln(critical/amplitude)/scatter), and its slope."""
     critical, strength = np.log([0.22, 0.27, 0.36, 0.4] * 3), np.log(0.3)
-    found, slopes = stands(scatter, critical, strength)
+    (found, _), (slopes, _) = stands(scatter, critical, strength)
     z = (critical - strength) / scatter
-    np.testing.assert_allclose(found, scipy.stats.norm.cdf(z), atol=1e-3)
-    np.testing.assert_allclose(slopes, -z / scatter * scipy.stats.norm.pdf(z), rtol=0.015)
+    np.testing.assert_allclose(np.exp(found), scipy.stats.norm.cdf(z), atol=1e-3)
+    np.testing.assert_allclose(np.exp(found) * slopes, -z / scatter * scipy.stats.norm.pdf(z), rtol=0.015)
+
+
+@pytest.mark.parametrize("scatter", [0.2, 0.45])
+def test_slopes_by_the_scatter_of_what_is_hardly_possible(scatter):
+    """Five standard deviations away, beyond the last nodes: rocks that stood all the same, and that toppled."""
+    z = np.array([-5.0, 5.0] * 6)
+    strength = np.log(0.3)
+    _, slopes = stands(scatter, strength + scatter * z, strength)
+    slopes = np.where(z < 0, *slopes)  # of that which was hardly possible
+    # The straight lines on which margins go on there are a little steeper than the margins are.
+    true = 5 / scatter * scipy.stats.norm.pdf(5) / scipy.stats.norm.sf(5)
+    np.testing.assert_allclose(slopes, true, rtol=0.1)
 
 
 @jax.jit
 def stands(scatter, critical, strength):
-    """Probabilities that rocks stand, which are lost above amplitudes, and their slopes by the scatter."""
+    """Logarithms of the probabilities that rocks stand, which are lost above amplitudes, and topple, and their slopes
+    by the scatter."""
 
     def probabilities(scatter):
         seen = rk.inverse.Observations(np.full(12, 0.2), np.full(12, 3.0), ["survived"] * 12)
@@ -192,7 +205,7 @@ def stands(scatter, critical, strength):
         y = (critical - jax.lax.stop_gradient(levels.strength))[:, None]  # nodes are fixed, as in a likelihood
         margin, rotation = jnp.where(y < 0, 1 - jnp.exp(-2 * y), jnp.sqrt(1 + 4 * jnp.maximum(y, 0.0)) - 1), 0 * y
         found = Possible.of(where[:, None], margin, rotation, y == y, y < 0, rotation + 1).log_probabilities()
-        return jnp.exp(found[0]), jnp.exp(found[0])
+        return found, found
 
     slopes, found = jax.jacfwd(probabilities, has_aux=True)(scatter)
     return found, slopes

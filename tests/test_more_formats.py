@@ -476,6 +476,10 @@ def test_names_of_vertical_components(file, name):
         ("", "E", "S"),
         ("long", "x", "Trans"),
         ("EW", "", "North-South"),
+        ("N-S", "", "W-E"),
+        ("WE", "", "SN"),
+        ("90", "", "0"),
+        ("10°", "", "12 deg"),
     ],
 )
 def test_three_horizontal_components_are_refused(names):
@@ -487,7 +491,16 @@ def test_three_horizontal_components_are_refused(names):
 
 @pytest.mark.parametrize(
     "names",
-    [("", "", ""), ("000", "090", ""), ("1", "2", "3"), ("HN1", "HN2", "HN3"), ("x", "y", "z"), ("a", "b", "c")],
+    [
+        ("", "", ""),
+        ("000", "090", ""),
+        ("1", "2", "3"),
+        ("10", "11", "12"),
+        ("01", "02", "03"),
+        ("HN1", "HN2", "HN3"),
+        ("x", "y", "z"),
+        ("a", "b", "c"),
+    ],
 )
 def test_where_components_do_not_say_the_last_is_vertical(names):
     records = [rk.Record([0.1, 0.2], 0.01, origin=rk.motions.Origin(component=each)) for each in names]

@@ -134,6 +134,22 @@ def test_a_model_of_ones_own_does_not_raise():
             standing(block, model, series)
 
 
+class Chosen(rk.restitution.AbstractRestitution):
+    """A law that takes its ratio from a list."""
+
+    place: jax.Array = rk.parameter("-", is_whole=True)
+
+    def ratio(self, corners, speed):
+        return jnp.array([0.9, 0.8])[self.place] + 0 * speed
+
+
+def test_whole_numbers_of_a_law_stay_whole():
+    block = rk.Block(0.2, 2.0, Chosen(jnp.array(1)))
+    for strength in (0.9, -0.9):
+        found = standing(block, Softer(jnp.asarray(strength)), rk.Series(), throw=False)
+        assert np.isnan(found.alpha) == (strength < 0) and found.restitution == 0.8
+
+
 def test_a_history_that_is_none_tells_no_numbers_and_has_no_slopes():
     """At any time, in both modes: a fit that steps out of the ranges goes on."""
 

@@ -1,16 +1,17 @@
 """The flexible block: a rigid base on a spring of negative stiffness that carries an elastic column of masses."""
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._checks import Range, below_one, checked, one_of, size, truth, whole, with_throw
 from jaxrock._described import described
-from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._parameters import Owner, leaves_of, parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fitting_width, law_of
+from jaxrock.blocks.restitution import AbstractRestitution, Corners, Housner, Restitution, fits, fitting_width, law_of
 from jaxrock.blocks.rigid import GRAVITY
 
 Real = Inexact[Array, "..."]
@@ -105,25 +106,9 @@ class FlexibleBlock(Owner):
         set_parameters(self, damping_ratio=damping_ratio, gravity=gravity)
         self.law = law_of(restitution, Housner(), symmetric=True)
         self.width = fitting_width(self.law, self.width, self.height)
-        self.youngs_modulus = checked(
-            "youngs_modulus",
-            self.youngs_modulus,
-            "make the column stiffer than its base is unstable",
-            lambda x: jnp.sum(self._column_stiffness, -1) > self.spring_rate,
-        )
-        self.youngs_modulus = checked(
-            "youngs_modulus",
-            self.youngs_modulus,
-            "make the column at most 1e12 times as stiff as its base is unstable: rounding shows above (a rigid block)",
-            lambda x: jnp.sum(self._column_stiffness, -1) < 1e12 * self.spring_rate,
-        )
-        if self.p_delta:
-            self.youngs_modulus = checked(
-                "youngs_modulus",
-                self.youngs_modulus,
-                "make the column, held at its base, bear twice its own weight when `p_delta` is True",
-                lambda x: unit_column(self.masses).buckling * self._bending_rate**2 > 2 * self.gravity / self.length,
-            )
+        for allowed, holds in _DEMANDS:
+            now = holds(self)  # where nothing is raised, of what the demand before has left
+            self.youngs_modulus = checked("youngs_modulus", self.youngs_modulus, allowed, lambda _, now=now: now)
 
     @property
     def alpha(self) -> Real:
@@ -217,3 +202,33 @@ class FlexibleBlock(Owner):
         second = frequencies[..., 1]
         part = 2 * ratio / (first + second)
         return part * first * second, part[..., None] * frequencies**2
+
+
+# What the stiffness of a column must do, and whether that of a block does.
+_DEMANDS: tuple[tuple[str, Callable], ...] = (
+    (
+        "make the column stiffer than its base is unstable",
+        lambda block: jnp.sum(block._column_stiffness, -1) > block.spring_rate,
+    ),
+    (
+        "make the column at most 1e12 times as stiff as its base is unstable: rounding shows above (a rigid block)",
+        lambda block: jnp.sum(block._column_stiffness, -1) < 1e12 * block.spring_rate,
+    ),
+    (
+        "make the column, held at its base, bear twice its own weight when `p_delta` is True",
+        lambda block: not block.p_delta or _bears_itself(block),
+    ),
+)
+
+
+def _bears_itself(block: FlexibleBlock) -> Bool[Array, "..."]:
+    buckling = unit_column(block.masses).buckling
+    return buckling * block._bending_rate**2 > 2 * block.gravity / block.length
+
+
+def is_possible(block: FlexibleBlock) -> Bool[Array, ""]:
+    """Whether the constructor takes such numbers: a step of an optimiser may have changed those of a block as it is."""
+    known = [leaf for leaf in leaves_of(block) if leaf.declared.axes is not None]
+    held = [leaf.declared.range.holds(leaf.value) for leaf in known]
+    held += [fits(block.law, block.width, block.height), *(holds(block) for _, holds in _DEMANDS)]
+    return jnp.stack([jnp.all(each) for each in held]).all()

@@ -320,7 +320,12 @@ def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
     allowed = f"be at most 1.41 times the height when `restitution` is None or Housner's: {reason}"
     if law.inertia_ratio is not None:
         allowed = "be so small that Housner's restitution 1 - 2 inertia_ratio sin^2(alpha) is not negative"
-    return checked("width", width, allowed, lambda x: law._loss * x**2 <= (1 + 1e-6) * (x**2 + height**2))
+    return checked("width", width, allowed, lambda x: fits(law, x, height))
+
+
+def fits(law: AbstractRestitution, width: ArrayLike, height: Real) -> ArrayLike:
+    """Whether the law has a value for rectangles so wide."""
+    return not isinstance(law, Housner) or law._loss * width**2 <= (1 + 1e-6) * (width**2 + height**2)
 
 
 class Reset(eqx.Module):

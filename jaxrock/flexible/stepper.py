@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Complex, Inexact, Int
 
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.cantilever import unit_column
-from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.flexible import FlexibleBlock, is_possible
 from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.flexible.closeness import approached, mirrored, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rocking_phase
@@ -92,11 +92,9 @@ def resets_of(block: FlexibleBlock) -> tuple[Reset, ...]:
 
 def _may_be(block: FlexibleBlock, ground: AbstractMotion) -> Bool[Array, ""]:
     """Whether no step of an optimiser has made of block or motion what a constructor refuses."""
-    sizes = jnp.stack([block.width, block.height, block.youngs_modulus, block.density, block.gravity])
-    damped = (block.damping_ratio >= 0) & (block.damping_ratio < 1)
     knots = ground.knots
     forward = (knots[0] >= 0) & (knots[-1] >= 0) & (ground.lengths >= 0).all()
-    return (sizes > 0).all() & damped & forward
+    return is_possible(block) & forward
 
 
 def _ratio(resets: tuple[Reset, ...], side: Scalar, speed: Scalar) -> Scalar:

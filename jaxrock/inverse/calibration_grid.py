@@ -69,14 +69,23 @@ class Axis(eqx.Module):
         """
         place = jnp.log(values[name]) if self.log else values[name]
         if not self.is_scattered:
-            x = jnp.abs(jnp.clip(place, self.middles[0], self.middles[-1]) - self.middles) / self.width
-            near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
-            found = jnp.where(x < 1, near, jnp.where(x < 2, far, 0.0))
-            return found / jnp.sum(found)
+            # At an end, where rounding may put it on either side, it has the slope of the inside.
+            known = jax.lax.stop_gradient(place)
+            place = place + (jnp.clip(known, self.middles[0], self.middles[-1]) - known)
+            return self._by_cubics((place - self.middles[0]) / self.width)
         deviation = values[f"{name}_sd"] if self.deviation is None else self.deviation
         edges = self.middles[:-1] + self.width / 2
         below = ndtr((edges - place) / deviation)
         return jnp.diff(jnp.concatenate([jnp.zeros(1), below, jnp.ones(1)]))
+
+    def _by_cubics(self, place: Array) -> Float[Array, " cells"]:
+        """Weights of the cells around a place, in cells from the first."""
+        x = jnp.abs(place - np.arange(-1.0, self.count + 1))
+        near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
+        found = jnp.where(x < 1, near, jnp.where(x < 2, far, 0.0))
+        # The cells before the first and after the last go on straight: 2 f[0] - f[1].
+        outer = jnp.stack([2 * found[0], -found[0], -found[-1], 2 * found[-1]])
+        return found[1:-1].at[np.array([0, 1, -2, -1])].add(outer)
 
 
 def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
@@ -87,10 +96,18 @@ def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
     except TypeError as error:
         raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
     for leaf in leaves_of(blocks):
-        if leaf.is_shared and np.any(np.asarray(leaf.value) != np.asarray(leaf.value)[:1]):
+        if leaf.is_shared and not _is_one(np.asarray(leaf.value)):
+            axes = leaf.declared.axes
             said = f"declares its parameters (`jaxrock.parameter`), but `{leaf.name}` is not declared, and differs"
+            if axes is not None:
+                said = f"shares its lists, but `{leaf.name}` is declared as one (axes={axes}), and differs"
             raise ValueError(f"Argument `block` must make blocks of a class that {said} from cell to cell.")
     return jax.tree.map(lambda x, own: x[0] if own else x, blocks, shared(blocks))
+
+
+def _is_one(values: np.ndarray) -> bool:
+    """Whether all cells have the same; what is no number in all of them is the same, too."""
+    return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
 
 
 class Table(eqx.Module):

@@ -126,7 +126,10 @@ class Possible(NamedTuple):
         y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known)
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
         few = _SLOPE_OVER - 1
-        slope = jnp.stack([y[0] - y[few], y[-1 - few] - y[-1]]) / (few * _APART)
+        # As far apart as they are by this scatter: it changes that, and not the nodes.
+        slope = jnp.stack(
+            [(y[0] - y[few]) / (where[few] - where[0]), (y[-1 - few] - y[-1]) / (where[-1] - where[-1 - few])]
+        )
         far = jnp.broadcast_arrays(where[:1], where[-1:], y[:1])[:2]
         ends = jnp.stack([y[0], y[-1], *(jnp.maximum(slope, 0.0) + _LEAST_SLOPE), far[0][0], far[1][0]])
         half = jnp.concatenate([where[:1], _halves(where)])

@@ -25,10 +25,11 @@ _DOWN = re.compile(r"\W*D((OW|W)?N)?\W*", re.IGNORECASE)
 _VERTICAL = re.compile(
     r"\W*(U(P|D|-D|P[-/ ]?(DN|DWN|DOWN))?\d?|D((OW|W)?N)?|\d*V(ER\w*|R?T)?\d?|..?Z|Z)\W*", re.IGNORECASE
 )
-# Azimuths, points of the compass, codes of SEED, words. A number of one digit is rather that of a channel.
+# Azimuths, points of the compass, codes of SEED, words. Any other number of one or two digits is that of a channel.
 _HORIZONTAL = re.compile(
-    r"\W*(0|0?\d\d|[12]\d\d|3[0-6]\d|\d{1,3} ?(°|DEG\w*)|[NS][-/ ]?(\d{1,2} ?(°|DEG)? ?)?[EW]|[NESW]|NS|EW|N-S|E-W"
-    r"|(NORTH|EAST|SOUTH|WEST)\W*(NORTH|EAST|SOUTH|WEST)?|[A-Z][GHLN][NE]|(LONG|TRANS|RADIAL|HORIZ)\w*)\W*",
+    r"\W*(0|90|[0-2]\d\d|3[0-5]\d|360|\d{1,3} ?(°|DEG\w*)|[NS][-/ ]?(\d{1,2} ?(°|DEG)? ?)?[EW]|[NESW]"
+    r"|N[-/ ]?S|S[-/ ]?N|E[-/ ]?W|W[-/ ]?E|(NORTH|EAST|SOUTH|WEST)\W*(NORTH|EAST|SOUTH|WEST)?|[A-Z][GHLN][NE]"
+    r"|(LONG|TRANS|RADIAL|HORIZ)\w*)\W*",
     re.IGNORECASE,
 )
 

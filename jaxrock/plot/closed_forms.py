@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxrock.closed_form import sine_pulse, single_lobe
-from jaxrock.plot.style import DURATION, GREY, RATIO, RED, figure
+from jaxrock.plot.style import DURATION, GREY, INTENSITY, RATIO, RED, STRENGTH, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,7 @@ def safety_regions(
             letters = {"ha": "center", "va": "center", "color": "white" if name.startswith("$O") else "black"}
             axis.text(duration[widest], middle, name[:5], **letters)
     axis.plot(duration, curves[2], color="black", linewidth=1.2)
-    axis.set(xlim=(0, longest), ylim=(0, 1), xlabel=DURATION, ylabel="uplift strength $g\\alpha/A_g$")
+    axis.set(xlim=(0, longest), ylim=(0, 1), xlabel=DURATION, ylabel=f"{STRENGTH} $g\\alpha/A_g$")
     if legend:
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7, frameon=False)
     return axis
@@ -76,8 +76,8 @@ def sine_regions(
 
     **Returns:** the axis.
 
-    **Raises:** ValueError for an axis over pulse durations without `by_duration`, and for one over frequency ratios
-    with it.
+    **Raises:** ValueError for an axis over pulse durations without `by_duration`, for one over frequency ratios with
+    it, and for one on which `borders` are drawn by their strength, or by a `scale`.
 
     **Source:** Dimitrakopoulos & DeJong (2012), figure 4: equations 3.10, 3.18, 3.20 with 3.21, and 3.31.
     """
@@ -85,8 +85,8 @@ def sine_regions(
 
     if axis is None:
         _, axis = plt.subplots(figsize=(5, 4), layout="constrained")
-    elif (across := axis.get_xlabel()) == (RATIO if by_duration else DURATION):
-        raise ValueError(f"Argument `by_duration` must be {not by_duration} for an axis over {across!r}.")
+    else:
+        _check_coordinates(axis, by_duration)
     ratio = np.linspace(0.3, 8, 300) if frequency_ratio is None else np.asarray(frequency_ratio, float)
 
     def after(k):
@@ -107,7 +107,7 @@ def sine_regions(
         x, y = _to_its_tips(curve, ratio)
         x, y = (2 * np.pi / x, 1 / y) if by_duration else (x, y)
         axis.plot(x, y, color=color, linestyle=style, linewidth=1.2, label=name)
-    words = (DURATION, "uplift strength $g\\alpha/a_g$") if by_duration else (RATIO, "intensity $a_g/g\\alpha$")
+    words = (DURATION, f"{STRENGTH} $g\\alpha/a_g$") if by_duration else (RATIO, f"{INTENSITY} $a_g/g\\alpha$")
     axis.set_xlabel(axis.get_xlabel() or words[0])  # a map below has its own words
     axis.set_ylabel(axis.get_ylabel() or words[1])
     before = axis.get_legend()
@@ -115,6 +115,16 @@ def sine_regions(
     if before is not None:
         axis.add_artist(before)  # of the map below
     return axis
+
+
+def _check_coordinates(axis: "Axes", by_duration: bool) -> None:
+    """Raise ValueError for an axis whose labels say that it is over something else, or a multiple of it."""
+    across, upward = axis.get_xlabel(), axis.get_ylabel()
+    if across == (RATIO if by_duration else DURATION):
+        raise ValueError(f"Argument `by_duration` must be {not by_duration} for an axis over {across!r}.")
+    mine, other = (STRENGTH, INTENSITY) if by_duration else (INTENSITY, STRENGTH)
+    if upward.startswith((other, f"{mine} times ")):
+        raise ValueError(f"Argument `axis` must have the {mine} upward, but has {upward!r}.")
 
 
 _PIECE = 8  # points

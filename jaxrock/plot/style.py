@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 BLUE, RED, GREY, SAND = "#1f5a8a", "#b3352c", "#8a8a8a", "#d9a441"
 DURATION, RATIO = "pulse duration $p\\,t_d$", r"frequency ratio $\omega/p$"  # by which axes over them are known
+STRENGTH, INTENSITY = "uplift strength", "intensity"  # with which labels of axes begin that have them upward
 
 Drawing = TypeVar("Drawing", bound=Callable)
 

@@ -11,8 +11,10 @@ from jaxrock.plot.style import (
     BLUE,
     DURATION,
     GREY,
+    INTENSITY,
     RATIO,
     RED,
+    STRENGTH,
     broken_curve,
     draw_cells,
     figure,
@@ -164,9 +166,9 @@ def overturning(
     axis.set(xlim=limits_of(x), ylim=limits_of(y))
     axis.set_xlabel(DURATION if by_duration else RATIO)
     axis.set_ylabel(
-        "uplift strength (uplift threshold / peak acceleration)"
+        f"{STRENGTH} (uplift threshold / peak acceleration)"
         if by_duration
-        else "intensity (peak acceleration / uplift threshold)"
+        else f"{INTENSITY} (peak acceleration / uplift threshold)"
     )
     return axis
 
@@ -250,7 +252,7 @@ def borders(
                 axis.plot(region.frequency_ratio, shown, label=label, **line)
                 label = None
     axis.set_xlabel(RATIO)
-    axis.set_ylabel(("uplift strength" if by_strength else "intensity") + ("" if scale == 1 else f" times {scale:g}"))
+    axis.set_ylabel((STRENGTH if by_strength else INTENSITY) + ("" if scale == 1 else f" times {scale:g}"))
     return axis
 
 

@@ -75,7 +75,10 @@ def standing(
 
 @jax.jit
 def _none_where(bad: Bool[Array, ""], block: Block | AsymmetricBlock) -> Block | AsymmetricBlock:
-    return jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), block)
+    # What is declared whole counts, or is a place among others.
+    return jax.tree.map(
+        lambda x: jnp.where(bad, jnp.nan, x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x, block
+    )
 
 
 def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Block | AsymmetricBlock:
