@@ -576,14 +576,6 @@ def bisected(function, lower, upper):
     return lower, upper
 
 
-def test_an_overturned_block_has_no_peak_to_differentiate():
-    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.ExponentialPulse(0.6, 0.8, -1.0), **QUICKLY)
-    assert bool(found.outcome.overturned) and not bool(found.valid)
-    assert np.all(np.isnan(found.max_rotation.elasticity)) and np.all(np.isfinite(found.margin.derivative))
-    assert found.max_rotation.status == rk.studies.SlopeStatus.missing and np.isnan(found.max_rotation.reach)
-    assert found.margin.status == rk.studies.SlopeStatus.useful
-
-
 def test_a_block_that_does_not_uplift_has_no_slopes():
     """Nor under a ground that does not move, in which there is no peak to scale."""
     still = rk.Record([0.0, 0.0, 0.0], 0.01)
@@ -648,6 +640,14 @@ def test_an_impact_at_the_end_of_the_motion():
 # ---- Sensitivities ----
 
 
+def test_an_overturned_block_has_no_peak_to_differentiate():
+    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.ExponentialPulse(0.6, 0.8, -1.0), **QUICKLY)
+    assert bool(found.outcome.overturned) and not bool(found.valid)
+    assert np.all(np.isnan(found.max_rotation.elasticity)) and np.all(np.isfinite(found.margin.derivative))
+    assert found.max_rotation.status == rk.studies.SlopeStatus.missing and np.isnan(found.max_rotation.reach)
+    assert found.margin.status == rk.studies.SlopeStatus.useful
+
+
 def test_sensitivity_of_a_scene():
     """Elasticities obey similarity, agree with the outcome's derivatives, and vanish with nothing to depend on."""
     pulse = rk.ExponentialPulse(0.3, 0.8, -1.0)
@@ -664,6 +664,16 @@ def test_sensitivity_of_a_scene():
     rotation = float(found.max_rotation.value) / 0.2
     assert named["shape"] == pytest.approx(float(exact[2]) * -1.0 / rotation, rel=1e-9)
     assert named["duration"] == pytest.approx(float(exact[1]) * 1.6 / rotation, rel=1e-9)
+
+
+def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
+    pulse = rk.ExponentialPulse(0.25, 0.5, -1.0)
+    alone, scaled, shifted = (
+        rk.studies.sensitivity(rk.Block(0.2, 2.0), each, **QUICKLY) for each in (pulse, 1.0 * pulse, pulse.shifted(0.0))
+    )
+    for each in (scaled, shifted):
+        np.testing.assert_allclose(each.condition, alone.condition, rtol=1e-9)
+        np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)
 
 
 TIME = np.arange(0, 60, 0.02)  # of records that share what is compiled
@@ -738,16 +748,6 @@ def test_sensitivity_map():
     np.testing.assert_allclose(
         found.sensitivity.max_rotation.elasticity[1, 1], single.max_rotation.elasticity, rtol=1e-9, atol=1e-12
     )
-
-
-def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
-    pulse = rk.ExponentialPulse(0.25, 0.5, -1.0)
-    alone, scaled, shifted = (
-        rk.studies.sensitivity(rk.Block(0.2, 2.0), each, **QUICKLY) for each in (pulse, 1.0 * pulse, pulse.shifted(0.0))
-    )
-    for each in (scaled, shifted):
-        np.testing.assert_allclose(each.condition, alone.condition, rtol=1e-9)
-        np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)
 
 
 WAVES = np.sin(0.3 * np.arange(70))
