@@ -21,6 +21,7 @@ from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
+_ARRAY = 2 * SMALL**2  # numbers of an array at most: Diffrax keeps two of seven stages in up to eight directions
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 WITH_PROGRAMS = {"while", "cond", "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"}
@@ -122,7 +123,7 @@ class Emitter:
         if isinstance(value, jax.core.Tracer):
             raise Unsupported("a number from outside")
         value = np.asarray(value, dtype)
-        if value.size > SMALL**2:
+        if value.size > _ARRAY:
             raise Unsupported("a large array in the program")
         return for_each(lambda x: self.constant(x, value.dtype), value if value.ndim else value[()])
 
@@ -170,7 +171,7 @@ class Emitter:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
             return [unboxed(of_memory(self, equation, *inputs))]
-        if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > SMALL**2:
+        if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > _ARRAY:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
             moved = MOVES[name](parameters, *map(boxed, inputs))
