@@ -32,6 +32,13 @@ def regions(surface):
     return rk.studies.overturning_borders(surface).regions
 
 
+@pytest.fixture(scope="module")
+def small():
+    """A map of two regions, whose borders take less than half as long; of as many points: one program."""
+    grid = np.linspace(2.5, 3.5, 5), np.linspace(1.02, 3.0, 3)
+    return rk.overturning_map(*grid, alpha=0.2, restitution=RESTITUTION, model=rk.Linear(), progress=False)
+
+
 def at(regions, ratio):
     """Lower and upper intensity of all regions that have a column there."""
     found = [
@@ -142,8 +149,10 @@ def test_maps_that_have_no_borders(surface, change):
         rk.studies.overturning_borders(dataclasses.replace(surface, **change))
 
 
-def test_map_with_borders(surface, regions):
-    axis = rk.plot.overturning(surface)
+def test_map_with_borders(small):
+    regions = rk.studies.overturning_borders(small).regions
+    assert len(regions) == 2
+    axis = rk.plot.overturning(small)
     rk.plot.sine_regions(RESTITUTION, axis, frequency_ratio=np.linspace(1, 5, 3))
     drawn = [line.get_ydata() for line in axis.lines[: 2 * len(regions)]]
     for region, lower, upper in zip(regions, drawn[::2], drawn[1::2]):
@@ -173,12 +182,12 @@ def test_columns_without_a_result_are_drawn_by_pixels(too_few_steps, caplog):
     assert "borders are left out" in caplog.text
 
 
-def test_columns_that_the_map_contradicts_are_crowded(surface):
+def test_columns_that_the_map_contradicts_are_crowded(small):
     """One point of the map has another verdict than the borders around it."""
-    assert not rk.studies.overturning_borders(surface).crowded.size
-    row, column = np.argwhere(np.asarray(surface.state) == 0)[0]
-    other = dataclasses.replace(surface, state=surface.state.at[row, column].set(2))
-    place = float(surface.frequency_ratio[column])
+    assert not rk.studies.overturning_borders(small).crowded.size
+    row, column = np.argwhere(np.asarray(small.state) == 0)[0]
+    other = dataclasses.replace(small, state=small.state.at[row, column].set(2))
+    place = float(small.frequency_ratio[column])
     crowded = rk.studies.overturning_borders(other).crowded
     assert crowded.size and (np.min(abs(crowded - place), axis=1) == 0).all()
 
@@ -193,22 +202,22 @@ def test_survivors_are_coloured_up_to_the_border(surface):
     assert beside.any() and np.isfinite(peaks[:, :-1][beside]).all()
 
 
-def test_borders_over_each_other(surface):
-    axis = rk.plot.borders(surface, by_strength=True, color="red", label="one")
+def test_borders_over_each_other(small):
+    axis = rk.plot.borders(small, by_strength=True, color="red", label="one")
     highest = max(np.nanmax(line.get_ydata()) for line in axis.lines)
     assert highest < 1 and [line.get_label() for line in axis.lines].count("one") == 1
     assert {line.get_color() for line in axis.lines} == {"red"}
     assert (axis.get_xlabel(), axis.get_ylabel()) == (r"frequency ratio $\omega/p$", "uplift strength")
-    assert rk.plot.borders(surface, scale=2.0).get_ylabel() == "intensity times 2"
+    assert rk.plot.borders(small, scale=2.0).get_ylabel() == "intensity times 2"
 
 
 @pytest.mark.parametrize(
     "draw, given", [(rk.plot.borders, {}), (rk.plot.overturning, {"exact": True}), (rk.plot.overturning, {})]
 )
-def test_progress_of_a_figure(surface, capsys, draw, given):
-    draw(surface, **given)
+def test_progress_of_a_figure(small, capsys, draw, given):
+    draw(small, **given)
     assert capsys.readouterr().err == ""
-    draw(surface, progress=True, **given)
+    draw(small, progress=True, **given)
     assert "borders" in capsys.readouterr().err
 
 

@@ -165,9 +165,13 @@ def test_arguments_out_of_range():
         rk.critical_amplitudes(rk.Block(np.full((2, 2), 0.2), 2.0), rk.SinePulse(1.0, 1.0))
 
 
+# Where neither model nor digits are the point all searches ask the same: they share what is compiled.
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=8)}
+
+
 def test_a_motion_too_weak_has_no_ends():
-    scene, engine = (rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.05), rk.Linear()), rk.Series(order=6)
-    found = rk.critical_amplitudes(*scene, intensity=(1.0, 1.5), engine=engine)
+    scene = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(1.0, 0.05)
+    found = rk.critical_amplitudes(*scene, intensity=(1.0, 1.5), **QUICK)
     assert found.count == 0 and np.isinf(found.lowest)
     assert found.value.shape == (0,) and found.derivative.shape == (0, 4)
 
@@ -234,29 +238,27 @@ def test_an_end_without_balance_has_no_derivatives():
 
 def test_the_amplitude_of_a_sum_is_its_own_peak():
     """Which is far below what its parts add up to, where they take from each other."""
-    block, shape = rk.Block(0.2, 2.0, 0.9), np.sin(6 * np.arange(0, 1.2, 0.01))
-    first, second = rk.Record(0.3 * shape, 0.01), rk.Record(0.25 * shape, 0.01)
-    asked = {"intensity": (1.0, 2.0), "derivatives": False, "progress": False}
-    found = rk.critical_amplitudes(block, first - second, **asked)
-    alone = rk.critical_amplitudes(block, rk.Record(0.05 * shape, 0.01), **asked)
-    assert alone.count == found.count == 1
+    block, first = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.3, 0.8)
+    asked = QUICK | {"intensity": (1.0, 8.0), "derivatives": False, "progress": False}
+    found = rk.critical_amplitudes(block, first + rk.SinePulse(-0.25, 0.8), **asked)
+    alone = rk.critical_amplitudes(block, rk.SinePulse(0.05, 0.8), **asked)
+    assert alone.count == found.count > 1
     np.testing.assert_allclose(found.value, alone.value, rtol=1e-12)
     np.testing.assert_allclose(found.intensity, alone.intensity, rtol=1e-12)
     with pytest.raises(ValueError, match="Argument `motion` must move the ground"):
-        rk.critical_amplitudes(block, first - first, **asked)
+        rk.critical_amplitudes(block, first + rk.SinePulse(-0.3, 0.8), **asked)
 
 
 def test_ends_of_a_sum_of_pulses_are_ends():
     """The verdict changes there, and derivatives are those of differences."""
-    block, how = rk.Block(0.2, 2.0, 0.9), {"model": rk.Linear(), "engine": rk.Series(order=8)}
-    asked = how | {"intensity": (4.0, 5.0), "progress": False}
+    block, asked = rk.Block(0.2, 2.0, 0.9), QUICK | {"intensity": (4.0, 5.0), "progress": False}
 
     def motion(amplitude):
         return rk.SinePulse(amplitude, 0.6) + rk.SinePulse(0.2, 0.3)
 
     found = rk.critical_amplitudes(block, motion(0.3), **asked)
     peak = rk.intensity.peak_acceleration(motion(0.3))
-    either = [rk.outcome(block, found.lowest * (1 + x) / peak * motion(0.3), **how).overturned for x in (-1e-6, 1e-6)]
+    either = [rk.outcome(block, found.lowest * (1 + x) / peak * motion(0.3), **QUICK).overturned for x in (-1e-6, 1e-6)]
     assert [bool(x) for x in either] == [False, True]
     ends = [rk.critical_amplitudes(block, motion(0.3 + x), **asked, derivatives=False).lowest for x in (-1e-5, 1e-5)]
     slope = found.derivative[int(np.argmin(found.value)), found.names.index("first.amplitude")]
@@ -265,9 +267,9 @@ def test_ends_of_a_sum_of_pulses_are_ends():
 
 def test_durations_of_a_block_of_two_sides():
     block, pulse = rk.blocks.AsymmetricBlock(0.2, 0.25, 2.0), rk.SinePulse(0.6, 1.0)
-    found = rk.studies.critical_durations(block, pulse, rk.Linear(), max_ends=1, derivatives=False, progress=False)
+    found = rk.studies.critical_durations(block, pulse, **QUICK, max_ends=1, derivatives=False, progress=False)
     verdicts = [
-        bool(rk.outcome(block, rk.SinePulse(0.6, float(found.value[0]) * share), rk.Linear()).overturned)
+        bool(rk.outcome(block, rk.SinePulse(0.6, float(found.value[0]) * share), **QUICK).overturned)
         for share in (1 - 1e-9, 1 + 1e-9)
     ]
     assert sorted(verdicts) == [False, True]
@@ -284,17 +286,17 @@ def test_durations_are_refused_of_models_that_know_p():
 def test_the_amplitude_of_what_is_made_of_a_pulse_is_its_peak():
     """Of Mavroeidis and Papageorgiou's pulse the bound that it tells lies a tenth above."""
     block, motion = rk.Block(0.2, 2.0), 1.0 * rk.MavroeidisPapageorgiouPulse(0.3, 1.0)
-    found = rk.critical_amplitudes(block, motion, rk.Linear(), max_ends=1, derivatives=False, progress=False)
+    found = rk.critical_amplitudes(block, motion, **QUICK, max_ends=1, derivatives=False, progress=False)
     factor = float(found.value[0] / rk.intensity.peak_acceleration(motion))
-    verdicts = [bool(rk.outcome(block, share * factor * motion, rk.Linear()).overturned) for share in (0.9999, 1.0001)]
+    verdicts = [bool(rk.outcome(block, share * factor * motion, **QUICK).overturned) for share in (0.9999, 1.0001)]
     assert sorted(verdicts) == [False, True]
 
 
 @pytest.mark.parametrize("most", [None, 2])
 def test_a_block_that_overturns_at_the_least_amplitude(most):
     """Its lowest end lies below what was looked at: no number, where infinity would say that it stands."""
-    block, pulse = rk.Block(0.15, 2.5), rk.SinePulse(1.0, 1.5)
-    asked = {"max_ends": most, "derivatives": False, "progress": False}
+    block, pulse = rk.Block(0.15, 2.5, 0.95), rk.SinePulse(1.0, 1.5)
+    asked = QUICK | {"max_ends": most, "derivatives": False, "progress": False}
     found = rk.critical_amplitudes(block, pulse, intensity=(3.0, 20.0), **asked)
     assert found.from_the_least and np.isnan(found.lowest)
     found = rk.critical_amplitudes(block, pulse, intensity=(1.0, 20.0), **asked)
@@ -304,7 +306,7 @@ def test_a_block_that_overturns_at_the_least_amplitude(most):
 def test_no_motion_is_unexceeded_where_the_least_topples_a_rock():
     rocks = rk.inverse.Observations([0.15, 0.2], [2.5, 2.0], ["survived"] * 2)
     found, below = (
-        rk.inverse.unexceeded_motion(rocks, rk.SinePulse, [0.6, 1.5], intensity=(low, 20.0), progress=False)
+        rk.inverse.unexceeded_motion(rocks, rk.SinePulse, [0.6, 1.5], intensity=(low, 20.0), progress=False, **QUICK)
         for low in (1.0, 3.0)
     )
     assert found.complete.all() and np.isfinite(found.amplitude).all()

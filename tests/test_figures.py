@@ -48,7 +48,7 @@ def test_a_tornado_is_of_one_scene():
 
 def test_a_tornado_of_a_block_that_overturns_says_so():
     """It was an empty frame."""
-    told = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.SinePulse(1.4, 0.9), rk.Linear())
+    told = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.SinePulse(1.4, 0.9), rk.Linear(), engine=rk.Series(order=6))
     with pytest.raises(ValueError, match="Argument `sensitivity` must have .* 'max_rotation', .*: draw its `margin`"):
         rk.plot.tornado(told)
     assert len(rk.plot.tornado(told, "margin").patches) == len(told.names)
@@ -332,7 +332,8 @@ def test_sizes_that_are_there_twice_are_shaded():
 
 def test_sizes_that_overturn_alone_are_shaded():
     """A spectrum's overturned sizes each have a cell, half way to their neighbours."""
-    spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), np.linspace(0.5, 8, 200), progress=False)
+    quick = {"engine": rk.Series(order=6), "progress": False}
+    spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), np.linspace(0.5, 8, 200), **quick)
     lost, places = np.asarray(spectrum.overturned), np.asarray(spectrum.abscissa)
     axis, _ = rk.plot.spectrum(spectrum)
     spans = sorted((patch.get_x(), patch.get_x() + patch.get_width()) for patch in axis.patches)
@@ -345,7 +346,7 @@ def test_sizes_that_overturn_alone_are_shaded():
 def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
     """Where exact borders take too long, and it is said; where they were asked for they are drawn."""
     monkeypatch.setattr("jaxrock.plot.surfaces._SCENES", 5000)
-    surface = rk.overturning_map(np.linspace(1, 8, 6), np.linspace(1.05, 9, 6), alpha=0.2, progress=False)
+    surface = rk.overturning_map(np.linspace(2.5, 3.5, 6), np.linspace(1.05, 3, 6), alpha=0.2, progress=False)
     with caplog.at_level("INFO", "jaxrock"):
         pixels = rk.plot.overturning(surface)
     assert "too many islands" in caplog.text and len(pixels.lines) == 0

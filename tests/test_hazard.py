@@ -823,24 +823,27 @@ def test_what_is_not_there(file):
         rk.hazard.read_hazard_curves("nowhere.csv")
 
 
+def probabilities(size, levels):
+    """By a fragility of each kind."""
+    lognormal = rk.hazard.LogNormalFragility(0.5 * size, 0.4)
+    table = rk.hazard.TabulatedFragility(jnp.array([0.1, 0.3]) * size, [0.0, 1.0])
+    surface = rk.hazard.SurfaceFragility(0.5 * jnp.asarray(size), jnp.asarray(0.0), jnp.asarray(0.4))
+    return jnp.stack([lognormal(levels), table(levels), surface(levels, 1.0)])
+
+
+WITH_SLOPES = jax.jit(lambda *x: (probabilities(*x), jax.jacfwd(probabilities)(*x), jax.jacrev(probabilities)(*x)))
+
+
 @pytest.mark.parametrize("level, probability", [(0.0, 0.0), (np.inf, 1.0)])
 def test_slopes_at_the_ends_of_all_levels(level, probability):
     """None, and no NaN, which would spoil the slopes of all other levels."""
-
-    def probabilities(size):
-        lognormal = rk.hazard.LogNormalFragility(0.5 * size, 0.4)
-        table = rk.hazard.TabulatedFragility(jnp.array([0.1, 0.3]) * size, [0.0, 1.0])
-        levels = jnp.array([level, 0.2])
-        surface = rk.hazard.SurfaceFragility(0.5 * jnp.asarray(size), jnp.asarray(0.0), jnp.asarray(0.4))
-        return jnp.stack([lognormal(levels), table(levels), surface(levels, 1.0)])
-
-    values, slopes = probabilities(1.0), jax.jacfwd(probabilities)(1.0)
+    levels = np.array([level, 0.2])
+    values, forward, reverse = WITH_SLOPES(1.0, levels)
     np.testing.assert_allclose(values[:, 0], probability, atol=0)
-    np.testing.assert_allclose(slopes[:, 0], 0, atol=0)
-    np.testing.assert_allclose(
-        slopes[:, 1], (probabilities(1 + 1e-6) - probabilities(1 - 1e-6))[:, 1] / 2e-6, rtol=1e-6
-    )
-    np.testing.assert_allclose(jax.jacrev(probabilities)(1.0), slopes, rtol=1e-12)
+    np.testing.assert_allclose(forward[:, 0], 0, atol=0)
+    above, below = (WITH_SLOPES(1.0 + step, levels)[0] for step in (1e-6, -1e-6))
+    np.testing.assert_allclose(forward[:, 1], (above - below)[:, 1] / 2e-6, rtol=1e-6)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
 def test_slopes_where_a_knot_is_a_level_of_the_curve():
@@ -854,13 +857,15 @@ def test_slopes_where_a_knot_is_a_level_of_the_curve():
     def closed(median):
         return jnp.exp(-1000 * rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(median, 0.35), curve))
 
-    np.testing.assert_allclose(jax.grad(survival)(0.4), jax.grad(closed)(0.4), rtol=1e-9)
-    np.testing.assert_allclose(jax.hessian(survival)(0.4), jax.hessian(closed)(0.4), rtol=1e-8)
+    first, second = jax.jit(lambda x: [[d(f)(x) for f in (survival, closed)] for d in (jax.grad, jax.hessian)])(0.4)
+    np.testing.assert_allclose(*first, rtol=1e-9)
+    np.testing.assert_allclose(*second, rtol=1e-8)
 
     def rate(levels):
         return rk.hazard.toppling_rate(rk.hazard.TabulatedFragility(levels, [0.0, 0.2, 0.6, 1.0]), curve)
 
+    with_slopes = jax.jit(jax.value_and_grad(rate))
     for i in (1, 2):
-        step = 1e-6 * jnp.eye(4)[i]
-        difference = (rate(levels + step) - rate(levels - step)) / 2e-6
-        np.testing.assert_allclose(jax.grad(rate)(levels)[i], difference, rtol=1e-5)
+        step = 1e-6 * np.eye(4)[i]
+        difference = (with_slopes(levels + step)[0] - with_slopes(levels - step)[0]) / 2e-6
+        np.testing.assert_allclose(with_slopes(levels)[1][i], difference, rtol=1e-5)

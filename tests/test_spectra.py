@@ -272,10 +272,12 @@ def test_maps_go_through_forward_mode():
         )
         return found.margin[0, 0]
 
-    duration, shape = 1.5, 0.5
-    wall, by_both = jax.jit(jax.value_and_grad(single_lobe.safety_wall, argnums=(0, 1)))(duration, shape)
-    slopes = np.asarray(jax.jit(jax.jacfwd(margin))(np.array([float(wall) + 1e-9, duration, shape])))
-    np.testing.assert_allclose(-slopes[1:] / slopes[0], by_both, rtol=1e-6)
+    duration, shape, step = 1.5, 0.5, 1e-5
+    places = np.array([duration, shape]) + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    as_above = np.resize(places, (SHAPES.size, STRENGTHS.size, DURATIONS.size, 2))  # one program
+    wall = np.ravel(single_lobe.safety_wall(as_above[..., 0], as_above[..., 1]))[:5]
+    slopes = np.asarray(jax.jit(jax.jacfwd(margin))(np.array([wall[0] + 1e-9, duration, shape])))
+    np.testing.assert_allclose(-slopes[1:] / slopes[0], (wall[1::2] - wall[2::2]) / (2 * step), rtol=1e-6)
 
 
 def test_borders_cannot_be_traced():
@@ -305,15 +307,15 @@ def test_slopes_beside_a_point_that_overturns():
     motion, periods = 0.9 * rk.SinePulse(0.5, 0.9), jnp.array([2.0, 4.5])
 
     def peaks(alpha):
-        spectrum = rk.rocking_spectrum(alpha, motion, periods, progress=False)
-        surface = rk.overturning_map([2.0, 4.0], [1.2, 3.0], alpha=alpha, progress=False)
+        spectrum = rk.rocking_spectrum(alpha, motion, periods, **QUICK)
+        surface = rk.overturning_map([2.0, 4.0], [1.2, 3.0], alpha=alpha, **QUICK)
         return jnp.concatenate([spectrum.max_rotation, spectrum.max_velocity, surface.max_rotation.ravel()])
 
     at = 0.3
     found, lost = peaks(at), jnp.isinf(peaks(at))
     assert lost.any() and not lost.all()
     differences = (peaks(at + 1e-6) - peaks(at - 1e-6)) / 2e-6
-    for slopes in (jax.jacfwd(peaks)(at), jax.jacrev(peaks)(at)):
+    for slopes in jax.jit(lambda alpha: (jax.jacfwd(peaks)(alpha), jax.jacrev(peaks)(alpha)))(at):
         np.testing.assert_allclose(slopes, jnp.where(jnp.isinf(found), 0.0, differences), rtol=1e-6, atol=1e-7)
 
 

@@ -206,10 +206,11 @@ def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Arr
     return jax.vmap(one)(jnp.arange(size))
 
 
-@eqx.filter_jit
-def _units(kind: AbstractVaried, both: PyTree, size: int) -> Array:
-    """What the factors multiply in so many scenes."""
-    return jax.vmap(lambda index: kind.unit(*one_of_many(both, index)))(jnp.arange(size))
+def _names(both: PyTree) -> list[str]:
+    """Of the parameters of a scene, in the order of `named`; the peak of a sum is not computed for it."""
+    found = []
+    jax.eval_shape(lambda both: found.extend(named(*one_of_many(both, 0))), both)
+    return found
 
 
 # Of many scenes: what is asked of one point.
@@ -240,7 +241,7 @@ def _critical(
             "Argument `max_ends` must be given where arguments are traced (jax.jit, jax.vmap, a derivative): the "
             "number of ends is not known before."
         )
-    names = tuple(name for name in named(*one_of_many(scenes.both, 0)) if kind.keeps(name))
+    names = tuple(filter(kind.keeps, _names(scenes.both)))
     wanted = names if derivatives is None and known or derivatives else ()
     rows = (
         _all(scenes, grid, kind, wanted, progress)
@@ -272,7 +273,7 @@ def _all(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...], pr
     told["complete"][ends["index"][~ends["known"]]] = False
     order = np.lexsort((ends["z"], ends["index"]))
     ends = {name: values[order] for name, values in ends.items()}
-    units = _units(kind, scenes.both, grid.shape[0])
+    units = kind.units(scenes.both, scenes.amplitude)
     units, threshold, amplitude = (np.asarray(x)[ends["index"]] for x in (units, scenes.threshold, scenes.amplitude))
     value = np.exp(ends["z"]) * units
     rows = {"value": value, "intensity": kind.amplitude(value, amplitude) / threshold}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrock._checks import is_traced
-from jaxrock._parameters import is_ours
+from jaxrock._parameters import is_ours, one_of_many
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -34,6 +34,10 @@ class AbstractVaried(eqx.Module):
     @abc.abstractmethod
     def unit(self, block, motion):
         """What the factor multiplies."""
+
+    @abc.abstractmethod
+    def units(self, both, amplitude):
+        """What the factors multiply in many scenes, block and motion of arrays, of known amplitudes."""
 
     @abc.abstractmethod
     def amplitude(self, value, own):
@@ -84,6 +88,10 @@ class Amplitude(AbstractVaried):
         """What the factor multiplies: the amplitude [g]."""
         return jnp.abs(named(block, motion)["amplitude"])
 
+    def units(self, both, amplitude):
+        """What the factors multiply in many scenes: their amplitudes [g]."""
+        return amplitude
+
     def amplitude(self, value, own):
         """Of the motion at a critical value, where its own is given [g]."""
         return value
@@ -104,6 +112,10 @@ class Duration(AbstractVaried):
         """What the factor multiplies: the duration of the motion [s]."""
         return motion.end
 
+    def units(self, both, amplitude):
+        """What the factors multiply in many scenes: the durations of their motions [s]."""
+        return _ends(both, amplitude.size)
+
     def amplitude(self, value, own):
         """Of the motion at a critical value, where its own is given [g]."""
         return own
@@ -111,6 +123,12 @@ class Duration(AbstractVaried):
     def keeps(self, name: str) -> bool:
         """Whether the critical value depends on a parameter."""
         return name not in ("duration", "period", "dt")
+
+
+@eqx.filter_jit
+def _ends(both, size: int):
+    """Of the motions of so many scenes."""
+    return jax.vmap(lambda index: one_of_many(both, index)[1].end)(jnp.arange(size))
 
 
 def faster(block: Block | AsymmetricBlock, factor) -> Block | AsymmetricBlock:
