@@ -123,7 +123,7 @@ def test_a_stout_block_has_no_balance():
             ask(rk.Block(0.8, 1.0), rk.SinePulse(2.0, 0.6), spring)
         with pytest.raises(ValueError, match="Argument `block.alpha2` must be below pi/4 .* but is 0.8"):
             ask(rk.blocks.AsymmetricBlock(0.5, 0.8, 1.0), rk.SinePulse(2.0, 0.6), spring)
-    found = rk.outcome(rk.Block(0.8, 1.0), rk.SinePulse(2.0, 0.6), spring, engine=rk.Series(order=6), throw=False)
+    found = rk.outcome(rk.Block(0.8, 1.0), rk.SinePulse(2.0, 0.6), spring, throw=False)
     assert found.status == rk.Status.not_finite and np.isnan(found.max_rotation)
 
 
@@ -247,8 +247,7 @@ def test_energy_between_impacts(spring):
     alpha, e, p = 0.4, 0.8, 2.0
     block, model = rk.Block(alpha, p, e), rk.Spring(*spring)
     moment = MOMENTS[spring]
-    engine, still = rk.Series(order=8), rk.Record([0.0], 0.1)
-    release = lambda speed: rk.simulate(block, still, model, initial=(0.0, speed), duration=8.0, engine=engine)
+    release = lambda speed: rk.simulate(block, rk.Record([0.0], 0.1), model, initial=(0.0, speed), duration=8.0)
     over = float(
         mpmath.sqrt(2 * mpmath.quad(lambda x: moment(x, alpha, mpmath), [0, float(model.moments(block).saddle)]))
     )
