@@ -182,7 +182,7 @@ def test_walls_of_the_pulse_in_220_digits(i):
 def test_walls_of_spikes(name, time, duration, shape):
     """Where e^-shape is lost beside 1: in double, and in single precision."""
     function = getattr(single_lobe, name)
-    found, slope = map(float, jax.jvp(lambda shape: function(duration, shape), (shape,), (1.0,)))
+    found, slope = map(float, jax.value_and_grad(function, 1)(duration, shape))
     in_single = function(np.float32(duration), np.float32(shape))
     assert in_single.dtype == np.float32
     with mp.workdps(400):
