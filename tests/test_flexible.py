@@ -107,9 +107,8 @@ def test_undamped_columns_in_single_precision():
 
 
 def test_no_verdict_is_given_while_the_ground_shakes():
-    """A base that is far beyond its balance; the ground, which still shakes a little, might bring it back."""
-    block = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02, masses=3)
-    motion = rk.RectangularPulse(0.6, 0.9) + rk.SinePulse(0.01, 3.0)
+    """A base that is far beyond its balance; the ground, which still shakes, might bring it back."""
+    block, motion = rk.blocks.FlexibleBlock(0.5, 3.0, 3e9, 2000.0, 0.02), rk.SinePulse(1.5, 3.0)
     for duration in (0.5, 0.8):
         found = rk.outcome(block, motion, duration=duration)
         assert found.status == rk.Status.undecided and found.margin < 0 and found.energy > 10
@@ -431,10 +430,11 @@ def test_neighbours_answer_alike():
 
     Of these one in sixty had a peak that was 3e-8 of it too large, where such a piece was taken for one of a second.
     """
-    block, near = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02), jnp.linspace(-5e-14, 5e-14, 401)
-    found = jax.jit(jax.vmap(lambda a: rk.outcome(block, rk.SinePulse(a, 0.8))))(0.266 * (1 + near))
-    assert np.ptp(found.max_rotation) < 1e-12 * found.max_rotation[0]
-    assert np.ptp(found.energy) < 1e-10 and (found.status == rk.Status.successful).all()
+    block, near = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02), np.linspace(-5e-14, 5e-14, 201)
+    found = [rk.outcome(block, rk.SinePulse(0.266 * (1 + x), 0.8)) for x in near]  # one by one: compiled above
+    peaks, energies = np.array([(float(each.max_rotation), float(each.energy)) for each in found]).T
+    assert np.ptp(peaks) < 1e-12 * peaks[0]
+    assert np.ptp(energies) < 1e-10 and all(each.status == rk.Status.successful for each in found)
 
 
 @pytest.mark.slow

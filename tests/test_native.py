@@ -677,6 +677,7 @@ def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), model=rk.Housner(), **settin
 
 SHORT_SERIES = {"engine": rk.Series(order=6)}  # of the same operations, and compiled in half the time
 PULSE, SHORT = rk.SinePulse(0.4, 0.8), rk.Record(rk.example_record().samples[500:2500], 0.005)
+STRONGEST = rk.Record(rk.example_record().samples[256:656], 0.005)
 SCENES = {
     "value": lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin,
     "derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0)).margin, (0, 1)),
@@ -686,7 +687,7 @@ SCENES = {
     "a scaled record": lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin,
     "its derivatives": jax.grad(lambda a, u: rk.outcome(rk.Block(a, 2.0), u * rk.example_record()).margin, (0, 1)),
     "two records": lambda a, u: (
-        rk.outcome(rk.Block(a, 2.0), u * SHORT + SHORT.shifted(0.3), rk.Linear(), **SHORT_SERIES).margin
+        rk.outcome(rk.Block(a, 2.0), u * STRONGEST + STRONGEST.shifted(0.3), rk.Linear(), **SHORT_SERIES).margin
     ),
     "vertical records": lambda a, u: rk.outcome(rk.Block(a, 2.0), (u * SHORT).with_vertical(0.3 * SHORT)).margin,
     "two sides, vertical": lambda a, u: (
@@ -816,7 +817,7 @@ def test_a_record_of_one_sample_beside_a_longer_one(caplog):
     both = record + rk.Record([0.1], 0.02)
     scales = jnp.linspace(0.7, 1.3, 65)
     found, alone = (
-        jax.vmap(lambda s, m=m: rk.outcome(rk.Block(0.15, 2.5), s * m, rk.Linear()).margin)(scales)
+        jax.vmap(lambda s, m=m: rk.outcome(rk.Block(0.15, 2.5), s * m, rk.Linear(), **SHORT_SERIES).margin)(scales)
         for m in (both, record)
     )
     np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
