@@ -95,7 +95,7 @@ class _Run:
         if name == "while":
             return self._loop(equation, given)
         if name == "scan" and _is_short(parameters["length"], parameters["jaxpr"]):
-            return self._scan(parameters, given)
+            return self._scan(equation, given)
         if "callback" in name:  # which another library may have put where it is hardly ever called
             raise Unsupported(f"operation {name}")
         if name in NOTHING:
@@ -138,9 +138,11 @@ class _Run:
 
         return _traced(run, program)
 
-    def _scan(self, parameters: dict, given: list) -> list:
+    def _scan(self, equation, given: list) -> list:
         """A loop over the rows of arrays, unrolled."""
-        consts, carried, length = parameters["num_consts"], parameters["num_carry"], parameters["length"]
+        parameters, length = equation.params, equation.params["length"]
+        carried = _alike(equation.outvars, parameters["jaxpr"].out_avals)
+        consts = _alike(equation.invars, parameters["jaxpr"].in_avals) - carried
         fixed, carry, lists = given[:consts], given[consts : consts + carried], given[consts + carried :]
         rows = []
         for turn in range(length):
@@ -186,6 +188,12 @@ class _Run:
         }
         found = self._bound(equation, [*of_cond, *of_body, *carry], changed)
         return [x if y is None else y for x, y in zip(found, same)]
+
+
+def _alike(variables: Sequence, of_one: Sequence) -> int:
+    """How many arrays around a scan are as within: what is constant or carried; of the others it takes, or makes, a row
+    at a time. (How JAX tells it differs from version to version.)"""
+    return sum(len(v.aval.shape) == len(x.shape) for v, x in zip(variables, of_one, strict=True))
 
 
 def _needs(program: ClosedJaxpr) -> list[bool]:
