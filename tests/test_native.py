@@ -72,6 +72,22 @@ def test_a_number_of_a_few():
     agree(lambda i, x: [x[i], jax.lax.clamp(-0.5, x[0], 0.5)], np.array([-9, 0, 1, 2, 9]), np.eye(5, 3) - 0.7)
 
 
+def test_polynomials_of_jax():
+    """Single operations since JAX 0.12, of a name that one of ours had."""
+
+    def horner(x, coefficients):
+        return functools.reduce(lambda found, each: found * x + each, coefficients[::-1])
+
+    of_jax = getattr(jax.lax, "polynomial", horner)
+    x, numbers = np.linspace(-2, 2, 9), np.array([1.5, -0.25, 3.0])
+    agree(
+        lambda x, c: [of_jax(x, [0.5, c[0], c[1], c[2]]), of_jax(x, [c, 2 * c])],
+        x,
+        np.tile(numbers, (9, 1)),
+        rtol=1e-14,
+    )
+
+
 REAL = {
     "sum": lambda x, y: x + y,
     "difference": lambda x, y: x - y,

@@ -226,6 +226,14 @@ def _by(function: Callable):
     return operation
 
 
+def _polynomial(e, equation, x, *coefficients):
+    """Of JAX 0.12 and later, where interpolants are made of it: from the lowest degree on."""
+    *lower, found = coefficients
+    for each in reversed(lower):
+        found = OPERATIONS["add"](e, equation, OPERATIONS["mul"](e, equation, found, x), each)
+    return found
+
+
 def _logarithm_of_any(x):
     inside = jnp.where(x > 0, jnp.where(x < jnp.inf, logarithm(x), jnp.inf), -jnp.inf)
     return jnp.where(x >= 0, inside, jnp.nan)
@@ -247,6 +255,7 @@ OPERATIONS: dict[str, Callable] = {
     "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
     "integer_pow": _power,
     "pow": _any_power,
+    "polynomial": _polynomial,
     "nextafter": _next,
     "sqrt": lambda e, _, x: e.intrinsic("sqrt", x),
     "rsqrt": lambda e, q, x: e.b.fdiv(e.constant(1, q.invars[0].aval.dtype), e.intrinsic("sqrt", x)),

@@ -22,7 +22,7 @@ _OPERATIONS: dict[str, "Compound"] = {}  # by the names of their primitives: set
 class Compound:
     """A function `function(*numbers, **settings)` that returns a list of numbers, as a single operation of JAX.
 
-    - `name`: of that operation, of which there is one.
+    - `name`: of that operation, of which there is one (behind `compound_`).
     - `function`: of arrays that fit each other's shapes, in operations that work on each of their numbers; settings are
       hashable.
     - `change`: of the operation, numbers, their changes (`Zero` where there is none) and the settings: results and
@@ -32,6 +32,8 @@ class Compound:
 
     def __init__(self, name: str, function: Callable, change: Callable | None = None, results: int | Callable = 1):
         self._function, self._change, self._results = function, change, results
+        # JAX 0.12 has a `polynomial` of its own: in programs they are told by their names.
+        name = f"compound_{name}"
         self._primitive = primitive = Primitive(name)
         primitive.multiple_results = True
         primitive.def_impl(self._alone)
