@@ -122,7 +122,7 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
 def all_moving(state: State, scene: Scene) -> State:
     """The state; where any number of the scene moves, so does all that moves later. Or else JAX would trace the loop
     over all steps twice when it differentiates it: as what moves at first has it, and as what comes to move on the
-    way, which is a sixth of the time of a first Hessian."""
+    way."""
     path = [getattr(state, name) for name in _MOVES]
     numbers = [x for x in jax.tree.leaves(scene) if not jnp.shape(x)]
     return replace(state, **dict(zip(_MOVES, given(_all_move, path, (path, numbers)))))
