@@ -480,7 +480,8 @@ def test_a_history_as_long_as_its_record_tells_the_verdict(samples, dt):
     """The last step of such records is longer than what is left of the duration, by a rounding: the free stage was left
     out, and a block that is thrown down was safe."""
     record = rk.Record(np.full(samples, 3.0), dt)
-    for duration in (dt * (samples - 1), float(record.end), np.nextafter(float(record.end), 1.0)):
+    end = float(record.end)
+    for duration in (dt * (samples - 1), end, np.nextafter(end, 1.0), np.nextafter(end, 0.0)):
         found = rk.simulate(rk.Block(0.2, 2.0), record, rk.Linear(), duration=duration, samples=2, engine=SHORT)
         assert bool(found.overturned) and float(found.margin) < 0 and found.status == rk.Status.successful
 
