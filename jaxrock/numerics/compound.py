@@ -31,7 +31,7 @@ class Compound:
     """
 
     def __init__(self, name: str, function: Callable, change: Callable | None = None, results: int | Callable = 1):
-        self._function, self._change, self._results = function, change, results
+        self._function, self.change, self._results = function, change, results
         # JAX 0.12 has a `polynomial` of its own: in programs they are told by their names.
         name = f"compound_{name}"
         self._primitive = primitive = Primitive(name)
@@ -72,8 +72,8 @@ class Compound:
         return of
 
     def _pushed(self, numbers, changes, **settings):
-        if self._change is not None:
-            return self._change(self, numbers, changes, **settings)
+        if self.change is not None:
+            return self.change(self, numbers, changes, **settings)
         moves = [type(d) is not Zero for d in changes]
         moving, moved = ([x for x, move in zip(each, moves) if move] for each in (numbers, changes))
         return jax.jvp(self._of_some(numbers, moves, settings), moving, moved)
@@ -94,6 +94,22 @@ def _compiled(primitive: Primitive, settings: tuple) -> Callable:
 def is_compound(name: str) -> bool:
     """Whether a primitive of this name consists of others."""
     return name in _OPERATIONS
+
+
+def changed(name: str, numbers: list, changes: list, settings: dict, through: Callable) -> tuple[list, list]:
+    """The results of an operation, and their changes, of single numbers whose changes (None: there is none) may have
+    one more axis; `through(program, numbers, changes)` goes through what has no rule of its own."""
+    operation = _OPERATIONS[name]
+    if operation.change is None:
+        return through(written(name, numbers, settings), numbers, changes)
+    told = [Zero(jax.typeof(x).to_tangent_aval()) if d is None else d for x, d in zip(numbers, changes)]
+    values, found = operation.change(operation, numbers, told, **settings)
+    return values, [None if type(d) is Zero else d for d in found]
+
+
+def of_all(change, value):
+    """A change as large as its value, or with one more axis than that."""
+    return jnp.broadcast_to(change, jnp.broadcast_shapes(jnp.shape(change), value.shape))
 
 
 def written(name: str, operands: list, settings: dict) -> ClosedJaxpr:

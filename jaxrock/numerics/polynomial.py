@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.compound import Compound, Zero
+from jaxrock.numerics.compound import Compound, Zero, of_all
 from jaxrock.numerics.given import given, is_zero
 from jaxrock.numerics.xla_cpu import keep
 
@@ -60,7 +60,7 @@ def _polynomial_changed(polynomial, numbers, changes, derivatives: int):
         own = polynomial(x, *others, derivatives=derivatives)
         change = own if still else [a + b for a, b in zip(change, own)]
     values = values[: derivatives + 1]
-    return values, [jnp.broadcast_to(d, value.shape) for d, value in zip(change, values)]
+    return values, [of_all(d, value) for d, value in zip(change, values)]
 
 
 polynomial = Compound("polynomial", _polynomial, _polynomial_changed, lambda _, derivatives: derivatives + 1)
@@ -90,7 +90,7 @@ def _sum_of_products_changed(operation, numbers, changes):
         pairs = [(changes[here + k], numbers[there + k]) for k in range(half) if type(changes[here + k]) is not Zero]
         moved += operation(*(x for x, _ in pairs), *(y for _, y in pairs)) if pairs else []
     (value,) = operation(*numbers)
-    return [value], [jnp.broadcast_to(sum(moved[1:], start=moved[0]), value.shape)]
+    return [value], [of_all(sum(moved[1:], start=moved[0]), value)]
 
 
 _products = Compound("sum_of_products", _sum_of_products, _sum_of_products_changed)

@@ -1,7 +1,6 @@
 """Derivatives of a recipe, as recipes: value and Jacobian by all that moves, value and change in one direction or in a
 few, and the transpose of that change."""
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock.transforms.pushforward import pushed
 from jaxrock.transforms.recipe import Recipe
 
 
@@ -39,13 +39,12 @@ def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
     moving = _moving(recipe.like, moves)
 
     def both(leaves):
-        pushed = functools.partial(_pushed, recipe, moves, leaves)
         directions = directions_of(_moving(leaves, moves))
-        if len(directions[0]) == 1:  # to trace it under `jax.vmap`, too, takes twice as long
-            value, tangents = pushed(*(x[0] for x in directions))
+        if len(directions[0]) == 1:  # arrays of one number would be for nothing
+            value, tangents = pushed(recipe.program, leaves, moves, [x[0] for x in directions], None)
             tangents = [x[None] for x in tangents]
         else:
-            value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions)
+            value, tangents = pushed(recipe.program, leaves, moves, directions, len(directions[0]))
         columns = [columns_of(*pair, moving) for pair in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
 
@@ -60,7 +59,7 @@ def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
     def both(leaves):
         own, direction = leaves[: len(moves)], leaves[len(moves) :]
-        value, tangents = _pushed(recipe, moves, own, *direction)
+        value, tangents = pushed(recipe.program, own, moves, direction, None)
         changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
 
@@ -74,8 +73,7 @@ def _with_changes(recipe: Recipe, moves: tuple[bool, ...], count: int) -> Recipe
 
     def both(leaves):
         own, directions = leaves[: len(moves)], leaves[len(moves) :]
-        pushed = functools.partial(_pushed, recipe, moves, own)
-        value, tangents = jax.vmap(pushed, out_axes=(None, 0))(*directions)
+        value, tangents = pushed(recipe.program, own, moves, directions, count)
         changes = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), changes
 
@@ -133,11 +131,6 @@ def _of_moving(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence) -> Cal
         return recipe([next(rest) if move else x for x, move in zip(leaves, moves)])
 
     return function
-
-
-def _pushed(recipe: Recipe, moves: tuple[bool, ...], leaves: Sequence, *direction: Any) -> tuple[list, list]:
-    """The recipe's leaves, and their change in a direction."""
-    return jax.jvp(_of_moving(recipe, moves, leaves), (_moving(leaves, moves),), (list(direction),))
 
 
 def directions_of(moving: Sequence) -> list:

@@ -1,0 +1,111 @@
+"""Derivatives of single operations of JAX, as a program of one scene consists of them.
+
+Of operations on numbers the partial derivatives by each operand (`PARTIALS`), of those that move numbers about what
+they do to changes that have one more axis, in front (`MOVED`). Of what is in neither, JAX's own rules are asked for.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax import lax
+
+# Of a partial derivative that is one, or minus one: the change itself.
+ONE, MINUS_ONE = object(), object()
+
+
+def number(like, value):
+    """A number of the type of others, which JAX writes into a program as it is."""
+    return np.asarray(value, like.dtype)[()]
+
+
+def _chosen(flag, one, other, like):
+    """One of two numbers where a flag is set, the other elsewhere, in the shape of others."""
+
+    def filled(x):
+        return x if not isinstance(x, float) else lax.full_like(like, x) if like.shape else number(like, x)
+
+    return lax.select_n(flag, filled(other), filled(one))
+
+
+def _share(z, own, other):
+    """Of a maximum or minimum z: one for the operand that it is, a half where both are."""
+    return _chosen(lax.eq(own, z), _chosen(lax.eq(other, z), 0.5, 1.0, z), 0.0, z)
+
+
+def _power(parameters, z, x):
+    n = parameters["y"]
+    return lax.mul(number(x, n), x if n == 2 else lax.integer_pow(x, n - 1))
+
+
+def _reciprocal(x):
+    return lax.div(number(x, 1.0), x)
+
+
+def _one_less_square(x):
+    return lax.mul(lax.sub(number(x, 1.0), x), lax.add(number(x, 1.0), x))
+
+
+# By the name of the operation: a function of its parameters, its result and its operands for each operand.
+PARTIALS: dict[str, tuple] = {
+    "add": (ONE, ONE),
+    "add_any": (ONE, ONE),
+    "sub": (ONE, MINUS_ONE),
+    "neg": (MINUS_ONE,),
+    "copy": (ONE,),
+    "mul": (lambda _, z, x, y: y, lambda _, z, x, y: x),
+    "div": (lambda _, z, x, y: _reciprocal(y), lambda _, z, x, y: lax.neg(lax.div(z, y))),
+    "max": (lambda _, z, x, y: _share(z, x, y), lambda _, z, x, y: _share(z, y, x)),
+    "min": (lambda _, z, x, y: _share(z, x, y), lambda _, z, x, y: _share(z, y, x)),
+    "abs": (lambda _, z, x: _chosen(lax.ge(x, number(x, 0.0)), 1.0, -1.0, x),),  # as JAX has it at zero
+    "square": (lambda _, z, x: lax.mul(number(x, 2.0), x),),
+    "integer_pow": (_power,),
+    "sqrt": (lambda _, z, x: lax.div(number(z, 0.5), z),),
+    "exp": (lambda _, z, x: z,),
+    "log": (lambda _, z, x: _reciprocal(x),),
+    "sin": (lambda _, z, x: lax.cos(x),),
+    "cos": (lambda _, z, x: lax.neg(lax.sin(x)),),
+    "tan": (lambda _, z, x: lax.add(number(z, 1.0), lax.square(z)),),
+    "tanh": (lambda _, z, x: _one_less_square(z),),
+    "asin": (lambda _, z, x: _reciprocal(lax.sqrt(_one_less_square(x))),),
+}
+
+
+def _behind(places: Any) -> tuple:
+    """Axes, where there is one more in front."""
+    return tuple(place + 1 for place in places)
+
+
+def _sliced(d, parameters):
+    strides = parameters["strides"]
+    return lax.slice(
+        d,
+        (0, *parameters["start_indices"]),
+        (d.shape[0], *parameters["limit_indices"]),
+        None if strides is None else (1, *strides),
+    )
+
+
+def _broadcast(d, parameters):
+    axes = 0, *_behind(parameters["broadcast_dimensions"])
+    return lax.broadcast_in_dim(d, (d.shape[0], *parameters["shape"]), axes)
+
+
+# By the name of the operation, of one operand: a function of the change, with an axis in front, and its parameters.
+MOVED: dict[str, Callable] = {
+    "slice": _sliced,
+    "squeeze": lambda d, parameters: lax.squeeze(d, _behind(parameters["dimensions"])),
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda d, parameters: lax.reshape(d, (d.shape[0], *parameters["new_sizes"])),
+    "convert_element_type": lambda d, parameters: lax.convert_element_type(d, parameters["new_dtype"]),
+    "reduce_sum": lambda d, parameters: d.sum(_behind(parameters["axes"])),
+}
+
+# What has no derivatives, whatever its operands' are (beside all that tells no real numbers).
+STILL = {"stop_gradient", "fixed", "floor", "ceil", "round", "sign", "nextafter", "unseen_one"}
+
+# By the name of the operation: the operands by which it has derivatives, of its parameters and all of them.
+OF_SOME: dict[str, Callable] = {
+    "given": lambda parameters, operands: operands[parameters["structures"][0].num_leaves :],
+    "keep": lambda parameters, operands: operands[:1],
+}

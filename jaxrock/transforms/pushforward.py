@@ -1,0 +1,232 @@
+"""Forward mode of a program, written as one program: its values, and their changes in a few directions at once.
+
+`jax.vmap` of `jax.jvp` does the same, and takes a few times as long to trace: both go through every loop and every case
+of a condition until they know which of its numbers change, and once more to write that. Here it is told beforehand,
+without tracing (`_which_move`), and the operations that a scene consists of have their rules in `partials`. All others,
+such as those of users' own functions, are left to JAX, one by one.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
+
+from jaxrock.numerics.compound import changed, is_compound
+from jaxrock.transforms.partials import MINUS_ONE, MOVED, OF_SOME, ONE, PARTIALS, STILL, number
+
+_WITHIN = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # programs that only stand there, and where
+
+
+def pushed(
+    program: ClosedJaxpr, values: Sequence, moves: Sequence[bool], directions: Sequence, count: int | None
+) -> tuple[list, list]:
+    """What a program makes of values, and how that changes where those that move do, in `directions`: so many, in a
+    leading axis; None: one, without. Of what does not change, and of integers, the changes are zeros."""
+    pushing = _Pushing(count)
+    values, changes = pushing.through(program, list(values), _spread(directions, moves))
+    return values, [pushing.given(x, d) for x, d in zip(values, changes)]
+
+
+class _Pushing:
+    """Changes are None where there is none, and else arrays with `count` directions in a leading axis (None: without
+    one, of one direction)."""
+
+    def __init__(self, count: int | None):
+        self.count = count
+        self.axis = () if count is None else (count,)
+
+    def given(self, x, change):
+        """A change, zeros if there is none."""
+        return lax.full((*self.axis, *np.shape(x)), 0, x.dtype) if change is None else change
+
+    def through(self, program, values: list, changes: list) -> tuple[list, list]:
+        """Values and changes of the results of a program (closed)."""
+        jaxpr = program.jaxpr
+        known, moved = dict(zip(jaxpr.constvars, program.consts)), {}
+        _note(known, moved, jaxpr.invars, values, changes)
+
+        def read(x):
+            return number(x.aval, x.val) if isinstance(x, Literal) else known[x]
+
+        def change(x):
+            return None if isinstance(x, Literal) else moved.get(x)
+
+        for equation in jaxpr.eqns:
+            found = self.of(equation, [read(x) for x in equation.invars], [change(x) for x in equation.invars])
+            _note(known, moved, equation.outvars, *found)
+        return [read(x) for x in jaxpr.outvars], [change(x) for x in jaxpr.outvars]
+
+    def of(self, equation, xs: list, ds: list) -> tuple[list, list]:
+        """Values and changes of the results of an operation."""
+        name, parameters = equation.primitive.name, equation.params
+        flags = tuple(d is not None for d in ds)
+        if not any(flags) or (not _has_rules(equation) and not any(_moving_results(equation, flags))):
+            values = _bound(equation, xs)
+            return values, [None] * len(values)
+        if name in _WITHIN:
+            return self.through(parameters[_WITHIN[name]], xs, ds)
+        if name == "while":
+            return self.loop(equation, xs, ds)
+        if name == "cond":
+            return self.cases(equation, xs, ds)
+        if is_compound(name) and not any(map(np.shape, xs)):
+            return changed(name, xs, ds, parameters, self.through)
+        if name in PARTIALS:
+            (z,) = _bound(equation, xs)
+            return [z], [self.summed(PARTIALS[name], parameters, z, xs, ds)]
+        if name == "select_n" and not np.shape(xs[0]):
+            return _bound(equation, xs), [lax.select_n(xs[0], *map(self.given, xs[1:], ds[1:]))]
+        if name == "concatenate":
+            parts, axis = list(map(self.given, xs, ds)), parameters["dimension"] + len(self.axis)
+            return _bound(equation, xs), [lax.concatenate(parts, axis)]
+        if name in MOVED and not flags[1:]:
+            return _bound(equation, xs), [MOVED[name](ds[0], parameters) if self.axis else _bound(equation, ds)[0]]
+        return self.by_jax(equation, xs, ds)
+
+    def summed(self, partials: tuple, parameters: dict, z, xs: list, ds: list):
+        """The change of a result z: the partial derivatives times the changes of the operands, of which single numbers
+        may stand beside arrays."""
+        total = None
+        for partial, d in zip(partials, ds):
+            if d is None:
+                continue
+            if d.ndim < len(self.axis) + z.ndim:
+                d = lax.broadcast_in_dim(d, (*self.axis, *z.shape), tuple(range(len(self.axis))))
+            if partial is MINUS_ONE:
+                total = lax.neg(d) if total is None else lax.sub(total, d)
+                continue
+            if partial is not ONE:
+                factor = partial(parameters, z, *xs)
+                d = lax.mul(d, lax.broadcast(factor, self.axis) if np.shape(factor) else factor)
+            total = d if total is None else lax.add(total, d)
+        return total
+
+    def loop(self, equation, xs: list, ds: list) -> tuple[list, list]:
+        """A loop, whose state has the changes of what moves in it behind."""
+        parameters = equation.params
+        n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
+        of_cond, of_body, state = xs[:n_cond], xs[n_cond : n_cond + n_body], xs[n_cond + n_body :]
+        of_body_moved, moved = ds[n_cond : n_cond + n_body], ds[n_cond + n_body :]
+        flags = _moving_results(equation, tuple(d is not None for d in ds))
+        going = jaxpr_as_fun(parameters["cond_jaxpr"])
+
+        def body(carry):
+            values, changes = carry
+            values, changes = self.through(
+                parameters["body_jaxpr"], [*of_body, *values], [*of_body_moved, *_spread(changes, flags)]
+            )
+            return values, [self.given(x, d) for x, d, moves in zip(values, changes, flags) if moves]
+
+        first = [self.given(x, d) for x, d, moves in zip(state, moved, flags) if moves]
+        values, changes = lax.while_loop(lambda carry: going(*of_cond, *carry[0])[0], body, (state, first))
+        return values, _spread(changes, flags)
+
+    def cases(self, equation, xs: list, ds: list) -> tuple[list, list]:
+        """A condition, whose cases make the changes, too."""
+        which, *xs = xs
+        moves = tuple(d is not None for d in ds[1:])
+        flags = _moving_results(equation, (False, *moves))
+
+        def case(program):
+            def made(values, changes):
+                values, changes = self.through(program, values, _spread(changes, moves))
+                return values, [self.given(x, d) for x, d, moves in zip(values, changes, flags) if moves]
+
+            return made
+
+        cases = [case(program) for program in equation.params["branches"]]
+        values, changes = lax.switch(_place(which), cases, xs, [d for d in ds[1:] if d is not None])
+        return values, _spread(changes, flags)
+
+    def by_jax(self, equation, xs: list, ds: list) -> tuple[list, list]:
+        """By the rules that JAX has."""
+        moves, xs = [d is not None for d in ds], list(map(jnp.asarray, xs))  # rules may tell which arrays they take
+
+        def one(*direction):
+            def function(*own):
+                rest = iter(own)
+                return _bound(equation, [next(rest) if move else x for x, move in zip(xs, moves)])
+
+            return jax.jvp(function, tuple(x for x, move in zip(xs, moves) if move), direction)
+
+        every = jax.vmap(one, out_axes=(None, 0)) if self.axis else one
+        values, changes = every(*(d for d in ds if d is not None))
+        return values, [d if _is_real(x) else None for x, d in zip(values, changes)]
+
+
+def _note(known: dict, moved: dict, variables, values: list, changes: list) -> None:
+    known.update(zip(variables, values))
+    moved.update((v, d) for v, d in zip(variables, changes) if d is not None)
+
+
+def _bound(equation, xs: list) -> list:
+    """The results of an operation."""
+    if "call_jaxpr" in equation.params:  # calls of functions, of which their parameters only tell
+        return jaxpr_as_fun(_program_of(equation))(*xs)
+    found = equation.primitive.bind(*xs, **equation.params)
+    return list(found) if equation.primitive.multiple_results else [found]
+
+
+def _has_rules(equation) -> bool:
+    """Whether there may be rules of functions in an operation: these may tell other integers, too, where anything
+    changes."""
+    return equation.primitive.name in ("while", "cond") or any(x in equation.params for x in ("jaxpr", "call_jaxpr"))
+
+
+def _program_of(equation) -> ClosedJaxpr:
+    """One operation as a program."""
+    inputs, inner = [Var(x.aval) for x in equation.invars], equation.params["call_jaxpr"]
+    told = getattr(inner, "jaxpr", inner).debug_info.with_unknown_names()
+    equation = equation.replace(invars=inputs)
+    return ClosedJaxpr(Jaxpr((), inputs, equation.outvars, [equation], equation.effects, told), ())
+
+
+def _spread(changes: Sequence, flags: Sequence[bool]) -> list:
+    """The changes of what moves in their places, None in the others."""
+    rest = iter(changes)
+    return [next(rest) if moves else None for moves in flags]
+
+
+def _place(which):
+    return lax.convert_element_type(which, np.int32)
+
+
+def _is_real(x: Any) -> bool:
+    return jax.dtypes.issubdtype(x.dtype, np.inexact)
+
+
+def _which_move(program: Any, flags: tuple[bool, ...]) -> tuple[bool, ...]:
+    """Which results of a program may change where those of its inputs do that are flagged."""
+    jaxpr = program.jaxpr
+    moved = {v for v, moves in zip(jaxpr.invars, flags) if moves}
+    for equation in jaxpr.eqns:
+        own = tuple(not isinstance(x, Literal) and x in moved for x in equation.invars)
+        moved.update(v for v, moves in zip(equation.outvars, _moving_results(equation, own)) if moves)
+    return tuple(not isinstance(x, Literal) and x in moved for x in jaxpr.outvars)
+
+
+def _moving_results(equation, flags: tuple[bool, ...]) -> tuple[bool, ...]:
+    """Which results of an operation may change where its flagged operands do."""
+    name, parameters = equation.primitive.name, equation.params
+    by = OF_SOME[name](parameters, flags) if name in OF_SOME else flags
+    if not any(by) or name in STILL:
+        return (False,) * len(equation.outvars)
+    if name in _WITHIN:
+        return _which_move(parameters[_WITHIN[name]], flags)
+    if name == "cond":
+        each = [_which_move(program, flags[1:]) for program in parameters["branches"]]
+        return tuple(map(any, zip(*each)))
+    if name == "while":
+        n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
+        of_body, state = flags[n_cond : n_cond + n_body], flags[n_cond + n_body :]
+        while True:
+            after = _which_move(parameters["body_jaxpr"], (*of_body, *state))
+            more = tuple(a or b for a, b in zip(after, state))
+            if more == state:
+                return state
+            state = more
+    return tuple(_is_real(v.aval) for v in equation.outvars)

@@ -1,0 +1,152 @@
+"""Forward mode of whole programs, beside JAX's own: `jax.jvp`, one direction after the other."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from jaxrock.numerics.elementary import exponential, logarithm, sine_cosine
+from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.polynomial import fall_bound, jet, sum_of_products
+from jaxrock.transforms.partials import MOVED, PARTIALS
+from jaxrock.transforms.pushforward import pushed
+
+X, Y = 0.37, 1.9
+LIST = np.array([0.3, -0.7, 1.1])
+
+
+@jax.custom_jvp
+def _counted(x):
+    """A number, and an integer that is another where the number changes."""
+    return x, jnp.int32(0)
+
+
+@_counted.defjvp
+def _(values, changes):
+    (x,), (d,) = values, changes
+    return (x, jnp.int32(1)), (2 * d, np.zeros((), jax.dtypes.float0))
+
+
+def _doubled_until(x, y):
+    return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + y * y, c[1] * c[0], x), (x, y, 1.0))
+
+
+def _newest(x, y):
+    """What moves in a loop only after some turns of it."""
+    return lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 1, c[2], c[3], x * y), (0, 1.0, 2.0, 3.0))[1:]
+
+
+def _nested(x, y):
+    def body(c):
+        count, z = c
+        z = lax.while_loop(lambda c: c[0] < 2, lambda c: (c[0] + 1, jnp.sin(c[1]) * y), (0, z))[1]
+        return count + 1, lax.cond(z > 0.2, lambda z: z * x, lambda z: 0.5, z)
+
+    return lax.while_loop(lambda c: c[0] < 3, body, (0, x))[1]
+
+
+# Of two numbers, in a program as JAX traces it.
+OF_NUMBERS = {
+    "a sum": lambda x, y: x + y - 3.0,
+    "a product": lambda x, y: x * y * x,
+    "a quotient": lambda x, y: (x / y, 1 / y, y / 3.0),
+    "a difference from nothing": lambda x, y: 1.0 - x,
+    "the larger": lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y)),
+    "a tie": lambda x, y: (jnp.maximum(x * y, y * x), jnp.minimum(x, 0.37), jnp.abs(x - 0.37)),
+    "powers": lambda x, y: (x**2, x**3, x**-1, y**-2, lax.integer_pow(y, 0), lax.square(x)),
+    "roots": lambda x, y: (jnp.sqrt(x), lax.rsqrt(y), x**0.3),
+    "circular functions": lambda x, y: (lax.sin(x), lax.cos(y), lax.tan(x), lax.asin(x), jnp.arctan2(x, y)),
+    "exponentials": lambda x, y: (lax.exp(x), lax.log(y), lax.tanh(x), jnp.expm1(x)),
+    "a choice": lambda x, y: (jnp.where(x > 0, x, y), jnp.where(x > 0, 2.0, y)),
+    "clipped": lambda x, y: jnp.clip(x * y, 0.1, 0.2),
+    "without a derivative": lambda x, y: (jnp.floor(x) + y, fixed(x) * y, jnp.sign(x), lax.stop_gradient(x)),
+    "not zero times infinity": lambda x, y: fixed(x) * jnp.sqrt(y * 0.0 + 1.0) + jnp.where(y > 0, 0.0, fixed(y)),
+    "a smaller type": lambda x, y: (x.astype(jnp.float32).astype(x.dtype) * y, (x * 9).astype(jnp.int32) * y),
+    "lists": lambda x, y: jnp.stack([x, y, x * y])[1:] * jnp.concatenate([jnp.array([2.0]), x[None]]),
+    "one of a list": lambda x, y: (jnp.stack([x, y])[0], jnp.stack([x, x, y]).sum(), jnp.arange(3.0)[1] * x),
+    "a list by a number": lambda x, y: (y * LIST, LIST / y, x - LIST, jnp.maximum(x, LIST), (x * LIST).reshape(3, 1)),
+    "sorted": lambda x, y: jnp.sort(jnp.stack([y, x, x * y])),
+    "a function within": jax.jit(lambda x, y: jax.jit(lambda a, b: a * b)(x, y) + 1),
+    "a loop": _doubled_until,
+    "a loop that is late": _newest,
+    "loops within": _nested,
+    "a case without a change": lambda x, y: lax.cond(x > 1, lambda x: x * y, lambda x: 1.0, x),
+    "one of three": lambda x, y: lax.switch(jnp.int32(x * 3), [lambda x: x, lambda x: x * x, lambda x: 1.0], y),
+    "a scan": lambda x, y: lax.scan(lambda c, a: (c * a + x, c), y, jnp.arange(3.0)),
+    "a rule that tells integers": lambda x, y: _counted(x * y)[0] * jnp.array([1.0, 10.0])[_counted(x)[1]],
+    "within a function only integers": lambda x, y: y * jnp.array([1.0, 10.0])[jax.jit(lambda x: _counted(x)[1])(x)],
+    "a rule": lambda x, y: jax.nn.relu(x) * jax.nn.silu(y),
+    "operations of many": lambda x, y: (
+        jet([x, y, x * y], y, 2), sum_of_products([x, y, 1.0 * x], [y, 2.0 * y, y]), *sine_cosine(x), logarithm(y),
+    ),
+    "operations of many without a rule": lambda x, y: (exponential(x), fall_bound([x, -y, x, y], x, 1, y)),
+}  # fmt: skip
+
+
+def told(function, *numbers):
+    return jax.make_jaxpr(lambda *numbers: jax.tree.leaves(function(*numbers)))(*numbers)
+
+
+def expected(function, numbers, moves, directions):
+    """Values, and their changes in every direction, by JAX."""
+
+    def of_moving(*own):
+        rest = iter(own)
+        return jax.tree.leaves(function(*(next(rest) if move else x for x, move in zip(numbers, moves))))
+
+    moving = [x for x, move in zip(numbers, moves) if move]
+    each = [jax.jvp(of_moving, moving, [d[k] for d in directions]) for k in range(len(directions[0]))]
+    values = each[0][0]
+    is_real = [jnp.issubdtype(x.dtype, jnp.inexact) for x in values]
+    changes = [jnp.stack(c) if real else 0 for real, c in zip(is_real, zip(*(changes for _, changes in each)))]
+    return values, changes
+
+
+@pytest.mark.parametrize("moves", [(True, True), (True, False), (False, True)], ids=str)
+@pytest.mark.parametrize("case", OF_NUMBERS)
+def test_beside_jax(case, moves):
+    """In three directions at once, and in one alone."""
+    function, numbers = OF_NUMBERS[case], (jnp.asarray(X), jnp.asarray(Y))
+    program = told(function, *numbers)
+    every = [jnp.asarray(d) for d, move in zip(([1.0, 0.3, 0.0], [0.0, -2.0, 1.0]), moves) if move]
+
+    @jax.jit  # all in one program
+    def results(numbers, every):
+        alone = pushed(program, numbers, moves, [d[1] for d in every], None)
+        return expected(function, numbers, moves, every), pushed(program, numbers, moves, every, 3), alone
+
+    (values, changes), (found, moved), (alone, moved_alone) = results(numbers, every)
+    for k, (value, change) in enumerate(zip(values, changes)):
+        np.testing.assert_allclose(found[k], value, rtol=1e-14)
+        np.testing.assert_allclose(alone[k], value, rtol=1e-14)
+        np.testing.assert_allclose(moved[k], change, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(
+            moved_alone[k], change if np.ndim(change) == 0 else change[1], rtol=1e-13, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize(
+    "case", ["a product", "a quotient", "a list by a number", "loops within", "operations of many"]
+)
+def test_twice(case):
+    """Of a program that was made so: second derivatives are those of JAX."""
+    function, numbers = OF_NUMBERS[case], (jnp.asarray(X), jnp.asarray(Y))
+    moves, unit = (True, True), [jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])]
+    once = told(lambda *x: pushed(told(function, *x), x, moves, unit, 2), *numbers)
+    found = pushed(once, numbers, moves, [d[0] for d in unit], None)[1]
+    by_jax = functools.partial(expected, function, moves=moves, directions=unit)
+    exact = jax.jvp(lambda *x: by_jax(x), numbers, tuple(d[0] for d in unit))[1]
+    for own, change in zip(found, jax.tree.leaves(exact), strict=True):
+        np.testing.assert_allclose(own, change, rtol=1e-12, atol=1e-14)
+
+
+def test_every_rule_is_asked():
+    """The cases above have all operations of the tables."""
+    names = set()
+    for function in OF_NUMBERS.values():
+        names |= {equation.primitive.name for equation in told(function, X * 1.0, Y * 1.0).eqns}
+    # What JAX makes itself where it differentiates, and copies.
+    assert set(PARTIALS) | set(MOVED) <= names | {"add_any", "copy"}
