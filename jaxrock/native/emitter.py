@@ -20,6 +20,7 @@ from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
 from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
+_HOLDERS = {np.ndarray, Memory}  # of more numbers than one
 SMALL = 8  # numbers of a list that is kept in registers; of other arrays its square
 _ARRAY = 2 * SMALL**2  # numbers of an array at most: Diffrax keeps two of seven stages in up to eight directions
 _KINDS = {"f8": ir.DoubleType(), "f4": ir.FloatType(), "i4": ir.IntType(32), "i8": ir.IntType(64), "b1": ir.IntType(1)}
@@ -52,7 +53,11 @@ class Emitter:
 
     def constant(self, value, dtype):
         """One number for all lanes."""
-        return self.constant_of(np.asarray(value, dtype)[()], self.vector(dtype))
+        number = np.asarray(value, dtype)
+        key = number.tobytes(), number.dtype.char
+        if key not in self._constants:
+            self._constants[key] = self.constant_of(number[()], self.vector(dtype))
+        return self._constants[key]
 
     def constant_of(self, value, kind: ir.VectorType):
         """One number for all lanes, of a known type."""
@@ -114,8 +119,11 @@ class Emitter:
             return self.known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
-            results = self._place(equation, [read(x) for x in equation.invars], active)
-            values.update(zip(equation.outvars, results))
+            inputs, operation = [read(x) for x in equation.invars], OPERATIONS.get(equation.primitive.name)
+            if operation is not None and not _HOLDERS.intersection(map(type, inputs)):
+                values[equation.outvars[0]] = self._number(operation, equation, inputs)
+            else:
+                values.update(zip(equation.outvars, self._place(equation, inputs, active)))
         return [read(x) for x in jaxpr.outvars]
 
     def known(self, value, dtype):
@@ -125,7 +133,15 @@ class Emitter:
         value = np.asarray(value, dtype)
         if value.size > _ARRAY:
             raise Unsupported("a large array in the program")
-        return for_each(lambda x: self.constant(x, value.dtype), value if value.ndim else value[()])
+        return for_each(lambda x: self.constant(x, dtype), value if value.ndim else value[()])
+
+    def _number(self, operation: Callable, equation, inputs: list):
+        """As `_place`, of single numbers, which most are: thousands in a program."""
+        depth = max([self._depths.get(id(x), 0) for x in inputs], default=0)
+        result = self._in_loops(depth, equation, lambda: operation(self, equation, *inputs))
+        if not any(result is x for x in inputs):
+            self.remember([result], depth)
+        return result
 
     def _place(self, equation, inputs: list, active) -> list:
         """Apply an operation, before the loops that do not change its operands."""
@@ -134,25 +150,20 @@ class Emitter:
             return self._apply(equation, inputs, active)
         if is_compound(name):
             return self.run(written(name, [x.aval for x in equation.invars], equation.params), inputs, active)
-        depth = max(map(self._depth, inputs), default=0)
-        if depth == len(self.before):
-            results = self._apply(equation, inputs, active)
-        elif depth > len(self.before):
-            raise Unsupported(f"{name} of what another loop makes")
-        else:
-            with self.b.goto_block(self.before[depth]):
-                results = self._apply(equation, inputs, active)
+        depth = max((_depth_of(x, self._depths) for x in inputs), default=0)
+        results = self._in_loops(depth, equation, lambda: self._apply(equation, inputs, active))
         given = set(map(id, _loose(inputs)))  # what is passed on is not made here
         self.remember([value for value in _loose(results) if id(value) not in given], depth)
         return results
 
-    def _depth(self, value) -> int:
-        """In how many loops a value is made anew."""
-        if isinstance(value, np.ndarray):
-            return max(map(self._depth, value.flat), default=0)
-        if isinstance(value, Memory):
-            return max(map(self._depth, value.starts or ()), default=0)
-        return self._depths.get(id(value), 0)
+    def _in_loops(self, depth: int, equation, write: Callable):
+        """What `write` makes, within so many of the loops that are being written."""
+        if depth == len(self.before):
+            return write()
+        if depth > len(self.before):
+            raise Unsupported(f"{equation.primitive.name} of what another loop makes")
+        with self.b.goto_block(self.before[depth]):
+            return write()
 
     def remember(self, values: list, depth: int) -> None:
         """That values are made anew in so many of the loops that are being written, at most: those at their end."""
@@ -177,19 +188,12 @@ class Emitter:
             moved = MOVES[name](parameters, *map(boxed, inputs))
             return [unboxed(x) for x in (moved if isinstance(moved, list) else [moved])]
         if name in SUMS and boxed(inputs[0]).size:
-            return [self._total(equation, boxed(inputs[0]))]
+            return [_total(self, equation, boxed(inputs[0]))]
         if name in OF_FEW:
             return [unboxed(OF_FEW[name](self, equation, *inputs))]
         if name not in OPERATIONS:
             raise Unsupported(f"operation {name}")
         return [for_each(lambda *values: OPERATIONS[name](self, equation, *values), *inputs)]
-
-    def _total(self, equation, array: np.ndarray):
-        operation = SUMS[equation.primitive.name]
-        for axis in sorted(equation.params["axes"], reverse=True):
-            parts = list(np.moveaxis(array, axis, 0))
-            array = functools.reduce(lambda x, y: for_each(lambda *v: operation(self, equation, *v), x, y), parts)
-        return unboxed(array)
 
     def loop(self, parameters: dict, inputs: list, active, leaves: Callable | None = None) -> tuple[list, Any]:
         """The state after a loop, and which lanes go on: none, unless `leaves(which go on)` ends it before."""
@@ -254,6 +258,24 @@ class Emitter:
             phi.add_incoming(old, before)
         self.remember(joined, len(self.before))
         return like(results, joined)
+
+
+def _depth_of(value, depths: dict) -> int:
+    """In how many loops a value is made anew; `depths`: of single vectors, by their identity."""
+    if isinstance(value, np.ndarray):
+        return max((_depth_of(x, depths) for x in value.flat), default=0)
+    if isinstance(value, Memory):
+        return max((_depth_of(x, depths) for x in value.starts or ()), default=0)
+    return depths.get(id(value), 0)
+
+
+def _total(e: Emitter, equation, array: np.ndarray):
+    """Of all numbers along axes of an array."""
+    operation = SUMS[equation.primitive.name]
+    for axis in sorted(equation.params["axes"], reverse=True):
+        parts = list(np.moveaxis(array, axis, 0))
+        array = functools.reduce(lambda x, y: for_each(lambda *v: operation(e, equation, *v), x, y), parts)
+    return unboxed(array)
 
 
 def flat(values: list) -> list:
