@@ -39,6 +39,9 @@ def _power(parameters, z, x):
 
 
 def _reciprocal(x):
+    if isinstance(x, np.generic):  # known: or else XLA would be left to find out
+        with np.errstate(divide="ignore"):
+            return number(x, 1 / x)
     return lax.div(number(x, 1.0), x)
 
 
