@@ -48,6 +48,31 @@ def _nested(x, y):
     return lax.while_loop(lambda c: c[0] < 3, body, (0, x))[1]
 
 
+def _beside(x, y):
+    """A number that stays zero beside one that moves, in a scan."""
+    moved, still = lax.fori_loop(0, 3, lambda k, c: (c[0] * x, c[1] * k), (y, 0.0))
+    return moved + still**0.5
+
+
+def _beside_in_a_loop(x, y):
+    def body(c):
+        moved, still = lax.fori_loop(0, 3, lambda k, c: (c[0] * x, c[1] * k), c[1:])
+        return c[0] + 1, moved, still
+
+    _, moved, still = lax.while_loop(lambda c: c[0] < 2, body, (0, y, 0.0))
+    return moved + jnp.sqrt(still)
+
+
+def _checkpointed(x, y):
+    moved, still = jax.checkpoint(lambda x, n: (x * x * y, n * 0.0))(x, 1.0)
+    return moved + jnp.sqrt(still)
+
+
+def _sorted_together(x, y):
+    keys, still = lax.sort((jnp.stack([y, x]), jnp.zeros(2)), num_keys=1)
+    return keys, jnp.sqrt(still)
+
+
 # Of two numbers, in a program as JAX traces it.
 OF_NUMBERS = {
     "a sum": lambda x, y: x + y - 3.0,
@@ -57,6 +82,9 @@ OF_NUMBERS = {
     "the larger": lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y)),
     "a tie": lambda x, y: (jnp.maximum(x * y, y * x), jnp.minimum(x, 0.37), jnp.abs(x - 0.37)),
     "powers": lambda x, y: (x**2, x**3, x**-1, y**-2, lax.integer_pow(y, 0), lax.square(x)),
+    "a power of zero": lambda x, y: (x - 0.37) ** 0 + y,
+    "a subnormal divisor": lambda x, y: (x / (fixed(y) * 1e-310), x / 1e-310, y / 5e-324),
+    "complex numbers": lambda x, y: jnp.abs(jnp.exp(2j * x) * y),
     "roots": lambda x, y: (jnp.sqrt(x), lax.rsqrt(y), x**0.3),
     "circular functions": lambda x, y: (lax.sin(x), lax.cos(y), lax.tan(x), lax.asin(x), jnp.arctan2(x, y)),
     "exponentials": lambda x, y: (lax.exp(x), lax.log(y), lax.tanh(x), jnp.expm1(x)),
@@ -73,6 +101,14 @@ OF_NUMBERS = {
     "a loop": _doubled_until,
     "a loop that is late": _newest,
     "loops within": _nested,
+    "loops side by side": lambda x, y: jax.vmap(lambda x: lax.while_loop(lambda x: x < 3, lambda x: x * 2 * y, x))(
+        jnp.stack([x, 3 * x])
+    ),
+    "zero beside what moves": _beside,
+    "zero beside what moves in a loop": _beside_in_a_loop,
+    "zero beside what moves in a checkpoint": _checkpointed,
+    "sorted with others": _sorted_together,
+    "one of many by flags": lambda x, y: jnp.where(jnp.arange(3) > 0, x * LIST, y),
     "a case without a change": lambda x, y: lax.cond(x > 1, lambda x: x * y, lambda x: 1.0, x),
     "one of three": lambda x, y: lax.switch(jnp.int32(x * 3), [lambda x: x, lambda x: x * x, lambda x: 1.0], y),
     "a scan": lambda x, y: lax.scan(lambda c, a: (c * a + x, c), y, jnp.arange(3.0)),
@@ -141,6 +177,26 @@ def test_twice(case):
     exact = jax.jvp(lambda *x: by_jax(x), numbers, tuple(d[0] for d in unit))[1]
     for own, change in zip(found, jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(own, change, rtol=1e-12, atol=1e-14)
+
+
+def test_functions_within_are_written_once():
+    """Each calls the one below twice: two to the tenth, if written out."""
+    function = lambda x, y: jnp.sin(x) * y  # noqa: E731
+    for _ in range(10):
+        function = jax.jit(lambda x, y, below=function: below(below(x, y), y))
+    numbers = jnp.asarray(X), jnp.asarray(Y)
+    program, count = told(function, *numbers), []
+
+    def counted(jaxpr, seen):
+        for equation in jaxpr.eqns:
+            count.append(1)
+            inner = equation.params.get("jaxpr")
+            if inner is not None and id(inner.jaxpr) not in seen:
+                seen.add(id(inner.jaxpr))
+                counted(inner.jaxpr, seen)
+
+    counted(told(lambda *x: pushed(program, x, (True, True), x, None), *numbers).jaxpr, set())
+    assert len(count) < 400
 
 
 def test_every_rule_is_asked():

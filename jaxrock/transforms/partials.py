@@ -5,13 +5,19 @@ they do to changes that have one more axis, in front (`MOVED`). Of what is in ne
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax import lax
 
 # Of a partial derivative that is one, or minus one: the change itself.
 ONE, MINUS_ONE = object(), object()
+
+
+class Over(NamedTuple):
+    """Of a partial derivative that is one over something: a reciprocal may be infinite where the quotient is not."""
+
+    function: Callable
 
 
 def number(like, value):
@@ -35,14 +41,9 @@ def _share(z, own, other):
 
 def _power(parameters, z, x):
     n = parameters["y"]
+    if n == 0:
+        return number(x, 0.0)
     return lax.mul(number(x, n), x if n == 2 else lax.integer_pow(x, n - 1))
-
-
-def _reciprocal(x):
-    if isinstance(x, np.generic):  # known: or else XLA would be left to find out
-        with np.errstate(divide="ignore"):
-            return number(x, 1 / x)
-    return lax.div(number(x, 1.0), x)
 
 
 def _one_less_square(x):
@@ -57,7 +58,7 @@ PARTIALS: dict[str, tuple] = {
     "neg": (MINUS_ONE,),
     "copy": (ONE,),
     "mul": (lambda _, z, x, y: y, lambda _, z, x, y: x),
-    "div": (lambda _, z, x, y: _reciprocal(y), lambda _, z, x, y: lax.neg(lax.div(z, y))),
+    "div": (Over(lambda _, z, x, y: y), lambda _, z, x, y: lax.neg(lax.div(z, y))),
     "max": (lambda _, z, x, y: _share(z, x, y), lambda _, z, x, y: _share(z, y, x)),
     "min": (lambda _, z, x, y: _share(z, x, y), lambda _, z, x, y: _share(z, y, x)),
     "abs": (lambda _, z, x: _chosen(lax.ge(x, number(x, 0.0)), 1.0, -1.0, x),),  # as JAX has it at zero
@@ -65,12 +66,12 @@ PARTIALS: dict[str, tuple] = {
     "integer_pow": (_power,),
     "sqrt": (lambda _, z, x: lax.div(number(z, 0.5), z),),
     "exp": (lambda _, z, x: z,),
-    "log": (lambda _, z, x: _reciprocal(x),),
+    "log": (Over(lambda _, z, x: x),),
     "sin": (lambda _, z, x: lax.cos(x),),
     "cos": (lambda _, z, x: lax.neg(lax.sin(x)),),
     "tan": (lambda _, z, x: lax.add(number(z, 1.0), lax.square(z)),),
     "tanh": (lambda _, z, x: _one_less_square(z),),
-    "asin": (lambda _, z, x: _reciprocal(lax.sqrt(_one_less_square(x))),),
+    "asin": (lambda _, z, x: lax.rsqrt(_one_less_square(x)),),
 }
 
 
@@ -105,7 +106,7 @@ MOVED: dict[str, Callable] = {
 }
 
 # What has no derivatives, whatever its operands' are (beside all that tells no real numbers).
-STILL = {"stop_gradient", "fixed", "floor", "ceil", "round", "sign", "nextafter", "unseen_one"}
+STILL = {"stop_gradient", "fixed", "floor", "ceil", "round", "sign", "unseen_one"}
 
 # By the name of the operation: the operands by which it has derivatives, of its parameters and all of them.
 OF_SOME: dict[str, Callable] = {

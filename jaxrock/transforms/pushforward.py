@@ -2,22 +2,25 @@
 
 `jax.vmap` of `jax.jvp` does the same, and takes a few times as long to trace: both go through every loop and every case
 of a condition until they know which of its numbers change, and once more to write that. Here it is told beforehand,
-without tracing (`_which_move`), and the operations that a scene consists of have their rules in `partials`. All others,
-such as those of users' own functions, are left to JAX, one by one.
+without tracing (`_which_move`), and the operations that a scene consists of have their rules in `partials`. Others of
+one result are left to JAX, one by one. A program with others of many, of which only JAX knows which change (scans,
+checkpoints, functions with rules of their own), is left to JAX as a whole.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from jaxrock.numerics.compound import changed, is_compound
-from jaxrock.transforms.partials import MINUS_ONE, MOVED, OF_SOME, ONE, PARTIALS, STILL, number
+from jaxrock.transforms.partials import MINUS_ONE, MOVED, OF_SOME, ONE, PARTIALS, STILL, Over, number
 
+_SMALL = 20  # operations of a program within that is written out wherever it stands
+_PARTS = ("split", "unstack", "scenes")  # operations of many results, all of which change
 _WITHIN = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # programs that only stand there, and where
 
 
@@ -26,9 +29,27 @@ def pushed(
 ) -> tuple[list, list]:
     """What a program makes of values, and how that changes where those that move do, in `directions`: so many, in a
     leading axis; None: one, without. Of what does not change, and of integers, the changes are zeros."""
+    try:
+        _which_move(program, tuple(moves))
+    except _LeftToJax:
+        return _by_jax_alone(program, values, moves, directions, count)
     pushing = _Pushing(count)
     values, changes = pushing.through(program, list(values), _spread(directions, moves))
     return values, [pushing.given(x, d) for x, d in zip(values, changes)]
+
+
+def _by_jax_alone(program: ClosedJaxpr, values: Sequence, moves: Sequence[bool], directions: Sequence, count):
+    def one(*direction):
+        def function(*own):
+            return jaxpr_as_fun(program)(*_merged(values, moves, own))
+
+        return jax.jvp(function, tuple(x for x, move in zip(values, moves) if move), direction)
+
+    return (one if count is None else jax.vmap(one, out_axes=(None, 0)))(*directions)
+
+
+class _LeftToJax(Exception):
+    """What only JAX knows to differentiate."""
 
 
 class _Pushing:
@@ -38,6 +59,7 @@ class _Pushing:
     def __init__(self, count: int | None):
         self.count = count
         self.axis = () if count is None else (count,)
+        self._functions = {}  # of programs that stand there more than once, perhaps
 
     def given(self, x, change):
         """A change, zeros if there is none."""
@@ -68,7 +90,7 @@ class _Pushing:
             values = _bound(equation, xs)
             return values, [None] * len(values)
         if name in _WITHIN:
-            return self.through(parameters[_WITHIN[name]], xs, ds)
+            return self.within(parameters[_WITHIN[name]], xs, ds)
         if name == "while":
             return self.loop(equation, xs, ds)
         if name == "cond":
@@ -100,10 +122,34 @@ class _Pushing:
                 total = lax.neg(d) if total is None else lax.sub(total, d)
                 continue
             if partial is not ONE:
-                factor = partial(parameters, z, *xs)
-                d = lax.mul(d, lax.broadcast(factor, self.axis) if np.shape(factor) else factor)
+                is_divided = isinstance(partial, Over)
+                factor = (partial.function if is_divided else partial)(parameters, z, *xs)
+                factor = lax.broadcast(factor, self.axis) if np.shape(factor) else factor
+                d = (lax.div if is_divided else lax.mul)(d, factor)
             total = d if total is None else lax.add(total, d)
         return total
+
+    def within(self, program, xs: list, ds: list) -> tuple[list, list]:
+        """A program that only stands there: a large one as a function, which may be called again."""
+        flags = tuple(d is not None for d in ds)
+        if len(program.jaxpr.eqns) <= _SMALL and not any(map(_has_rules, program.jaxpr.eqns)):
+            return self.through(program, xs, ds)
+        key = id(program.jaxpr), flags
+        if key not in self._functions:
+            results = _which_move(program, flags)
+            self._functions[key] = jax.jit(self.changing(program, flags, results)), results
+        function, results = self._functions[key]
+        values, changes = function(xs, [d for d in ds if d is not None])
+        return values, _spread(changes, results)
+
+    def changing(self, program, moves: Sequence[bool], results: Sequence[bool]) -> Callable:
+        """A function of values, and of the changes of those that move, that gives such."""
+
+        def made(values, changes):
+            values, changes = self.through(program, values, _spread(changes, moves))
+            return values, [self.given(x, d) for x, d, moves in zip(values, changes, results) if moves]
+
+        return made
 
     def loop(self, equation, xs: list, ds: list) -> tuple[list, list]:
         """A loop, whose state has the changes of what moves in it behind."""
@@ -131,14 +177,7 @@ class _Pushing:
         moves = tuple(d is not None for d in ds[1:])
         flags = _moving_results(equation, (False, *moves))
 
-        def case(program):
-            def made(values, changes):
-                values, changes = self.through(program, values, _spread(changes, moves))
-                return values, [self.given(x, d) for x, d, moves in zip(values, changes, flags) if moves]
-
-            return made
-
-        cases = [case(program) for program in equation.params["branches"]]
+        cases = [self.changing(program, moves, flags) for program in equation.params["branches"]]
         values, changes = lax.switch(_place(which), cases, xs, [d for d in ds[1:] if d is not None])
         return values, _spread(changes, flags)
 
@@ -148,8 +187,7 @@ class _Pushing:
 
         def one(*direction):
             def function(*own):
-                rest = iter(own)
-                return _bound(equation, [next(rest) if move else x for x, move in zip(xs, moves)])
+                return _bound(equation, _merged(xs, moves, own))
 
             return jax.jvp(function, tuple(x for x, move in zip(xs, moves) if move), direction)
 
@@ -165,10 +203,16 @@ def _note(known: dict, moved: dict, variables, values: list, changes: list) -> N
 
 def _bound(equation, xs: list) -> list:
     """The results of an operation."""
-    if "call_jaxpr" in equation.params:  # calls of functions, of which their parameters only tell
-        return jaxpr_as_fun(_program_of(equation))(*xs)
-    found = equation.primitive.bind(*xs, **equation.params)
+    told = equation.primitive.get_bind_params(equation.params)
+    functions, told = told if isinstance(told, tuple) else ((), told)  # the first before JAX 0.10.2
+    found = equation.primitive.bind(*functions, *xs, **told)
     return list(found) if equation.primitive.multiple_results else [found]
+
+
+def _merged(xs: Sequence, moves: Sequence[bool], own: Sequence) -> list:
+    """Values, those that move from among `own`."""
+    rest = iter(own)
+    return [next(rest) if move else x for x, move in zip(xs, moves)]
 
 
 def _has_rules(equation) -> bool:
@@ -210,11 +254,13 @@ def _which_move(program: Any, flags: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 def _moving_results(equation, flags: tuple[bool, ...]) -> tuple[bool, ...]:
-    """Which results of an operation may change where its flagged operands do."""
+    """Which results of an operation may change where its flagged operands do. Raises `_LeftToJax`."""
     name, parameters = equation.primitive.name, equation.params
     by = OF_SOME[name](parameters, flags) if name in OF_SOME else flags
     if not any(by) or name in STILL:
         return (False,) * len(equation.outvars)
+    if not _is_known(equation):
+        raise _LeftToJax(name)
     if name in _WITHIN:
         return _which_move(parameters[_WITHIN[name]], flags)
     if name == "cond":
@@ -230,3 +276,14 @@ def _moving_results(equation, flags: tuple[bool, ...]) -> tuple[bool, ...]:
                 return state
             state = more
     return tuple(_is_real(v.aval) for v in equation.outvars)
+
+
+def _is_known(equation) -> bool:
+    """Whether it is known here, or of one result: of many all would be said to change that may."""
+    name, parameters = equation.primitive.name, equation.params
+    if any(jax.dtypes.issubdtype(v.aval.dtype, np.complexfloating) for v in (*equation.invars, *equation.outvars)):
+        return False
+    if name == "while":
+        return not parameters["cond_jaxpr"].out_avals[0].shape
+    is_own = name in _WITHIN or name in ("cond", "given", *_PARTS) or is_compound(name)
+    return is_own or (len(equation.outvars) == 1 and "jaxpr" not in parameters)
