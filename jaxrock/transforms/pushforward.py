@@ -57,7 +57,6 @@ class _Pushing:
     one, of one direction)."""
 
     def __init__(self, count: int | None):
-        self.count = count
         self.axis = () if count is None else (count,)
         self._functions = {}  # of programs that stand there more than once, perhaps
 
@@ -176,7 +175,6 @@ class _Pushing:
         which, *xs = xs
         moves = tuple(d is not None for d in ds[1:])
         flags = _moving_results(equation, (False, *moves))
-
         cases = [self.changing(program, moves, flags) for program in equation.params["branches"]]
         values, changes = lax.switch(_place(which), cases, xs, [d for d in ds[1:] if d is not None])
         return values, _spread(changes, flags)
@@ -219,14 +217,6 @@ def _has_rules(equation) -> bool:
     """Whether there may be rules of functions in an operation: these may tell other integers, too, where anything
     changes."""
     return equation.primitive.name in ("while", "cond") or any(x in equation.params for x in ("jaxpr", "call_jaxpr"))
-
-
-def _program_of(equation) -> ClosedJaxpr:
-    """One operation as a program."""
-    inputs, inner = [Var(x.aval) for x in equation.invars], equation.params["call_jaxpr"]
-    told = getattr(inner, "jaxpr", inner).debug_info.with_unknown_names()
-    equation = equation.replace(invars=inputs)
-    return ClosedJaxpr(Jaxpr((), inputs, equation.outvars, [equation], equation.effects, told), ())
 
 
 def _spread(changes: Sequence, flags: Sequence[bool]) -> list:
