@@ -10,8 +10,10 @@ from jax import lax
 
 from jaxrock.numerics.elementary import exponential, logarithm, sine_cosine
 from jaxrock.numerics.fixed import fixed
+from jaxrock.numerics.given import given
 from jaxrock.numerics.polynomial import fall_bound, jet, sum_of_products
-from jaxrock.transforms.partials import MOVED, PARTIALS
+from jaxrock.numerics.xla_cpu import keep, unseen_one
+from jaxrock.transforms.partials import MOVED, OF_SOME, PARTIALS, STILL
 from jaxrock.transforms.pushforward import pushed
 
 X, Y = 0.37, 1.9
@@ -28,6 +30,10 @@ def _counted(x):
 def _(values, changes):
     (x,), (d,) = values, changes
     return (x, jnp.int32(1)), (2 * d, np.zeros((), jax.dtypes.float0))
+
+
+def _tripled(_, __, change):
+    return 3 * change
 
 
 def _doubled_until(x, y):
@@ -90,7 +96,9 @@ OF_NUMBERS = {
     "exponentials": lambda x, y: (lax.exp(x), lax.log(y), lax.tanh(x), jnp.expm1(x)),
     "a choice": lambda x, y: (jnp.where(x > 0, x, y), jnp.where(x > 0, 2.0, y)),
     "clipped": lambda x, y: jnp.clip(x * y, 0.1, 0.2),
-    "without a derivative": lambda x, y: (jnp.floor(x) + y, fixed(x) * y, jnp.sign(x), lax.stop_gradient(x)),
+    "without a derivative": lambda x, y: (
+        jnp.floor(x) + y, lax.ceil(y), lax.round(x), fixed(x) * y, jnp.sign(x), lax.stop_gradient(x),
+    ),
     "not zero times infinity": lambda x, y: fixed(x) * jnp.sqrt(y * 0.0 + 1.0) + jnp.where(y > 0, 0.0, fixed(y)),
     "a smaller type": lambda x, y: (x.astype(jnp.float32).astype(x.dtype) * y, (x * 9).astype(jnp.int32) * y),
     "lists": lambda x, y: jnp.stack([x, y, x * y])[1:] * jnp.concatenate([jnp.array([2.0]), x[None]]),
@@ -114,6 +122,8 @@ OF_NUMBERS = {
     "a scan": lambda x, y: lax.scan(lambda c, a: (c * a + x, c), y, jnp.arange(3.0)),
     "a rule that tells integers": lambda x, y: _counted(x * y)[0] * jnp.array([1.0, 10.0])[_counted(x)[1]],
     "within a function only integers": lambda x, y: y * jnp.array([1.0, 10.0])[jax.jit(lambda x: _counted(x)[1])(x)],
+    "given by others": lambda x, y: (given(_tripled, x, y), y + jnp.sqrt(given(_tripled, x * 0.0, fixed(x)))),
+    "kept for XLA": lambda x, y: (keep(x, y) * y, y + jnp.sqrt(keep(x * 0.0, y)), unseen_one(y) + x),
     "a rule": lambda x, y: jax.nn.relu(x) * jax.nn.silu(y),
     "operations of many": lambda x, y: (
         jet([x, y, x * y], y, 2), sum_of_products([x, y, 1.0 * x], [y, 2.0 * y, y]), *sine_cosine(x), logarithm(y),
@@ -205,4 +215,4 @@ def test_every_rule_is_asked():
     for function in OF_NUMBERS.values():
         names |= {equation.primitive.name for equation in told(function, X * 1.0, Y * 1.0).eqns}
     # What JAX makes itself where it differentiates, and copies.
-    assert set(PARTIALS) | set(MOVED) <= names | {"add_any", "copy"}
+    assert {*PARTIALS, *MOVED, *OF_SOME, *STILL} <= names | {"add_any", "copy"}

@@ -28,7 +28,7 @@ def pushed(
     program: ClosedJaxpr, values: Sequence, moves: Sequence[bool], directions: Sequence, count: int | None
 ) -> tuple[list, list]:
     """What a program makes of values, and how that changes where those that move do, in `directions`: so many, in a
-    leading axis; None: one, without. Of what does not change, and of integers, the changes are zeros."""
+    leading axis; None: one, without. Of what does not change, the changes are zeros; those of integers tell nothing."""
     try:
         _which_move(program, tuple(moves))
     except _LeftToJax:
@@ -157,17 +157,16 @@ class _Pushing:
         of_cond, of_body, state = xs[:n_cond], xs[n_cond : n_cond + n_body], xs[n_cond + n_body :]
         of_body_moved, moved = ds[n_cond : n_cond + n_body], ds[n_cond + n_body :]
         flags = _moving_results(equation, tuple(d is not None for d in ds))
+        constant = tuple(d is not None for d in of_body_moved)
         going = jaxpr_as_fun(parameters["cond_jaxpr"])
-
-        def body(carry):
-            values, changes = carry
-            values, changes = self.through(
-                parameters["body_jaxpr"], [*of_body, *values], [*of_body_moved, *_spread(changes, flags)]
-            )
-            return values, [self.given(x, d) for x, d, moves in zip(values, changes, flags) if moves]
-
+        step = self.changing(parameters["body_jaxpr"], (*constant, *flags), flags)
+        same = [d for d in of_body_moved if d is not None]
         first = [self.given(x, d) for x, d, moves in zip(state, moved, flags) if moves]
-        values, changes = lax.while_loop(lambda carry: going(*of_cond, *carry[0])[0], body, (state, first))
+        values, changes = lax.while_loop(
+            lambda carry: going(*of_cond, *carry[0])[0],
+            lambda carry: step([*of_body, *carry[0]], [*same, *carry[1]]),
+            (state, first),
+        )
         return values, _spread(changes, flags)
 
     def cases(self, equation, xs: list, ds: list) -> tuple[list, list]:
@@ -176,7 +175,9 @@ class _Pushing:
         moves = tuple(d is not None for d in ds[1:])
         flags = _moving_results(equation, (False, *moves))
         cases = [self.changing(program, moves, flags) for program in equation.params["branches"]]
-        values, changes = lax.switch(_place(which), cases, xs, [d for d in ds[1:] if d is not None])
+        values, changes = lax.switch(
+            lax.convert_element_type(which, np.int32), cases, xs, [d for d in ds[1:] if d is not None]
+        )
         return values, _spread(changes, flags)
 
     def by_jax(self, equation, xs: list, ds: list) -> tuple[list, list]:
@@ -201,9 +202,7 @@ def _note(known: dict, moved: dict, variables, values: list, changes: list) -> N
 
 def _bound(equation, xs: list) -> list:
     """The results of an operation."""
-    told = equation.primitive.get_bind_params(equation.params)
-    functions, told = told if isinstance(told, tuple) else ((), told)  # the first before JAX 0.10.2
-    found = equation.primitive.bind(*functions, *xs, **told)
+    found = equation.primitive.bind(*xs, **equation.primitive.get_bind_params(equation.params))
     return list(found) if equation.primitive.multiple_results else [found]
 
 
@@ -223,10 +222,6 @@ def _spread(changes: Sequence, flags: Sequence[bool]) -> list:
     """The changes of what moves in their places, None in the others."""
     rest = iter(changes)
     return [next(rest) if moves else None for moves in flags]
-
-
-def _place(which):
-    return lax.convert_element_type(which, np.int32)
 
 
 def _is_real(x: Any) -> bool:
