@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
+from jaxrock.native.builder import Builder
 from jaxrock.native.emitter import SMALL, Emitter, flat, like
 from jaxrock.native.lists import Memory, boxed, unboxed
 from jaxrock.native.operations import Unsupported
@@ -49,7 +50,7 @@ class Frame:
         function.attributes.add("nounwind")  # llvmlite writes the alignment only after another attribute
         function.attributes.alignstack = 64
         to, of, self.next = function.args
-        self.b = ir.IRBuilder(function.append_basic_block("entry"))
+        self.b = Builder(function.append_basic_block("entry"))
         self.e = Emitter(self.b, lanes)
         self.sources = [self._array(of, i, kind) for i, kind in enumerate(inputs, 1)]
         self.targets = [self._array(to, i, kind) for i, kind in enumerate(outputs)]

@@ -6,14 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrock.numerics.typed import common_type, typed
+
 
 def where(condition: Any, one: Any, other: Any) -> jax.Array:
     """`one` where a condition holds, else `other`, as `jnp.where` has it."""
     shape = np.shape(condition)
     if shape != np.shape(one) or shape != np.shape(other) or (_yields(one) and _yields(other)):
         return jnp.where(condition, one, other)
-    dtype = jnp.result_type(one, other)
-    return jax.lax.select_n(jnp.asarray(condition), jnp.asarray(other, dtype), jnp.asarray(one, dtype))
+    dtype = common_type(one, other)
+    return jax.lax.select_n(jnp.asarray(condition), typed(other, dtype), typed(one, dtype))
 
 
 def _yields(value: Any) -> bool:

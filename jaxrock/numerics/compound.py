@@ -13,6 +13,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like
+from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 
 Zero = ad.Zero
@@ -45,8 +46,8 @@ class Compound:
         _OPERATIONS[name] = self
 
     def __call__(self, *numbers, **settings) -> list:
-        dtype = jnp.result_type(*numbers)
-        return self._primitive.bind(*(jnp.asarray(x, dtype) for x in numbers), **settings)
+        dtype = common_type(*numbers)
+        return self._primitive.bind(*(typed(x, dtype) for x in numbers), **settings)
 
     def written(self, *numbers, **settings) -> list:
         """The results, in the operations that it consists of."""

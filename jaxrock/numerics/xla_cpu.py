@@ -10,9 +10,12 @@ import contextlib
 import contextvars
 from collections.abc import Iterator
 
+import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+
+from jaxrock.numerics.typed import typed
 
 _one_p, _keep_p = Primitive("unseen_one"), Primitive("keep")
 _marks = contextvars.ContextVar("marks", default=True)
@@ -58,10 +61,12 @@ def keep_flag(flag, witness):
 def _marked(value, witness, by_one: bool):
     if not are_marked():
         return value
-    value, witness = jnp.asarray(value), jnp.asarray(witness)
+    value = value if isinstance(value, jax.Array) else jnp.asarray(value)
     if not jnp.issubdtype(value.dtype, jnp.inexact):
         return value
-    witness = jnp.broadcast_to(witness.astype(value.dtype), value.shape)
+    witness = typed(witness, value.dtype)
+    if witness.shape != value.shape:
+        witness = jnp.broadcast_to(witness, value.shape)
     return _keep_p.bind(value, witness, by_one=by_one)
 
 

@@ -21,9 +21,11 @@ def when(needed: Flag, function: Callable, value: PyTree) -> PyTree:
     def body(carry):
         first, value = carry
 
+        # The flag changes in the loop: what depends on it stays in the loop.
+        witness = jnp.where(first, 0.0, -1.0) if are_marked() else None
+
         def inside(x):
-            # The flag changes in the loop: what depends on it stays in the loop.
-            return keep(x, jnp.where(first, 0.0, -1.0)) if are_marked() else x
+            return x if witness is None else keep(x, witness)
 
         return jnp.zeros_like(first), function(value, first, inside)
 
