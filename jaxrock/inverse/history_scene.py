@@ -113,7 +113,8 @@ class FittedScene(eqx.Module):
     def at(self, values: dict) -> tuple[Any, AbstractMotion, tuple]:
         """Block, motion and initial state with other parameters."""
         before = named(self.block, self.motion)
-        block, motion = rebuilt(self.block, self.motion, {name: values.get(name, x) for name, x in before.items()})
+        after = {name: values.get(name, x) for name, x in before.items()}
+        block, motion = rebuilt(self.block, self.motion, after, before["amplitude"])
         return block, motion, (values.get("initial", self.initial[0]), values.get("velocity", self.initial[1]))
 
     def rotation(self, point, time, until):

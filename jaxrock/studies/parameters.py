@@ -72,13 +72,16 @@ def declarations(block: AnyBlock, motion: AbstractMotion) -> dict[str, Parameter
     return {"amplitude": Parameter("g")} | found
 
 
-def rebuilt(block: AnyBlock, motion: AbstractMotion, values: dict[str, Real]) -> tuple[AnyBlock, AbstractMotion]:
-    """The scene with other values of its parameters, and derivatives by them.
+def rebuilt(
+    block: AnyBlock, motion: AbstractMotion, values: dict[str, Real], amplitude: Real | None = None
+) -> tuple[AnyBlock, AbstractMotion]:
+    """The scene with other values of its parameters, and derivatives by them; `amplitude`: that of the motion as it is,
+    where it is known.
 
     What follows from other parameters goes on doing so (a restitution, from alpha): its value then is what is added to
     one of its own.
     """
-    return _rebuilt_block(block, values), _rebuilt_motion(motion, values)
+    return _rebuilt_block(block, values), _rebuilt_motion(motion, values, amplitude)
 
 
 def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
@@ -110,12 +113,12 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
     return eqx.tree_at(lambda b: b.law, new, law, is_leaf=lambda x: x is block.law)
 
 
-def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real]) -> AbstractMotion:
+def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: Real | None) -> AbstractMotion:
     numbers = _numbers(motion)
     new = [values[leaf.name] for leaf in numbers]
     changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
     if "amplitude" not in [leaf.name for leaf in numbers]:
-        peak = jax.lax.stop_gradient(peak_of(motion))
+        peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
         changed = Scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
     return changed
 

@@ -142,7 +142,7 @@ def sensitivity(
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
 
     def results(values):
-        changed = rebuilt(block, motion, dict(zip(names, jnp.unstack(values))))
+        changed = rebuilt(block, motion, dict(zip(names, jnp.unstack(values))), parameters["amplitude"])
         result = outcome(*changed, model, engine=engine)
         return jnp.stack([getattr(result, name) for name in _RESULTS]), result
 

@@ -62,14 +62,17 @@ class AbstractVaried(eqx.Module):
 
     def slopes(self, z, block, motion):
         """Derivatives of the logarithm of the critical value by the parameters."""
-        values = {name: jnp.asarray(value) for name, value in named(block, motion).items() if self.keeps(name)}
+        known = named(block, motion)
+        values = {name: jnp.asarray(value) for name, value in known.items() if self.keeps(name)}
+
+        def changed(values):
+            return rebuilt(block, motion, known | values, known["amplitude"])
 
         def margin(z, values):
-            place = rebuilt(block, motion, named(block, motion) | values)
-            return self.margin(z, *place)[0]
+            return self.margin(z, *changed(values))[0]
 
         def unit(values):
-            return jnp.log(self.unit(*rebuilt(block, motion, named(block, motion) | values)))
+            return jnp.log(self.unit(*changed(values)))
 
         by_z, by_values = jax.jacfwd(margin, argnums=(0, 1))(z, values)
         own = jax.jacfwd(unit)(values)
