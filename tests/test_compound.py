@@ -15,6 +15,7 @@ from jaxrock.numerics import compound, elementary, polynomial as polynomials
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given
+from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 from jaxrock.transforms.differentiation import differentiable
 
@@ -271,3 +272,40 @@ def test_exponentials_in_single_precision():
     x = np.linspace(-87.0, 88.0, 20_001).astype(np.float32)
     found, expected = np.asarray(jax.jit(elementary.exponential)(jnp.asarray(x))), np.exp(x.astype(float))
     assert np.all(np.abs(found - expected) <= 1.5 * np.spacing(expected.astype(np.float32)))
+
+
+KINDS = {
+    "as it is": lambda x: x,
+    "double": lambda x: x.astype(jnp.float64),
+    "single": lambda x: x.astype(jnp.float32),
+    "whole": lambda x: x.astype(jnp.int32),
+    "flag": lambda x: x > 0,
+    "complex": lambda x: x + 1j,
+    "weak": lambda x: jnp.asarray(2.5),
+    "list": lambda x: jnp.stack([x, x]),
+    "of Python": lambda x: 2.5,
+    "whole of Python": lambda x: 3,
+    "flag of Python": lambda x: True,
+    "of NumPy": lambda x: np.float64(2.5),
+    "single of NumPy": lambda x: np.float32(2.5),
+}
+
+
+@pytest.mark.parametrize("first", KINDS)
+@pytest.mark.parametrize("second", KINDS)
+def test_types_are_those_of_jax(first, second):
+    """Traced or not: type, weakness and shape."""
+
+    def check(x):
+        one, other = KINDS[first](x), KINDS[second](x)
+        dtype = common_type(one, other)
+        assert dtype == jnp.result_type(one, other)
+        if dtype.kind == "f":
+            for value in (one, other):
+                ours, theirs = jax.typeof(typed(value, dtype)), jax.typeof(jnp.asarray(value, dtype))
+                assert (ours.dtype, ours.shape, ours.weak_type) == (theirs.dtype, theirs.shape, theirs.weak_type)
+        return x
+
+    for number in (jnp.asarray(0.7), jnp.float64(0.7)):  # weak, and not
+        check(number)
+        jax.jit(check)(number)

@@ -20,12 +20,12 @@ def typed(value: Any, dtype: Any) -> Any:
 
 def common_type(*values: Any) -> np.dtype:
     """As `jnp.result_type`."""
-    found = None
+    kinds: set[np.dtype] = set()
     for value in values:
-        if type(value) in (float, int):
+        if type(value) in (float, int):  # which give way to real numbers
             continue
         kind = jax.typeof(value) if isinstance(value, jax.Array) else None
-        if kind is None or kind.weak_type or kind.dtype.kind != "f" or found not in (None, kind.dtype):
+        if kind is None or kind.dtype.kind != "f":
             return jnp.result_type(*values)
-        found = kind.dtype
-    return jnp.result_type(*values) if found is None else found
+        kinds.add(kind.dtype)
+    return kinds.pop() if len(kinds) == 1 else jnp.result_type(*values)
