@@ -1,4 +1,5 @@
-"""Operations that consist of many: what they give, how they change, what is written for them; how long programs are."""
+"""Operations that consist of many: what they give, how they change, what is written for them, and of which types; how
+long programs are."""
 
 import math
 

@@ -18,10 +18,12 @@ machine = pytest.importorskip("jaxrock.native.machine", reason="needs llvmlite")
 import diffrax  # noqa: E402
 import equinox as eqx  # noqa: E402
 import equinox.internal as eqxi  # noqa: E402
+from llvmlite import binding, ir  # noqa: E402
 
 import jaxrock as rk  # noqa: E402
 from jaxrock import _foreign  # noqa: E402
 from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
+from jaxrock.native.builder import Builder  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.numerics.apart import apart  # noqa: E402
 from jaxrock.transforms import batching  # noqa: E402
@@ -838,3 +840,58 @@ def test_a_record_of_one_sample_beside_a_longer_one(caplog):
     )
     np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
     assert "left to XLA" not in caplog.text
+
+
+# Name: instructions of real numbers x and y, whole numbers m and n, flags f and g.
+INSTRUCTIONS = {
+    "sum": lambda b, x, y, m, n, f, g: b.fadd(x, y, flags=("contract",)),
+    "difference": lambda b, x, y, m, n, f, g: b.fsub(x, y),
+    "product": lambda b, x, y, m, n, f, g: b.fmul(x, ir.Constant(x.type, 0.5), name="half", flags=("contract",)),
+    "quotient": lambda b, x, y, m, n, f, g: b.fdiv(x, y),
+    "negative": lambda b, x, y, m, n, f, g: b.fneg(x),
+    "bits": lambda b, x, y, m, n, f, g: b.xor(b.or_(m, n), b.and_(m, n)),
+    "not": lambda b, x, y, m, n, f, g: b.not_(f),
+    "choice": lambda b, x, y, m, n, f, g: b.select(f, x, y),
+    "whole choice": lambda b, x, y, m, n, f, g: b.select(g, m, n),
+    "less": lambda b, x, y, m, n, f, g: b.fcmp_ordered("<", x, y),
+    "other": lambda b, x, y, m, n, f, g: b.fcmp_unordered("!=", x, y),
+    "no number": lambda b, x, y, m, n, f, g: b.fcmp_unordered("uno", x, x),
+    "known": lambda b, x, y, m, n, f, g: b.fcmp_ordered("ord", x, y, flags=("nnan",)),
+    "beside llvmlite's": lambda b, x, y, m, n, f, g: b.icmp_signed("<", b.neg(b.xor(m, n)), b.add(b.or_(m, n), m)),
+}
+
+
+def written_by(builder, write, lanes):
+    """A function with one instruction, or a few, as LLVM prints it."""
+
+    def of(kind):
+        return kind if lanes is None else ir.VectorType(kind, lanes)
+
+    kinds = [of(kind) for kind in (ir.DoubleType(), ir.IntType(64), ir.IntType(1)) for _ in range(2)]
+    function = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), kinds), "f")
+    b = builder(function.append_basic_block())
+    result = write(b, *function.args)
+    room = b.alloca(result.type)
+    with b.goto_block(b.block):  # there is no end yet: behind it
+        b.store(result, room)
+    b.ret_void()
+    with b.goto_block(function.blocks[0]):  # before the end
+        b.store(write(b, *function.args), room)
+    return re.sub(r"%[^ ,)]+", "%", str(binding.parse_assembly(str(function.module))))
+
+
+@pytest.mark.parametrize("lanes", [None, 8])
+@pytest.mark.parametrize("write", INSTRUCTIONS.values(), ids=INSTRUCTIONS)
+def test_instructions_are_those_of_llvmlite(write, lanes):
+    assert written_by(Builder, write, lanes) == written_by(ir.IRBuilder, write, lanes)
+
+
+@pytest.mark.parametrize("name", ["fmul", "select", "fcmp_ordered"])
+def test_operands_are_of_one_type(name):
+    """As llvmlite, and not only when LLVM reads it: that would leave the program to XLA."""
+    kinds = [ir.IntType(1), ir.DoubleType(), ir.FloatType()]
+    function = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), kinds), "f")
+    flag, x, y = function.args
+    more = {"fmul": (), "select": (flag,), "fcmp_ordered": ("<",)}[name]
+    with pytest.raises(ValueError, match="must be of one type, but are"):
+        getattr(Builder(function.append_basic_block()), name)(*more, x, y)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def typed(value: Any, dtype: Any) -> Any:
+def typed(value: Any, dtype: np.dtype) -> Any:
     """As `jnp.asarray(value, dtype)`; of a number of Python's one of NumPy's."""
     if isinstance(value, jax.Array):
         kind = jax.typeof(value)
