@@ -101,6 +101,16 @@ def placed(known: Any) -> Any:
     return jax.device_put(known)
 
 
+def if_traced(array: Any) -> Any:
+    """An array that is traced as it is, and any other as NumPy's: what is done with that compiles nothing."""
+    return array if is_traced(array) else np.asarray(array)
+
+
+def of_each(function: Callable, tree: Any) -> Any:
+    """A function of arrays, NumPy's or JAX's, of each array in a tree, by NumPy where it is known."""
+    return jax.tree.map(lambda x: function(x) if is_traced(x) else placed(function(np.asarray(x))), tree)
+
+
 def _no_number(name: str, value: Any) -> ValueError:
     return ValueError(f"Argument `{name}` must be a number or an array of numbers, but is {shown(value)}.")
 

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxrock._checks import RANGES, Range, check_shapes, finite, is_traced, one_of, throws
+from jaxrock._checks import RANGES, Range, check_shapes, finite, is_traced, one_of, placed, throws
 
 
 class Parameter(NamedTuple):
@@ -178,7 +179,13 @@ def shared(owner: Any) -> Any:
 
 def broadcast(owner: Any, shape: tuple[int, ...]) -> Any:
     """The owner with every number of a scene broadcast to a shape; what is shared stays."""
-    return jax.tree.map(lambda x, own: x if own else jnp.broadcast_to(x, shape), owner, shared(owner))
+
+    def of(x, own):
+        if own or jnp.shape(x) == shape:
+            return x
+        return jnp.broadcast_to(x, shape) if is_traced(x) else placed(np.broadcast_to(np.asarray(x), shape))
+
+    return jax.tree.map(of, owner, shared(owner))
 
 
 def one_of_many(owners: Any, index: Any) -> Any:

@@ -99,9 +99,10 @@ def pytest_runtest_teardown(item, nextitem):
     most = max(_WITHIN if goes_on else _AFTER_A_FILE, _held[0] + _LEAST_GROWTH)
     if not _has_many_maps() and _memory() <= most:
         return
-    importlib.import_module("jaxrock.transforms.recipe")._latest.clear()
+    importlib.import_module("jaxrock.transforms.recipe").forget_programs()
     jax.clear_caches()
     gc.collect()  # it is told to look seldom, and much waits for it
+    gc.freeze()  # what is left stays for long
     if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
         _OF_C.malloc_trim(0)
     _held[0] = _memory()

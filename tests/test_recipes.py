@@ -1,13 +1,14 @@
-"""Recipes: those that are alike are one, and scenes that a quick program postpones to a careful one are collected,
-computed, and put back in their places."""
+"""Recipes: those that are alike are one, what is made of them stays longer than their programs, and scenes that a
+quick program postpones to a careful one are collected, computed, and put back in their places."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxrock as rk
 from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.recipe import Passes, Recipe
+from jaxrock.transforms.recipe import Passes, Recipe, forget_programs
 
 
 def _result(scene, state):
@@ -39,6 +40,59 @@ def test_recipes_of_the_same_facts_are_one():
     assert made(numbers, "twice") is first
     assert first not in (made(numbers, "thrice"), made(more, "twice"))
     assert made(numbers, None) is not made(numbers, None)
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """Facts of the recipes that are traced."""
+    found, trace = [], Recipe._trace
+
+    def noted(self, function):
+        found.append(self.facts)
+        return trace(self, function)
+
+    monkeypatch.setattr(Recipe, "_trace", noted)
+    return found
+
+
+def margin(amplitude):
+    pulse = rk.RectangularPulse(amplitude, 0.3)
+    return rk.outcome(rk.Block(0.2, 2.0), pulse, rk.Linear(), engine=rk.Series(order=4)).margin
+
+
+def forget():
+    forget_programs()
+    jax.clear_caches()
+
+
+def test_what_is_machine_code_is_not_traced_again(traced):
+    forget()
+    before = jax.jit(lambda a: margin(a))(0.3)
+    forget()
+    traced.clear()
+    assert jax.jit(lambda a: margin(a))(0.3) == before
+    assert not traced
+
+
+def test_what_was_forgotten_is_traced_for_what_is_new(traced):
+    before = margin(0.3)
+    forget()
+    traced.clear()
+    assert jax.vmap(margin)(jnp.array([0.3, 0.4]))[0] == before
+    assert len(traced) == 1
+
+
+def test_only_the_latest_programs_stay():
+    numbers = [jax.ShapeDtypeStruct((), float)]
+    made = [Recipe.of(lambda x: x, jax.tree.structure(numbers), numbers, f"number {i}") for i in range(40)]
+    programs = [each.program for each in made]
+    assert [each.program is program for each, program in zip(made[8:], programs[8:])] == [True] * 32
+    assert made[0].program is not programs[0]  # and is traced again where it is wanted
+    own = Recipe.of(lambda x: x, jax.tree.structure(numbers), numbers, None)
+    program = own.program
+    forget_programs()
+    assert made[39].program is not programs[39]
+    assert own.program is program  # without facts it may hold what can be traced only once
 
 
 @pytest.mark.parametrize("level", [-1.0, 0.97, 0.5, 3.0], ids=["none", "nearly all", "half", "all"])

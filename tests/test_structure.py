@@ -364,7 +364,6 @@ SHARED = {
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",
     "transforms.user_function._known": "the same value, whoever puts it there, by one call of C",
     "transforms.recipe._alike": "under a lock",
-    "transforms.recipe._latest": "under a lock",
 }
 CHANGES = {"add", "append", "clear", "discard", "extend", "insert", "pop", "popitem", "remove", "setdefault", "update"}
 

@@ -1,5 +1,6 @@
 """The steps of a history: where each starts, so that the block can be followed again to any time after it."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
-from jaxrock._checks import Values, checked
+from jaxrock._checks import Values, checked, if_traced, is_traced, placed
 from jaxrock.numerics.choice import where
 from jaxrock.status import still_where
 from jaxrock.transforms.differentiation import differentiable
@@ -41,7 +42,7 @@ class Trajectory(eqx.Module):
         """Times within the history."""
         self.check_single()
         rounding = max(1e-12, 4 * float(jnp.finfo(self.duration.dtype).eps))
-        end = self.duration * (1 + rounding)  # a time computed as the duration may round past it
+        end = if_traced(self.duration) * (1 + rounding)  # a time computed as the duration may round past it
         allowed = "be in the history [0, duration]"  # of one that is none (`throw=False`) any time, which tells nothing
         time = checked("time", time, allowed, lambda t: (t >= 0) & ~(t > end))
         return time.astype(jnp.result_type(time, self.duration))
@@ -64,20 +65,24 @@ class Trajectory(eqx.Module):
         is_followed = node.done | jnp.isfinite(following) | (elapsed <= 0)
         return node, where(is_followed, elapsed, jnp.nan)
 
-    def events(self, happened: Bool[Array, " nodes"], order: Inexact[Array, " nodes"], *values) -> tuple:
-        """The values where something happened, in this order; under jit filled up: infinite times, zeros beside them.
+    def events(self, told: Callable) -> tuple:
+        """Values at the nodes where something happened, in order; under jit filled up: infinite times, zeros beside
+        them.
 
-        Each of `values` comes with what fills it up.
+        `told(trajectory)`: of every node whether it did, what they are ordered by, and pairs of a value and what fills
+        it up.
         """
-        found, count = _in_order(happened, order, values)
-        if isinstance(count, jax.core.Tracer):
+        self.check_single()
+        found, count = _in_order(self, told)
+        if is_traced(count):
             return found
-        traced = any(isinstance(value, jax.core.Tracer) for value in found)  # known events, of which something moves
-        return tuple(value[: int(count)] if traced else jnp.asarray(np.asarray(value)[: int(count)]) for value in found)
+        traced = is_traced(found)  # known events, of which something moves
+        return tuple(value[: int(count)] if traced else placed(np.asarray(value)[: int(count)]) for value in found)
 
 
-@jax.jit
-def _in_order(happened, order, values) -> tuple[tuple, Int[Array, ""]]:
+@functools.partial(jax.jit, static_argnames="told")
+def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
+    happened, order, *values = told(path)
     order = jnp.argsort(where(happened, order, jnp.inf), stable=True)
     found = []
     for value, filling in values:

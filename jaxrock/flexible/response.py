@@ -110,20 +110,24 @@ class FlexibleResponse(AbstractTable):
     @property
     def impact_times(self) -> Inexact[Array, " impacts"]:
         """Times of the impacts [s]; under jit filled up with inf."""
-        path = self.trajectory
-        path.check_single()
-        return path.events(path.impacted, path.times, (path.times, jnp.inf))[0]
+        return self.trajectory.events(_impacts_of)[0]
 
     @property
     def impact_modes(self) -> Inexact[Array, "impacts modes"]:
         """Share of each clamped mode of the column in the energy just after each impact [-]; with P-Delta the modes are
         those of the column under its weight, about the balance."""
-        path = self.trajectory
-        path.check_single()
-        q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)
-        energies = v**2 + self.scene.numbers.squares * q**2
-        total = energies.sum(1, keepdims=True)
-        return path.events(path.impacted, path.times, (energies / jnp.where(total > 0, total, 1.0), 0.0))[0]
+        return self.trajectory.events(_modes_of)[0]
+
+
+def _impacts_of(path: Trajectory) -> tuple:
+    return path.impacted, path.times, (path.times, jnp.inf)
+
+
+def _modes_of(path: Trajectory) -> tuple:
+    q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)
+    energies = v**2 + path.stepper.numbers.squares * q**2
+    total = energies.sum(1, keepdims=True)
+    return path.impacted, path.times, (energies / jnp.where(total > 0, total, 1.0), 0.0)
 
 
 @arguments

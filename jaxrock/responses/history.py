@@ -134,13 +134,11 @@ class Response(AbstractTable):
 
     @property
     def _impacts(self) -> tuple:
-        self.trajectory.check_single()
-        return self.trajectory.events(*_impacts_of(self.trajectory))
+        return self.trajectory.events(_impacts_of)
 
     @property
     def _peaks(self) -> tuple:
-        self.trajectory.check_single()
-        return self.trajectory.events(*_peaks_of(self.trajectory))
+        return self.trajectory.events(_peaks_of)
 
     @property
     def impact_times(self) -> Inexact[Array, " impacts"]:
@@ -166,14 +164,12 @@ class Response(AbstractTable):
 # What `Trajectory.events` takes.
 
 
-@jax.jit
 def _impacts_of(path: Trajectory) -> tuple:
     nodes = path.nodes
     velocities = nodes.impact_velocity * path.stepper.scene.p
     return path.impacted, nodes.impact_time, (nodes.impact_time, jnp.inf), (velocities, 0.0)
 
 
-@jax.jit
 def _peaks_of(path: Trajectory) -> tuple:
     nodes = path.nodes
     turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)

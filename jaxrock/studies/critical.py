@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import is_traced, placed, ratio, scalar, watched
+from jaxrock._checks import if_traced, is_traced, of_each, one_program, placed, ratio, scalar, watched
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -66,6 +66,7 @@ class Critical(AbstractTable):
     from_the_least: Bool[Array, "..."] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
 
     @property
+    @one_program
     def lowest(self) -> Float[Array, "..."]:
         """The least critical value above which a block overturns (over many scenes: a spectrum); infinite if none, not
         a number where it overturns at the least that was looked at already: then it lies below."""
@@ -120,7 +121,7 @@ def critical_amplitudes(
     scenes = _Scenes.of(block, motion, model)
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
     grid = np.concatenate([[low], low + (high - low) * np.geomspace(1e-4, 1.0, _FIRST)])
-    grid = np.log(grid) + jnp.log(scenes.threshold / scenes.peak)[:, None]
+    grid = np.log(grid) + if_traced(scenes.least)[:, None]
     return _critical(scenes, grid, Amplitude(model, engine), derivatives, max_ends, progress)
 
 
@@ -154,7 +155,7 @@ def critical_durations(
     check_sizeless(block, model)
     scenes = _Scenes.of(block, motion, model)
     grid = np.linspace(np.log(low), np.log(high), _FIRST + 1)
-    grid = jnp.broadcast_to(grid, (scenes.threshold.size, grid.size))
+    grid = np.broadcast_to(grid, (scenes.threshold.size, grid.size))
     return _critical(scenes, grid, Duration(model, engine), derivatives, max_ends, progress)
 
 
@@ -170,8 +171,8 @@ class _Scenes(eqx.Module):
 
     both: PyTree  # block and motion
     threshold: Float[Array, " scenes"]  # [g]
-    peak: Float[Array, " scenes"]  # of the acceleration [g]
     amplitude: Float[Array, " scenes"]  # as the motion names it [g]
+    least: Float[Array, " scenes"]  # logarithm of the factor of the motion that reaches the threshold
     single: bool = eqx.field(static=True)
 
     @classmethod
@@ -186,22 +187,23 @@ class _Scenes(eqx.Module):
         size = shape[0] if shape else 1
         both = broadcast(both, (size,))
 
-        threshold, peak, amplitude = _facts(both, model, size)
+        threshold, peak, amplitude, least = _facts(both, model, size)
         message = "Argument `motion` must move the ground"
         if is_traced(peak):
-            peak = watched(peak, message, ~(peak > _LEAST).all())
-        elif not (peak > _LEAST).all():
-            raise ValueError(f"{message}, but its peak is {peak.min():g} g.")
-        return cls(both, threshold, peak, amplitude, single=not shape)
+            least = watched(least, message, ~(peak > _LEAST).all())
+        elif not (np.asarray(peak) > _LEAST).all():
+            raise ValueError(f"{message}, but its peak is {np.asarray(peak).min():g} g.")
+        return cls(both, threshold, amplitude, least, single=not shape)
 
 
 @eqx.filter_jit
-def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array]:
-    """Threshold, peak and amplitude of so many scenes."""
+def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array, Array]:
+    """Threshold, peak and amplitude of so many scenes, and the least factor of their motions that moves them."""
 
     def one(index):
         block, motion = one_of_many(both, index)
-        return uplift_threshold(block, model), peak_of(motion), jnp.abs(named(block, motion)["amplitude"])
+        threshold, peak = uplift_threshold(block, model), peak_of(motion)
+        return threshold, peak, jnp.abs(named(block, motion)["amplitude"]), jnp.log(threshold / peak)
 
     return jax.vmap(one)(jnp.arange(size))
 
@@ -228,7 +230,7 @@ def _slopes(z, index, scene):
 
 def _critical(
     scenes: _Scenes,
-    grid: Float[Array, "scenes points"],
+    grid: Float[Array | np.ndarray, "scenes points"],
     kind: AbstractVaried,
     derivatives: bool | None,
     most: int | None,
@@ -249,8 +251,8 @@ def _critical(
         else _lowest(scenes, grid, kind, wanted, most, progress)
     )
     if not wanted:
-        rows["derivative"] = jnp.full((*rows["value"].shape, len(names)), jnp.nan)
-    return Critical(**jax.tree.map(lambda x: x[0] if scenes.single else x, rows), names=names)
+        rows["derivative"] = placed(np.full((*rows["value"].shape, len(names)), np.nan, rows["value"].dtype))
+    return Critical(**(of_each(lambda x: x[0], rows) if scenes.single else rows), names=names)
 
 
 # What stands where there are fewer ends.

@@ -1,7 +1,5 @@
 """How a response depends on the parameters of its scene, and how far that can be trusted."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan, scalar
 from jaxrock._described import described
-from jaxrock._parameters import check_single
+from jaxrock._parameters import check_single, in_real_numbers
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -138,6 +136,11 @@ def sensitivity(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
+    return _sensitivity(*in_real_numbers(block, motion), current_model(model, block, motion), engine)
+
+
+@jax.jit  # one program: the operations are many
+def _sensitivity(block, motion, model, engine) -> Sensitivity:
     parameters = named(block, motion)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])
 
@@ -150,10 +153,8 @@ def sensitivity(
     return _told(names, values, uplift_threshold(block, model), rows, result)
 
 
-@functools.partial(jax.jit, static_argnames="names")
 def _told(names: tuple[str, ...], values, threshold, rows, result: Outcome) -> Sensitivity:
-    """What derivatives (results, parameters) at values of the parameters tell: one program, for the operations are
-    many."""
+    """What derivatives (results, parameters) at values of the parameters tell."""
     valid = (result.status == Status.successful) & result.differentiable
     # uplift_strength = threshold/amplitude: d/d ln strength = -d/d ln amplitude.
     amplitude = values[names.index("amplitude")]

@@ -1,6 +1,5 @@
 """What is computed of one scene: a function as a whole, in parts, and with its derivatives, as a thing with a name."""
 
-import collections
 import functools
 import threading
 import weakref
@@ -101,14 +100,18 @@ class Recipe:
             recipe = _alike.get(key)
             if recipe is None:
                 recipe = _alike[key] = cls(function, structure, like, facts=facts, **rest)
-            _latest.append(recipe)
+        _latest.note(recipe)
         return recipe
 
     def _traced(self, quick: bool) -> tuple[ClosedJaxpr, Any]:
         key = quick, are_marked()
-        if key not in self._programs:
-            self._programs[key] = self._trace(self.passes.at_once if quick and self.passes else self.function)
-        return self._programs[key]
+        found = self._programs.get(key)
+        if found is None:
+            found = self._programs[key] = self._trace(self.passes.at_once if quick and self.passes else self.function)
+        if self.facts is not None:  # else it may hold what is traced only once
+            for recipe in _with_programs.note(self):
+                recipe._programs.clear()
+        return found
 
     def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
         # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
@@ -133,7 +136,9 @@ class Recipe:
     @property
     def results(self) -> Any:
         """What it returns, a tree of `jax.ShapeDtypeStruct`."""
-        return self._traced(quick=False)[1] if self._results is None else self._results
+        if self._results is None:
+            self._results = self._traced(quick=False)[1]
+        return self._results
 
     def __call__(self, leaves: Sequence) -> list:
         """Compute it for one scene."""
@@ -166,7 +171,37 @@ class Recipe:
         return f"recipe {self.name}"
 
 
-# Recipes with facts: those that a compiled function holds, and the latest.
+class _Latest:
+    """The latest so many recipes of any threads."""
+
+    def __init__(self, most: int):
+        self._most, self._recipes, self._lock = most, dict[Recipe, None](), threading.Lock()
+
+    def note(self, recipe: Recipe) -> list[Recipe]:
+        """Those that are among the latest no more, now that this one is."""
+        with self._lock:
+            self._recipes.pop(recipe, None)
+            self._recipes[recipe] = None
+            gone = list(self._recipes)[: -self._most]
+            for each in gone:
+                del self._recipes[each]
+        return gone
+
+    def taken(self) -> list[Recipe]:
+        """All of them, which it holds no more."""
+        with self._lock:
+            gone, self._recipes = list(self._recipes), {}
+        return gone
+
+
+# Recipes with facts: those that a compiled function holds, and the latest. What was made of them is small, and stays
+# with them; their programs are large, and only the latest stay.
 _alike: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
-_latest: collections.deque = collections.deque(maxlen=32)
 _one_at_a_time = threading.Lock()
+_latest, _with_programs = _Latest(512), _Latest(32)
+
+
+def forget_programs() -> None:
+    """Forget what has been traced of recipes with facts; what was made of it stays."""
+    for recipe in _with_programs.taken():
+        recipe._programs.clear()
