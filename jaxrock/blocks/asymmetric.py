@@ -276,6 +276,7 @@ class AsymmetricBlock(Owner):
         return flat if self.given_radius_ratio is None else self.given_radius_ratio
 
     @property
+    @one_program
     def inertia_ratio2(self) -> Real:
         """m R2^2/I2."""
         square = self.radius_ratio**2

@@ -1,5 +1,6 @@
 """Blocks whose parameters are uncertain, as random draws."""
 
+import functools
 from typing import Annotated, Any, overload
 
 import jax
@@ -59,16 +60,22 @@ def draw_blocks(
     **Raises:** ValueError for arguments outside their ranges.
     """
     check_single(block=block)
-    keys = jax.random.split(jax.random.key(seed), 3)
-    alphas, ps = (jnp.exp(by * jax.random.normal(key, (draws,))) for key, by in zip(keys, (alpha, p)))
+    alphas, ps, last = _factors(jax.random.key(seed), alpha, p, draws)
     try:
         if isinstance(block, AsymmetricBlock):
             return _drawn_sides(block, alphas, ps, restitution)
-        return _drawn(block, alphas, ps, restitution, keys[2])
+        return _drawn(block, alphas, ps, restitution, last)
     except _NoBlock as error:
         names = " and ".join(f"`{name}`" for name, deviation in (("alpha", alpha), ("p", p)) if deviation > 0)
         said = f"let all {draws} draws be blocks, but one is none ({str(error).rstrip('.')})"
         raise ValueError(f"The standard deviation {names} must {said}. Lower it, or draw less stocky blocks.") from None
+
+
+@functools.partial(jax.jit, static_argnames="draws")
+def _factors(key: Array, alpha: ArrayLike, p: ArrayLike, draws: int) -> tuple[Array, Array, Array]:
+    """Of slenderness and of frequency parameters, and a key for more."""
+    *keys, last = jax.random.split(key, 3)
+    return *(jnp.exp(by * jax.random.normal(key, (draws,))) for key, by in zip(keys, (alpha, p))), last
 
 
 class _NoBlock(ValueError):

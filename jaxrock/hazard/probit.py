@@ -12,7 +12,7 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float
 
 from jaxrock._arguments import arguments, word_of
-from jaxrock._checks import Values, is_traced, not_negative, positive, shown
+from jaxrock._checks import Values, is_traced, not_negative, one_program, positive, shown
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line, slope_tests
 
@@ -126,7 +126,6 @@ def fit_probit(
     trials = not_negative("trials", trials)
     if trials.shape not in ((), first.shape):
         raise ValueError(f"Argument `trials` must have shape {first.shape} or (), but has shape {trials.shape}.")
-    trials = jnp.broadcast_to(trials, first.shape)
     toppled = outcomes(toppled, first, trials)
     if errors is None:
         errors = "information" if clusters is None else "clusters"
@@ -135,11 +134,16 @@ def fit_probit(
         raise ValueError(f"Argument `clusters` must have shape {first.shape}, but has shape {labels.shape}.")
     if errors != "information" and labels.max() < 1:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    logarithms = jnp.log(jnp.stack(lists).astype(jnp.result_type(float)))  # whose sums over outcomes are long
     count = 0 if errors == "information" else int(labels.max()) + 1
-    survived = trials - toppled
+    logarithms, survived = _prepared(lists, toppled, trials)
     numbers = _fit(logarithms, toppled, survived, jnp.asarray(labels), count, errors)
     return or_separable(ProbitFit(tuple(measures), *numbers), logarithms, toppled, survived)
+
+
+@one_program
+def _prepared(lists, toppled, trials):
+    """Logarithms of the measures, whose sums over outcomes are long, and how many survived."""
+    return jnp.log(jnp.stack(lists).astype(jnp.result_type(float))), trials - toppled
 
 
 def or_separable(fit, logarithms, toppled, survived):

@@ -4,6 +4,7 @@ Peak acceleration alone says whether a block uplifts, the ratio of peak velocity
 pushed: together they say most of what a motion does to a rock.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Annotated
@@ -145,19 +146,24 @@ def fit_surface(
     count = int(labels.max()) + 1
     if count < 2:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    survived = trials - toppled
-    fit, scores = _fit(acceleration, ratio, toppled, survived)
-    fit = or_separable(fit, jnp.log(jnp.stack([acceleration, ratio])), toppled, survived)
+    fit, scores, measures, survived = _fit(acceleration, ratio, toppled, trials)
+    fit = or_separable(fit, measures, toppled, survived)
     if clusters is None:
         return fit
+    return eqx.tree_at(lambda f: f.covariance, fit, _clustered(fit.covariance, scores, labels, count))
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _clustered(covariance, scores, labels, count: int) -> Float[Array, "3 3"]:
     summed = jnp.zeros((count, 3)).at[labels].add(scores)
-    middle = summed.T @ summed * count / (count - 1)
-    return eqx.tree_at(lambda f: f.covariance, fit, fit.covariance @ middle @ fit.covariance)
+    return covariance @ (summed.T @ summed * count / (count - 1)) @ covariance
 
 
 @jax.jit
-def _fit(acceleration, ratio, toppled, survived):
-    """The fit, and the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion)."""
+def _fit(acceleration, ratio, toppled, trials):
+    """The fit, the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion), the
+    logarithms of the measures, and how many survived."""
+    survived = trials - toppled
     measures = jnp.log(jnp.stack([acceleration, ratio]))
     centre = jnp.mean(measures, axis=1, keepdims=True)
     size = jnp.std(measures, axis=1, keepdims=True)
@@ -179,7 +185,7 @@ def _fit(acceleration, ratio, toppled, survived):
     status = FitStatus.where(converged, status, FitStatus.not_converged)
     numbers = jnp.exp(logarithm), exponent, dispersion, covariance
     *numbers, covariance = (jnp.where(status == FitStatus.successful, x, jnp.nan) for x in numbers)
-    return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T
+    return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T, measures, survived
 
 
 @arguments

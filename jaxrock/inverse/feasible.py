@@ -179,16 +179,17 @@ def unexceeded_motion(
 def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMotion, Array]:
     """Those of amplitude 1, one way or (-1) the other, and of all durations in one, which share samples of a record;
     and what each calls its amplitude."""
-    one = eqx.filter_eval_shape(motion, ways[0], duration[0])
+    first = [jax.ShapeDtypeStruct((), x.dtype) for x in (ways, duration)]
+    one = eqx.filter_eval_shape(motion, *first)
     if not isinstance(one, AbstractMotion):
         raise ValueError(f"Argument `motion` must make a motion of amplitude and duration, but makes {shown(one)}.")
-    is_level = eqx.filter_eval_shape(lambda *x: motion(*x).vertical_bounds, ways[0], duration[0]) is None
+    is_level = eqx.filter_eval_shape(lambda *x: motion(*x).vertical_bounds, *first) is None
 
     def turned(way, duration):
         made = motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
         return made, jnp.abs(amplitude_of(made))
 
-    like, _ = eqx.filter_eval_shape(turned, ways[0], duration[0])
+    like, _ = eqx.filter_eval_shape(turned, *first)
     axes = jax.tree.map(lambda own: None if own else 0, shared(like))
     try:
         return jax.vmap(turned, out_axes=(axes, 0))(ways, duration)

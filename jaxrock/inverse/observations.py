@@ -10,7 +10,19 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, as_real, checked, is_traced, not_negative, one_program, placed, put_down, shown
+from jaxrock._checks import (
+    Values,
+    as_real,
+    checked,
+    if_traced,
+    is_traced,
+    not_negative,
+    of_each,
+    one_program,
+    placed,
+    put_down,
+    shown,
+)
 from jaxrock._described import described
 from jaxrock._label import Label
 from jaxrock._words import meant
@@ -108,7 +120,7 @@ class Observations(eqx.Module):
         count = alpha.size
         self.seen = _words(seen, count)
         restitution = _list("restitution", np.nan if restitution is None else restitution, count)
-        self.follows, self.other = _where(restitution != restitution, True, False), other
+        self.follows, self.other = _where(_is_missing(restitution), True, False), other
         given = checked("restitution", _where(self.follows, 0.5, restitution), "be in [0, 1]", _in_share)
         block = Block(alpha, _list("p", p, count), given)
         self.alpha, self.p = block.alpha, block.p
@@ -126,11 +138,9 @@ class Observations(eqx.Module):
         self.rotation, self.rotation_sd = (
             _measured(name, value, measured) for name, value in (("rotation", rotation), ("rotation_sd", rotation_sd))
         )
-        wider = self.alpha if other is None else self.alpha * _where(other.alpha_ratio > 1, other.alpha_ratio, 1.0)
-        most = _where(measured, wider, np.inf)
-        _check_below(
-            "rotation", self.rotation, 2 * most, "twice `alpha`, from which no rock comes back, and in radians"
-        )
+        wider = 1.0 if other is None else if_traced(other.alpha_ratio).clip(1.0)
+        most, twice = (_where(measured, by * if_traced(self.alpha) * wider, np.inf) for by in (1, 2))
+        _check_below("rotation", self.rotation, twice, "twice `alpha`, from which no rock comes back, and in radians")
         _check_below("rotation_sd", self.rotation_sd, most, "`alpha`, and in radians")
         self.label = Label(tuple(f"rock {i + 1}" for i in range(count)) if names is None else tuple(map(str, names)))
         if len(self.names) != count:
@@ -181,7 +191,7 @@ class Observations(eqx.Module):
         if blocks.law.depends_on_speed:
             raise ValueError("Argument `blocks` must have a restitution that does not depend on the speed of impacts.")
         if not isinstance(blocks.law, AngularMomentum):
-            restitution = _where(restitution != restitution, both, restitution)
+            restitution = _where(_is_missing(restitution), both, restitution)
         return cls(alpha1, p1, seen, restitution, other=other, **known)
 
     @property
@@ -192,7 +202,7 @@ class Observations(eqx.Module):
     @property
     def ways(self) -> Inexact[Array, "ways rocks"]:
         """Signs of the motion that each rock may have felt, all equally likely."""
-        return jnp.ones((1, self.alpha.size)) if self.other is None else self.other.ways
+        return placed(np.ones((1, self.alpha.size))) if self.other is None else self.other.ways
 
     @property
     def weaker_alpha(self) -> Rocks:
@@ -223,15 +233,12 @@ class Observations(eqx.Module):
     def of(self, which: ArrayLike) -> "Observations":
         """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
         index = _chosen(which, self.alpha.size)
-        known = {
-            name: getattr(self, name)[index]
-            for name in ("alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
-        }
-        restitution = _where(self.follows, np.nan, self.restitution)[index]
+        numbers = ("alpha", "p", "alpha_sd", "p_sd", "restitution_sd", "rotation", "rotation_sd")
+        known = {name: getattr(self, name) for name in numbers}
+        known |= {"restitution": _where(self.follows, np.nan, self.restitution), "other": self.other}
         words = [SEEN[k] for k in np.asarray(self.seen)[index]]
         names = [self.names[i] for i in index]
-        other = jax.tree.map(lambda x: x[..., index], self.other)
-        return Observations(self.alpha[index], self.p[index], words, restitution, **known, names=names, other=other)
+        return Observations(seen=words, names=names, **of_each(lambda x: x[..., index], known))
 
 
 def _two_sided(other: OtherSide, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> AsymmetricBlock:
@@ -250,6 +257,10 @@ def _by_momentum(other: OtherSide | None, alpha: Real, p: Rocks) -> Real:
     with put_down():
         block = _two_sided(other, alpha, p, None)
     return jnp.sqrt(block.restitution1 * block.restitution2)
+
+
+def _is_missing(values: Array) -> Array | np.ndarray:
+    return if_traced(values) != if_traced(values)
 
 
 def _where(which: ArrayLike, this: ArrayLike, that: ArrayLike) -> Array:
