@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,6 +15,7 @@ from jaxrock.studies.borders import _Interval, _pairs
 
 RESTITUTION, TIP = 0.8, 4.33389  # largest frequency ratio of case 1.2, by 200-bit Taylor series
 COARSE = np.linspace(0.5, 8.0, 5), np.linspace(1.02, 10.0, 3)
+LINEAR = {"alpha": 0.2, "restitution": RESTITUTION, "model": rk.Linear(), "progress": False}
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +26,7 @@ def closed_afterwards():
 
 @pytest.fixture(scope="module")
 def surface():
-    return rk.overturning_map(*COARSE, alpha=0.2, restitution=RESTITUTION, model=rk.Linear(), progress=False)
+    return rk.overturning_map(*COARSE, **LINEAR)
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +36,31 @@ def regions(surface):
 
 @pytest.fixture(scope="module")
 def small():
-    """A map of two regions, whose borders take less than half as long; of as many points: one program."""
-    grid = np.linspace(2.5, 3.5, 5), np.linspace(1.02, 3.0, 3)
-    return rk.overturning_map(*grid, alpha=0.2, restitution=RESTITUTION, model=rk.Linear(), progress=False)
+    """A map of two regions, whose borders take few columns."""
+    return rk.overturning_map(np.linspace(2.5, 2.7, 5), np.linspace(1.02, 3.0, 3), **LINEAR)
+
+
+@pytest.fixture(scope="module")
+def borders_of_small(small):
+    return rk.studies.overturning_borders(small)
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """A map of one region, whose borders are nearly straight: they need no columns but its own."""
+    return rk.overturning_map([3.0, 3.01], np.linspace(1.5, 2.5, 3), **LINEAR)
+
+
+@pytest.fixture(scope="module")
+def with_curves(small):
+    """The small map with its borders, and the curves of the closed forms."""
+    return rk.plot.sine_regions(RESTITUTION, rk.plot.overturning(small), frequency_ratio=np.linspace(1, 5, 8))
+
+
+def in_pieces(function, x, *more):
+    """A function of a list, of eight numbers at a time, as `sine_regions` asks it: one program for any number."""
+    found = [function(piece, *more) for piece in np.resize(x, (-(-x.size // 8), 8))]
+    return jax.tree.map(lambda *rows: np.concatenate(rows)[: x.size], *found)
 
 
 def at(regions, ratio):
@@ -57,11 +81,11 @@ def test_borders_are_the_closed_forms(regions, references):
     """At every column; islands at one of them, by 200-bit Taylor series."""
     by_impacts = {region.impacts: region for region in regions}
     blue, red = by_impacts[0], by_impacts[1]
-    limit = sine_pulse.no_impact_limit(blue.frequency_ratio)
+    limit = in_pieces(sine_pulse.no_impact_limit, blue.frequency_ratio)
     np.testing.assert_allclose(blue.lower, limit, rtol=1e-11)
     np.testing.assert_allclose(blue.upper, 10.0, rtol=1e-15)
-    low, high = sine_pulse.after_pulse_limits(red.frequency_ratio, RESTITUTION)
-    during = np.asarray(sine_pulse.during_pulse_limit(red.frequency_ratio, RESTITUTION))
+    low, high = in_pieces(sine_pulse.after_pulse_limits, red.frequency_ratio, RESTITUTION)
+    during = in_pieces(sine_pulse.during_pulse_limit, red.frequency_ratio, RESTITUTION)
     np.testing.assert_allclose(red.upper, high, rtol=2e-9)  # the two meet in the tip
     np.testing.assert_allclose(red.lower, np.where(np.isfinite(during), during, low), rtol=2e-9)
     (known,) = (
@@ -84,7 +108,7 @@ def test_borders_are_smooth(regions):
     """A straight line between two columns is nowhere off by more than a thousandth of the range, or two."""
     (region,) = (region for region in regions if region.impacts == 0)
     middle = (region.frequency_ratio[1:] + region.frequency_ratio[:-1]) / 2
-    exact = np.asarray(sine_pulse.no_impact_limit(np.append(middle, 1.0)))[:-1]  # as many as above: one program
+    exact = in_pieces(sine_pulse.no_impact_limit, middle)
     straight = (region.lower[1:] + region.lower[:-1]) / 2
     drawn = exact < 10
     assert np.max(np.abs(straight - exact)[drawn]) < 2e-3 * 9
@@ -149,24 +173,22 @@ def test_maps_that_have_no_borders(surface, change):
         rk.studies.overturning_borders(dataclasses.replace(surface, **change))
 
 
-def test_map_with_borders(small):
-    regions = rk.studies.overturning_borders(small).regions
+def test_map_with_borders(borders_of_small, with_curves):
+    regions = borders_of_small.regions
     assert len(regions) == 2
-    axis = rk.plot.overturning(small)
-    rk.plot.sine_regions(RESTITUTION, axis, frequency_ratio=np.linspace(1, 5, 3))
-    drawn = [line.get_ydata() for line in axis.lines[: 2 * len(regions)]]
+    drawn = [line.get_ydata() for line in with_curves.lines[: 2 * len(regions)]]
     for region, lower, upper in zip(regions, drawn[::2], drawn[1::2]):
         np.testing.assert_array_equal(lower, region.lower)
         np.testing.assert_array_equal(upper, region.upper)
-    legends = [child for child in axis.get_children() if type(child).__name__ == "Legend"]
+    legends = [child for child in with_curves.get_children() if type(child).__name__ == "Legend"]
     assert len(legends) == 2  # the map's, and that of the curves
 
 
 @pytest.fixture(scope="module")
 def too_few_steps():
     """A map whose columns cannot be searched: what a search asks takes more steps than a verdict."""
-    grid, engine = (np.linspace(0.5, 8, 20), np.linspace(1.05, 9, 20)), rk.Series(max_steps=15)
-    return rk.overturning_map(*grid, alpha=0.2, restitution=0.95, engine=engine, progress=False)
+    grid = np.linspace(0.5, 8, 20), np.linspace(1.05, 9, 20)
+    return rk.overturning_map(*grid, **LINEAR | {"restitution": 0.95, "engine": rk.Series(max_steps=15)})
 
 
 def test_columns_without_a_result_are_drawn_by_pixels(too_few_steps, caplog):
@@ -182,11 +204,13 @@ def test_columns_without_a_result_are_drawn_by_pixels(too_few_steps, caplog):
     assert "borders are left out" in caplog.text
 
 
-def test_columns_that_the_map_contradicts_are_crowded(small):
+def test_columns_that_the_map_contradicts_are_crowded(small, borders_of_small):
     """One point of the map has another verdict than the borders around it."""
-    assert not rk.studies.overturning_borders(small).crowded.size
-    row, column = np.argwhere(np.asarray(small.state) == 0)[0]
-    other = dataclasses.replace(small, state=small.state.at[row, column].set(2))
+    assert not borders_of_small.crowded.size
+    state = np.array(small.state)
+    row, column = np.argwhere(state == 0)[0]
+    state[row, column] = 2
+    other = dataclasses.replace(small, state=jnp.asarray(state))
     place = float(small.frequency_ratio[column])
     crowded = rk.studies.overturning_borders(other).crowded
     assert crowded.size and (np.min(abs(crowded - place), axis=1) == 0).all()
@@ -202,28 +226,27 @@ def test_survivors_are_coloured_up_to_the_border(surface):
     assert beside.any() and np.isfinite(peaks[:, :-1][beside]).all()
 
 
-def test_borders_over_each_other(small):
+def test_borders_over_each_other(small, narrow):
     axis = rk.plot.borders(small, by_strength=True, color="red", label="one")
     highest = max(np.nanmax(line.get_ydata()) for line in axis.lines)
     assert highest < 1 and [line.get_label() for line in axis.lines].count("one") == 1
     assert {line.get_color() for line in axis.lines} == {"red"}
     assert (axis.get_xlabel(), axis.get_ylabel()) == (r"frequency ratio $\omega/p$", "uplift strength")
-    assert rk.plot.borders(small, scale=2.0).get_ylabel() == "intensity times 2"
+    assert rk.plot.borders(narrow, scale=2.0).get_ylabel() == "intensity times 2"
 
 
 @pytest.mark.parametrize(
     "draw, given", [(rk.plot.borders, {}), (rk.plot.overturning, {"exact": True}), (rk.plot.overturning, {})]
 )
-def test_progress_of_a_figure(small, capsys, draw, given):
-    draw(small, **given)
+def test_progress_of_a_figure(narrow, capsys, draw, given):
+    draw(narrow, **given)
     assert capsys.readouterr().err == ""
-    draw(small, progress=True, **given)
+    draw(narrow, progress=True, **given)
     assert "borders" in capsys.readouterr().err
 
 
-def test_curves_reach_their_tips():
-    axis = rk.plot.sine_regions(RESTITUTION, frequency_ratio=np.linspace(1, 5, 3))
-    (curve,) = (line.get_xydata() for line in axis.lines if "1.2" in line.get_label())
+def test_curves_reach_their_tips(with_curves):
+    (curve,) = (line.get_xydata() for line in with_curves.lines if "1.2" in line.get_label())
     known = np.isfinite(curve[:, 1])
     np.testing.assert_allclose(curve[known, 0].max(), TIP, atol=1e-5)
 

@@ -17,6 +17,9 @@ from jaxrock.motions.pulses import PULSES, UNITS
 from jaxrock.studies.saved_outcomes import an_outcome
 from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=8)}  # compiles in half the time
+LINEAR = {"alpha": 0.2, "progress": False, **QUICK}  # of maps
+
 
 @pytest.fixture(autouse=True)
 def closed_afterwards():
@@ -26,10 +29,10 @@ def closed_afterwards():
 
 def sensitivity_of(elasticity):
     """A sensitivity with these elasticities by two parameters."""
-    elasticity = jnp.asarray(elasticity)
-    number = elasticity[..., 0]
+    elasticity = np.asarray(elasticity)
+    number, good = elasticity[..., 0], np.ones(elasticity.shape[:-1], bool)
+    elasticity, number, good = map(jnp.asarray, (elasticity, number, good))
     slopes = Slopes(number, elasticity, elasticity, number, SlopeStatus.useful)
-    good = jnp.ones_like(number, bool)
     return rk.studies.Sensitivity(
         ("alpha", "amplitude"), elasticity, slopes, slopes, slopes, an_outcome(), good, number, number, number
     )
@@ -48,7 +51,7 @@ def test_a_tornado_is_of_one_scene():
 
 def test_a_tornado_of_a_block_that_overturns_says_so():
     """It was an empty frame."""
-    told = rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.SinePulse(1.4, 0.9), rk.Linear(), engine=rk.Series(order=6))
+    told = rk.studies.sensitivity(rk.Block(0.2, 2.0, 0.9), rk.RectangularPulse(1.4, 0.9), **QUICK)
     with pytest.raises(ValueError, match="Argument `sensitivity` must have .* 'max_rotation', .*: draw its `margin`"):
         rk.plot.tornado(told)
     assert len(rk.plot.tornado(told, "margin").patches) == len(told.names)
@@ -177,12 +180,18 @@ def test_found_record():
     assert 0 < box.x0 and box.x1 < whole.x1 and box.y1 < whole.y1
 
 
+def a_region(rows, columns):
+    """Amplitudes and periods, the likeliest of them 0.4 and 0.7."""
+    likelihood = -((np.log(rows / 0.4)[:, None]) ** 2) - np.log(columns / 0.7) ** 2
+    values, likely = (jnp.asarray(rows), jnp.asarray(columns)), jnp.asarray(likelihood > -1)
+    return rk.inverse.FeasibleRegion(("amplitude", "period"), values, jnp.asarray(likelihood), likely)
+
+
 def test_feasible_region():
     """The best is the top of the scale; axes are logarithmic and have the units of the parameters."""
-    rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
-    likelihood = -((jnp.log(rows / 0.4)[:, None]) ** 2) - jnp.log(columns / 0.7) ** 2
-    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (rows, columns), likelihood, likelihood > -1)
-    wall = rk.inverse.Unexceeded(columns, jnp.full(5, 0.5), jnp.full((1, 5), 0.5), jnp.zeros(5, int), jnp.ones(5, bool))
+    region = a_region(np.geomspace(0.1, 1.0, 4), np.geomspace(0.2, 2.0, 5))
+    strongest = map(jnp.asarray, (np.full(5, 0.5), np.full((1, 5), 0.5), np.zeros(5, int), np.ones(5, bool)))
+    wall = rk.inverse.Unexceeded(region.values[1], *strongest)
     axis = rk.plot.feasible_region(region, wall=wall)
     assert (axis.get_ylabel(), axis.get_xlabel()) == ("amplitude [g]", "period [s]")
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
@@ -192,13 +201,14 @@ def test_feasible_region():
 
 def test_a_wall_lies_along_the_axes_of_its_region():
     """Whichever of the two is drawn upward, with gaps where not all is known; over other parameters it has no place."""
-    amplitude, period, likelihood = jnp.array([0.1, 1.0]), jnp.array([0.2, 2.0]), jnp.zeros((2, 2))
+    amplitude, period, likelihood = (jnp.asarray(x) for x in ([0.1, 1.0], [0.2, 2.0], np.zeros((2, 2))))
+    known = np.array([True, True, False])
     wall = rk.inverse.Unexceeded(
-        jnp.array([0.5, 1.5, 1.8]), jnp.array([0.3, 0.4, 0.5]), jnp.ones((1, 3)), jnp.zeros(3, int), jnp.arange(3) < 2
+        *map(jnp.asarray, ([0.5, 1.5, 1.8], [0.3, 0.4, 0.5], np.ones((1, 3)), np.zeros(3, int), known))
     )
 
     def drawn(names, values):
-        region = rk.inverse.FeasibleRegion(names, values, likelihood, likelihood > -1)
+        region = rk.inverse.FeasibleRegion(names, values, likelihood, jnp.asarray(np.ones((2, 2), bool)))
         return rk.plot.feasible_region(region, wall=wall).lines[0].get_xydata()
 
     np.testing.assert_allclose(
@@ -251,10 +261,10 @@ def test_ticks_of_many_decades_do_not_overlap():
 def maps_of(rows, columns):
     """Figures of a feasible region, sensitivities and a fragility surface of so many rows and columns, which have one
     value each."""
-    up, across = jnp.geomspace(0.1, 1.0, rows), jnp.geomspace(0.2, 2.0, columns)
-    ones = jnp.ones((rows, columns))
-    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), ones, ones > 0)
-    told = rk.studies.SensitivityMap(up, across, jnp.asarray(0.0), sensitivity_of(jnp.ones((rows, columns, 2))))
+    up, across = jnp.asarray(np.geomspace(0.1, 1.0, rows)), jnp.asarray(np.geomspace(0.2, 2.0, columns))
+    ones, all_likely = jnp.asarray(np.ones((rows, columns))), jnp.asarray(np.ones((rows, columns), bool))
+    region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), ones, all_likely)
+    told = rk.studies.SensitivityMap(up, across, jnp.asarray(0.0), sensitivity_of(np.ones((rows, columns, 2))))
     shares = rk.hazard.SimulatedSurface(up, across, np.ones((1, rows, columns, 1), np.int8))
     return (
         rk.plot.feasible_region(region),
@@ -276,13 +286,10 @@ def test_other_maps_of_one_row_or_column_are_drawn(shape):
 
 def test_a_feasible_region_is_drawn_in_order():
     """Whatever the order of its lists, cells and border are the same."""
-    rows, columns = jnp.geomspace(0.1, 1.0, 4), jnp.geomspace(0.2, 2.0, 5)
+    rows, columns = np.geomspace(0.1, 1.0, 4), np.geomspace(0.2, 2.0, 5)
 
     def drawn(up, across):
-        up, across = rows[jnp.array(up)], columns[jnp.array(across)]
-        likelihood = -((jnp.log(up / 0.4)[:, None]) ** 2) - jnp.log(across / 0.7) ** 2
-        region = rk.inverse.FeasibleRegion(("amplitude", "period"), (up, across), likelihood, likelihood > -1)
-        cells, border = rk.plot.feasible_region(region).collections
+        cells, border = rk.plot.feasible_region(a_region(rows[list(up)], columns[list(across)])).collections
         return cells.get_array(), cells.get_coordinates(), border.get_paths()[0].vertices
 
     for found, expected in zip(drawn([2, 0, 3, 1], [4, 3, 2, 1, 0]), drawn(range(4), range(5))):
@@ -297,11 +304,11 @@ def test_units_of_parameters_are_those_declared():
 def test_a_map_of_one_row_or_column_is_drawn():
     """Its cells have a width, whatever the order of the axes; overturned ones are not the colour of the safe."""
     grid = np.linspace(0.5, 8, 9), np.array([3.0])
-    states = np.asarray(rk.overturning_map(*grid, alpha=0.2, progress=False).state)[0]
+    states = np.asarray(rk.overturning_map(*grid, **LINEAR).state)[0]
     assert set(states) == {0, 1, 2}
     mixed = np.random.default_rng(1).permutation(9)
     for first in (grid[0], grid[0][mixed]):
-        axis = rk.plot.overturning(rk.overturning_map(first, grid[1], alpha=0.2, progress=False))
+        axis = rk.plot.overturning(rk.overturning_map(first, grid[1], **LINEAR))
         drawn = axis.collections[-1]
         np.testing.assert_array_equal(np.ma.filled(drawn.get_array(), 0).ravel(), states)
         assert np.ptp(drawn.get_coordinates()[..., 1]) > 0.1 and np.ptp(axis.get_ylim()) > 0.1
@@ -311,7 +318,7 @@ def test_a_map_of_one_row_or_column_is_drawn():
 @pytest.mark.filterwarnings("error")
 def test_places_that_are_there_twice_have_one_cell():
     """Of two alike neither would have a width, and all would be the colour of the safe."""
-    result = rk.overturning_map([2.0, 2.0], [4.0, 3.0, 4.0], alpha=0.2, progress=False)
+    result = rk.overturning_map([2.0, 2.0], [4.0, 3.0, 4.0], **LINEAR)
     axis = rk.plot.overturning(result, exact=False)
     drawn = axis.collections[-1]
     np.testing.assert_array_equal(np.ma.filled(drawn.get_array(), 0), np.asarray(result.state)[[1, 0], :1])
@@ -332,8 +339,8 @@ def test_sizes_that_are_there_twice_are_shaded():
 
 def test_sizes_that_overturn_alone_are_shaded():
     """A spectrum's overturned sizes each have a cell, half way to their neighbours."""
-    quick = {"engine": rk.Series(order=6), "progress": False}
-    spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), np.linspace(0.5, 8, 200), **quick)
+    sizes = 1.07 + 0.08 * np.arange(64)
+    spectrum = rk.rocking_spectrum(np.arctan(0.2), rk.example_record(), sizes, progress=False, **QUICK)
     lost, places = np.asarray(spectrum.overturned), np.asarray(spectrum.abscissa)
     axis, _ = rk.plot.spectrum(spectrum)
     spans = sorted((patch.get_x(), patch.get_x() + patch.get_width()) for patch in axis.patches)
@@ -345,8 +352,8 @@ def test_sizes_that_overturn_alone_are_shaded():
 
 def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
     """Where exact borders take too long, and it is said; where they were asked for they are drawn."""
-    monkeypatch.setattr("jaxrock.plot.surfaces._SCENES", 5000)
-    surface = rk.overturning_map(np.linspace(2.5, 3.5, 6), np.linspace(1.05, 3, 6), alpha=0.2, progress=False)
+    monkeypatch.setattr("jaxrock.plot.surfaces._SCENES", 500)
+    surface = rk.overturning_map([3.0, 3.01], np.linspace(1.05, 4.5, 6), **LINEAR)
     with caplog.at_level("INFO", "jaxrock"):
         pixels = rk.plot.overturning(surface)
     assert "too many islands" in caplog.text and len(pixels.lines) == 0
@@ -355,16 +362,18 @@ def test_a_map_of_too_many_islands_is_drawn_by_pixels(monkeypatch, caplog):
 
 
 def map_of(state, ratio, intensity):
-    state = jnp.asarray(state)
-    peaks, counts = jnp.where(state == 0, 0.5, jnp.inf), jnp.zeros_like(state)
+    state = np.asarray(state)
+    peaks, counts = np.where(state == 0, 0.5, np.inf), np.zeros_like(state)
+    state, peaks, counts = map(jnp.asarray, (state, peaks, counts))
     return rk.studies.OverturningMap(
         jnp.asarray(ratio), jnp.asarray(intensity), state, peaks, counts, peaks, rk.Status.successful
     )
 
 
 def spectrum_of(lost, abscissa):
-    lost = jnp.asarray(lost)
-    peaks, counts = jnp.where(lost, jnp.inf, 0.5), jnp.zeros(lost.shape, int)
+    lost = np.asarray(lost)
+    peaks, counts = np.where(lost, np.inf, 0.5), np.zeros(lost.shape, int)
+    lost, peaks, counts = map(jnp.asarray, (lost, peaks, counts))
     return rk.studies.Spectrum(jnp.asarray(abscissa), peaks, peaks, counts, lost, peaks, rk.Status.successful)
 
 
@@ -410,10 +419,12 @@ def test_the_legend_of_many_intensities_lies_beside_the_curves():
 def wrong_figures():
     """Calls with an argument that is not what is asked for, and what is said of it."""
     spectrum, told = spectrum_of([False], [1.0]), sensitivity_of([1.0, 2.0])
-    surface = rk.studies.SensitivityMap(jnp.ones(1), jnp.ones(1), jnp.zeros(()), told)
-    numbers, counts, verdicts = jnp.zeros(3), jnp.zeros(3, int), jnp.zeros(3, bool)
-    one = rk.studies.Critical(
-        jnp.array(3), numbers, numbers, verdicts, counts, verdicts, numbers[:, None], jnp.array(True), ("alpha",)
+    one = jnp.asarray([1.0])
+    surface = rk.studies.SensitivityMap(one, one, jnp.asarray(0.0), told)
+    numbers, counts, verdicts = (jnp.asarray(np.zeros(3, kind)) for kind in (float, int, bool))
+    slopes = jnp.asarray(np.zeros((3, 1)))
+    ends = rk.studies.Critical(
+        jnp.array(3), numbers, numbers, verdicts, counts, verdicts, slopes, jnp.array(True), ("alpha",)
     )
     one_axis = plt.figure().add_subplot()
     plot = rk.plot
@@ -428,7 +439,7 @@ def wrong_figures():
         (lambda: plot.tornado(told, "rotation"), "`result` must be .*max_rotation"),
         (lambda: plot.sensitivity_map(surface, "shap"), "`parameter` must be .*alpha"),
         (lambda: plot.scene(rk.Block(0.2, 2.0), None, plt.figure()), "`axis` must be an axis of matplotlib"),
-        (lambda: plot.critical([1.0], one), "`abscissa` and `ends` must be of as many scenes"),
+        (lambda: plot.critical([1.0], ends), "`abscissa` and `ends` must be of as many scenes"),
     ]
 
 
