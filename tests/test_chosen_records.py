@@ -93,11 +93,11 @@ def test_a_store_knows_the_names_of_records(grid, tmp_path):
         axes = {"motion": rk.motions.Suite(RECORDS, names), "scale": SCALES}
         return rk.sweep(outcome, **axes, store=tmp_path / "s.zarr", progress=False)
 
-    run("abcd")
-    again = run("abcd")
+    run(list("abcd"))
+    again = run(list("abcd"))
     assert again.resumed == 4 * SCALES.size and list(again.axes["motion"]) == list("abcd")
     with pytest.raises(ValueError, match="other words of axis `motion`"):
-        run("abce")
+        run(list("abce"))
 
 
 def test_lanes_share_the_samples_of_all_records():
@@ -187,7 +187,8 @@ def test_records_times_factors_are_chosen_by_number():
     """Alone or as many factors of one record, beside records as they are."""
     suite = rk.motions.Suite([RECORDS[0], 0.5 * RECORDS[2], np.array([0.4, 0.6]) * RECORDS[3]])
     found = jax.vmap(lambda number: outcome(suite[number]).margin)(jnp.arange(4))
-    expected = [at_scales(motion, np.ones(SCALES.size)).margin[0] for motion in suite]
+    each = (RECORDS[0], 1.0), (RECORDS[2], 0.5), (RECORDS[3], 0.4), (RECORDS[3], 0.6)
+    expected = [at_scales(record, np.full(SCALES.size, factor)).margin[0] for record, factor in each]
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
