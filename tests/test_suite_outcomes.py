@@ -22,7 +22,7 @@ RECORDS = [
         dt,
         f"record {k}",
     )
-    for k, (n, dt) in enumerate([(300, 0.01), (500, 0.01), (450, 0.02), (512, 0.01)])
+    for k, (n, dt) in enumerate([(300, 0.01), (500, 0.01), (450, 0.02), (1000, 0.005)])
 ]
 MOTIONS = [*RECORDS, rk.SinePulse(np.array([0.6, 1.2]), 0.7)]
 SCALE = np.array([0.4, 1.0, 2.5])
