@@ -498,7 +498,7 @@ def test_a_batch_of_motions_is_made_at_once():
 # ------------------------------------------------------------------------------------------ late motions
 
 LATE = rk.SinePulse(0.3, 0.8)
-QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=8)}
 
 
 @jax.jit

@@ -454,15 +454,18 @@ def test_fit_of_a_simulated_surface():
     assert float(fit.fragility.median) == float(plain.fragility.median) == pytest.approx(0.15, rel=0.05)
     errors = np.sqrt(np.diag(fit.covariance) / np.diag(plain.covariance))
     assert np.all((0.5 < errors) & (errors < 2.0))
-    alone = rk.hazard.SimulatedSurface(*jax.device_put((acceleration, ratio)), verdict[..., :1]).fit()
-    assert np.isfinite(alone.fragility.median) and np.isnan(alone.covariance).all()  # a block says nothing of others
+    # A block says nothing of others, whichever way round.
+    finer = np.geomspace(0.1, 1.5, 200)
+    single = np.random.default_rng(4).uniform(size=(200, 20)) < true_share(finer[:, None], ratio)
+    single = rk.hazard.SimulatedSurface(*jax.device_put((finer, ratio)), single[None, :, :, None].astype(np.int8))
+    mirrored = dataclasses.replace(single, verdict=np.repeat(single.verdict, 2, axis=3), ways=2)
+    for alone in (single.fit(), mirrored.fit()):
+        assert np.isfinite(alone.fragility.median) and np.isnan(alone.covariance).all()
     # A block and its mirror image are one draw, both ways under one pulse as under two.
     other = verdict[..., ::-1]
     both = dataclasses.replace(found, verdict=np.concatenate([verdict, other], axis=3), ways=2).fit()
     pulses = np.concatenate([verdict, other])
     np.testing.assert_allclose(both.covariance, dataclasses.replace(found, verdict=pulses).fit().covariance, rtol=1e-12)
-    mirrored = dataclasses.replace(found, verdict=np.repeat(verdict[..., :1], 2, axis=3), ways=2).fit()
-    assert np.isfinite(mirrored.fragility.median) and np.isnan(mirrored.covariance).all()
     verdict[0, 5, 5, 0] = -1
     with pytest.raises(ValueError, match="1 of 4000 scenes are undecided"):
         found.fit()
