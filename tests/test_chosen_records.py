@@ -26,17 +26,21 @@ def outcome(motion, scale=1.0):
     return rk.outcome(BLOCK, scale * motion, **QUICK)
 
 
+def at_scales(motion, scales):
+    """Of one motion with samples of its own."""
+    return jax.vmap(lambda scale: outcome(motion, scale))(scales)
+
+
 @pytest.fixture(scope="module")
 def grid():
     """Eighty scenes: the quick pass, too."""
-    return rk.sweep(lambda motion, scale: outcome(motion, scale), motion=SUITE, scale=SCALES, progress=False)
+    return rk.sweep(outcome, motion=SUITE, scale=SCALES, progress=False)
 
 
 @pytest.fixture(scope="module")
 def by_hand():
     """The same, record after record with samples of its own."""
-    parts = [jax.vmap(lambda scale, motion=motion: outcome(motion, scale))(SCALES) for motion in RECORDS]
-    return jax.tree.map(lambda *rows: np.stack(rows), *parts)
+    return jax.tree.map(lambda *rows: np.stack(rows), *(at_scales(motion, SCALES) for motion in RECORDS))
 
 
 @pytest.mark.parametrize("name", ["overturned", "impact_count", "max_rotation", "margin", "time_of_max", "clearance"])
@@ -86,14 +90,14 @@ def test_a_store_knows_the_names_of_records(grid, tmp_path):
     pytest.importorskip("zarr")
 
     def run(names):
-        suite = rk.motions.Suite(RECORDS[:2], names)
-        return rk.sweep(lambda motion: outcome(motion), motion=suite, store=tmp_path / "s.zarr", progress=False)
+        axes = {"motion": rk.motions.Suite(RECORDS, names), "scale": SCALES}
+        return rk.sweep(outcome, **axes, store=tmp_path / "s.zarr", progress=False)
 
-    run(["a", "b"])
-    again = run(["a", "b"])
-    assert again.resumed == 2 and list(again.axes["motion"]) == ["a", "b"]
+    run(list("abcd"))
+    again = run(list("abcd"))
+    assert again.resumed == 4 * SCALES.size and list(again.axes["motion"]) == list("abcd")
     with pytest.raises(ValueError, match="other words of axis `motion`"):
-        run(["a", "c"])
+        run(list("abce"))
 
 
 def test_lanes_share_the_samples_of_all_records():
@@ -183,7 +187,8 @@ def test_records_times_factors_are_chosen_by_number():
     """Alone or as many factors of one record, beside records as they are."""
     suite = rk.motions.Suite([RECORDS[0], 0.5 * RECORDS[2], np.array([0.4, 0.6]) * RECORDS[3]])
     found = jax.vmap(lambda number: outcome(suite[number]).margin)(jnp.arange(4))
-    expected = [outcome(motion).margin for motion in suite]
+    each = (RECORDS[0], 1.0), (RECORDS[2], 0.5), (RECORDS[3], 0.4), (RECORDS[3], 0.6)
+    expected = [at_scales(record, np.full(SCALES.size, factor)).margin[0] for record, factor in each]
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
@@ -228,4 +233,4 @@ def test_largest_values_from_each_piece_on(count):
     """Of the next 16, the next 256, and all that follow."""
     values = np.abs(np.random.default_rng(count).normal(size=count)) * np.exp(-np.arange(count) / count)
     wanted = [[values[i : i + most].max() for i in range(count)] for most in (count, 16, 256)]
-    np.testing.assert_array_equal(outlook._maxima(jnp.asarray(values)), wanted)
+    np.testing.assert_array_equal(jax.jit(outlook._maxima)(values), wanted)

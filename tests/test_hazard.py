@@ -61,7 +61,7 @@ def integral(probability, curve, breaks=()):
         k = mp.log(rates[i] / rates[i + 1]) / mp.log(levels[i + 1] / levels[i])
         ends = [levels[i], *(mp.mpf(x) for x in breaks if levels[i] < x < levels[i + 1]), levels[i + 1]]
         density = lambda x, i=i, k=k: probability(x) * k * rates[i] * (x / levels[i]) ** -k / x
-        total += mp.quad(density, [mp.mpf(x) for x in ends])
+        total += mp.quad(density, [mp.mpf(x) for x in ends], method="gauss-legendre")
     return total + rates[-1] * probability(levels[-1])
 
 
@@ -69,23 +69,32 @@ def lognormal(median, dispersion):
     return lambda x: mp.ncdf(mp.log(x / mp.mpf(median)) / mp.mpf(dispersion))
 
 
+def pushed(function):
+    """Values and changes of a function for rows of numbers and of directions, as one program."""
+    return jax.jit(jax.vmap(lambda numbers, direction: jax.jvp(function, (numbers,), (direction,))))
+
+
+STEPS = np.arange(-3, 4)
+
+
 def assert_slopes(function, numbers):
     """Derivatives of all results in three directions against central differences of sixth order."""
-    pushed = jax.jit(lambda x, direction: jax.jvp(function, (x,), (direction,)))  # one program for both
     for seed in range(3):
         direction = numbers * np.random.default_rng(seed).normal(size=numbers.size)
-        at = lambda n, direction=direction: np.asarray(pushed(numbers + n * 1e-3 * direction, direction)[0])
-        differences = (45 * (at(1) - at(-1)) - 9 * (at(2) - at(-2)) + at(3) - at(-3)) / 0.06
-        np.testing.assert_allclose(pushed(numbers, direction)[1], differences, rtol=1e-8)
+        rows = numbers + 1e-3 * STEPS[:, None] * direction
+        values, changes = (np.asarray(x) for x in function(rows, np.tile(direction, (STEPS.size, 1))))
+        differences = np.array([-1, 9, -45, 0, 45, -9, 1]) @ values / 0.06
+        np.testing.assert_allclose(changes[3], differences, rtol=1e-8)
 
 
 # --------------------------------------------------------------------------------------- hazard curves
 
 
 def test_rates_between_levels_follow_power_laws():
-    np.testing.assert_allclose(CURVE.rate(LEVELS), CURVE.rates, rtol=1e-14)
-    middle = np.sqrt(LEVELS[1:] * LEVELS[:-1])
-    np.testing.assert_allclose(CURVE.rate(middle), np.sqrt(CURVE.rates[1:] * CURVE.rates[:-1]), rtol=1e-13)
+    rates, middle = np.asarray(CURVE.rates), np.sqrt(LEVELS[1:] * LEVELS[:-1])
+    at_levels, between = np.split(np.asarray(CURVE.rate(np.append(LEVELS, middle))), [LEVELS.size])
+    np.testing.assert_allclose(at_levels, rates, rtol=1e-14)
+    np.testing.assert_allclose(between, np.sqrt(rates[1:] * rates[:-1]), rtol=1e-13)
     power = rk.hazard.HazardCurve([0.1, 0.3, 2.0], 1e-3 * np.array([0.1, 0.3, 2.0]) ** -1.7)
     x = np.geomspace(0.1, 2.0, 37)[1:-1]
     np.testing.assert_allclose(power.rate(x), 1e-3 * x**-1.7, rtol=1e-13)
@@ -142,15 +151,21 @@ def test_a_curve_that_falls_off_is_extended():
 def test_what_a_curve_leaves_open_is_bounded(median):
     """The rate under the full hazard lies between those under the curve that was cut, and under its power laws."""
     fragility = rk.hazard.LogNormalFragility(median, 0.4)
-    levels = np.geomspace(1e-4, 1e2, 400)
-    curve = lambda part: rk.hazard.HazardCurve(levels[part], site_rate(levels[part]))
-    full = float(rk.hazard.toppling_rate(fragility, curve(slice(None))))
-    cut = curve(slice(180, 260))  # 0.05 g to 0.8 g
-    below, above = (float(rk.hazard.toppling_rate(fragility, c)) for c in (cut, cut.extended(1e-4, 1e2)))
+    place, levels = np.arange(80), np.geomspace(1e-4, 1e2, 80)
+
+    def curve(first, end):
+        """Its rates are known of the levels from the first on, before the end."""
+        known = np.where(place < first, np.inf, np.where(place < end, site_rate(levels), 0.0))
+        return rk.hazard.HazardCurve(levels, known)
+
+    full = float(rk.hazard.toppling_rate(fragility, curve(0, 80)))
+    cut = curve(36, 52)  # 0.05 g to 0.8 g
+    inner = rk.hazard.HazardCurve(levels[1:-1], cut.rates[1:-1])
+    below, above = (float(rk.hazard.toppling_rate(fragility, c)) for c in (cut, inner.extended(1e-4, 1e2)))
     assert below < full < above
     # Above the last level, what is left open is at most its rate times the probability to withstand it.
-    beyond = curve(slice(0, 260))
-    most = float(beyond.rates[-1]) * (1 - float(fragility(float(beyond.levels[-1]))))
+    beyond = curve(0, 52)
+    most = site_rate(levels[51]) * (1 - ndtr(np.log(levels[51] / median) / 0.4))
     assert -1e-15 <= full - float(rk.hazard.toppling_rate(fragility, beyond)) <= most + 1e-15
 
 
@@ -177,9 +192,8 @@ def test_power_law_hazard_with_lognormal_fragility(k, median, dispersion):
 def test_small_dispersions_keep_the_digits_of_the_rate(double, rtol):
     """Far within one power law the rate is that of the median times exp(k^2 b^2/2), down to a step."""
     with jax.enable_x64(double):
-        levels, rates = [0.05, 0.1, 0.2, 0.4, 0.8, 1.6], [3e-2, 1e-2, 3e-3, 5e-4, 5e-5, 2e-6]
-        curve = rk.hazard.HazardCurve(levels, rates)
-        k = np.log(rates[2] / rates[3]) / np.log(2)
+        curve = rk.hazard.HazardCurve([0.1, 0.2, 0.4, 0.8], [1e-2, 3e-3, 5e-4, 5e-5])
+        k = np.log(3e-3 / 5e-4) / np.log(2)
         at_median = 3e-3 * (0.3 / 0.2) ** -k
         for dispersion in (1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
             found = rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(0.3, dispersion), curve)
@@ -214,8 +228,9 @@ def test_tabulated_fragility():
     levels, values = np.array([0.12, 0.25, 0.33, 0.5]), np.array([0.1, 0.7, 0.3, 0.9])
     table = rk.hazard.TabulatedFragility(levels, values)
     inside = np.geomspace(0.12, 0.5, 50)
-    np.testing.assert_allclose(table(inside), np.interp(np.log(inside), np.log(levels), values), rtol=1e-13)
-    np.testing.assert_allclose(table([0.119, 0.6]), [0.0, 0.9])
+    found = np.asarray(table(np.append(inside, [0.119, 0.6])))
+    np.testing.assert_allclose(found[:-2], np.interp(np.log(inside), np.log(levels), values), rtol=1e-13)
+    np.testing.assert_allclose(found[-2:], [0.0, 0.9])
 
     def line(x):
         if x < levels[0]:
@@ -251,6 +266,14 @@ ROCKS = [
 AGES = [300.0, 200.0, 900.0, 100.0]
 
 
+def topples(rock, level):
+    """The probability by SciPy and NumPy, of these kinds."""
+    if isinstance(rock, rk.hazard.LogNormalFragility):
+        return ndtr(np.log(level / float(rock.median)) / float(rock.dispersion))
+    levels, values = np.asarray(rock.levels), np.asarray(rock.probabilities)
+    return np.interp(np.log(level), np.log(levels), values, left=0.0)
+
+
 def test_survival_of_rocks_that_share_their_shakings():
     """Poisson shakings, each drawn once for all rocks, each rock drawn by its fragility while it is fragile."""
     rng, histories = np.random.default_rng(7), 8000
@@ -259,7 +282,7 @@ def test_survival_of_rocks_that_share_their_shakings():
     history, ago = np.divmod(time, max(AGES))
     toppled = np.zeros(time.shape, bool)
     for rock, age in zip(ROCKS, AGES):
-        toppled |= (rng.uniform(size=time.size) < rock(intensity)) & (ago < age)
+        toppled |= (rng.uniform(size=time.size) < topples(rock, intensity)) & (ago < age)
     survived = 1 - np.unique(history[toppled]).size / histories
     probability = float(rk.hazard.survival_probability(ROCKS, AGES, CURVE))
     error = np.sqrt(probability * (1 - probability) / histories)
@@ -270,13 +293,13 @@ def test_survival_of_rocks_that_share_their_shakings():
 
 def test_survival_against_direct_quadrature():
     """The definition: over time before present, over the curve, 1 - product of (1 - F) of the rocks already fragile."""
-    x = np.exp(np.linspace(np.log(LEVELS[0]), np.log(LEVELS[-1]), 400_001))
-    rate = np.asarray(CURVE.rate(x))
+    logarithm = np.linspace(np.log(LEVELS[0]), np.log(LEVELS[-1]), 400_001)
+    x, rate = np.exp(logarithm), np.exp(np.interp(logarithm, np.log(LEVELS), np.log(site_rate(LEVELS))))
     middle, falls = np.sqrt(x[1:] * x[:-1]), rate[:-1] - rate[1:]
     exponent = 0.0
     for start, end in ((0.0, 100.0), (100.0, 200.0), (200.0, 300.0), (300.0, 900.0)):
         there = [rock for rock, age in zip(ROCKS, AGES) if age >= end]
-        joint = lambda level, there=there: 1 - np.prod([1 - np.asarray(rock(level)) for rock in there], axis=0)
+        joint = lambda level, there=there: 1 - np.prod([1 - topples(rock, level) for rock in there], axis=0)
         exponent += (end - start) * (np.sum(joint(middle) * falls) + rate[-1] * joint(x[-1:])[0])
     np.testing.assert_allclose(rk.hazard.survival_probability(ROCKS, AGES, CURVE), np.exp(-exponent), rtol=1e-7)
 
@@ -351,14 +374,10 @@ def test_a_rock_counts_since_it_became_fragile():
 
 
 def test_uncertain_ages_are_a_mean_over_samples():
-    samples = np.random.default_rng(1).uniform(100.0, 3000.0, (50, 2))
-    each = np.asarray(
-        jax.jit(jax.vmap(lambda ages: rk.hazard.survival_probability([ROCK, TOUGH], ages, CURVE)))(samples)
-    )
+    samples = np.random.default_rng(1).uniform(100.0, 3000.0, (50, 4))
+    each = np.asarray(jax.jit(jax.vmap(lambda ages: rk.hazard.survival_probability(ROCKS, ages, CURVE)))(samples))
     for i in (0, 17, 49):
-        np.testing.assert_allclose(
-            each[i], rk.hazard.survival_probability([ROCK, TOUGH], samples[i], CURVE), rtol=1e-13
-        )
+        np.testing.assert_allclose(each[i], rk.hazard.survival_probability(ROCKS, samples[i], CURVE), rtol=1e-13)
 
 
 # --------------------------------------------------------------------------------------- branches and scales
@@ -381,6 +400,22 @@ def test_weights_of_branches():
     assert weights[0] > 0.8 and weights[2] < 1e-6
 
 
+def allowed(numbers, curve):
+    """The factor that an age [years] and a probability allow."""
+    return rk.hazard.allowed_scale(ROCK, numbers[0], curve, numbers[1])
+
+
+@jax.jit
+def with_derivatives(age, curve, probability=0.05):
+    """The allowed factor, its slopes by age and probability, and how these change with the probability."""
+
+    def slopes(probability):
+        return jax.value_and_grad(allowed)(jnp.stack([age, probability]), curve)
+
+    (value, first), (_, second) = jax.jvp(slopes, (probability,), (jnp.ones_like(probability),))
+    return value, first, second
+
+
 def test_allowed_scale_under_a_power_law():
     """Intensities times s raise the toppling rate of a power law by s^k: the factor in closed form."""
     k, age = 2.3, 2e4
@@ -388,41 +423,32 @@ def test_allowed_scale_under_a_power_law():
     curve = rk.hazard.HazardCurve(levels, 1e-5 * levels**-k, "PGA")
     once = age * 1e-5 * 0.35**-k * np.exp((k * 0.4) ** 2 / 2)
     exact = lambda probability: (-np.log(probability) / once) ** (1 / k)
-    scale = lambda p: rk.hazard.allowed_scale(ROCK, age, curve, p)
-    np.testing.assert_allclose(rk.hazard.allowed_scale(ROCK, age, curve), exact(0.05), rtol=1e-12)
+    np.testing.assert_allclose(with_derivatives(age, curve)[0], exact(0.05), rtol=1e-12)
     # d s/d p = s/(k p ln p), and its derivative.
     p, slope = 0.2, exact(0.2) / (k * 0.2 * np.log(0.2))
     curvature = slope * (1 / (k * p * np.log(p)) - 1 / p - 1 / (p * np.log(p)))
-    found = jax.jit(lambda p: jax.jvp(jax.jacfwd(scale), (p,), (1.0,)))(p)
-    np.testing.assert_allclose(found, [slope, curvature], rtol=1e-9)
-
-
-def test_allowed_scale_brings_survival_to_the_probability():
-    probabilities = np.array([0.01, 0.05, 0.5])
-    scales = np.asarray(jax.jit(jax.vmap(lambda p: rk.hazard.allowed_scale(ROCKS, AGES, CURVE, p)))(probabilities))
-    survival = lambda scale: float(rk.hazard.survival_probability(ROCKS, AGES, CURVE.scaled(scale)))
-    np.testing.assert_allclose([survival(scale) for scale in scales], probabilities, rtol=1e-12)
-    assert survival(1.001 * scales[1]) < 0.05
-    np.testing.assert_allclose(CURVE.scaled(3.0).levels, 3 * LEVELS, rtol=1e-15)
-    np.testing.assert_array_equal(CURVE.scaled(3.0).rates, CURVE.rates)
+    _, first, second = with_derivatives(age, curve, p)
+    np.testing.assert_allclose([first[1], second[1]], [slope, curvature], rtol=1e-9)
 
 
 def test_no_factor_is_large_or_small_enough():
     """The curve knows 0.21 shakings a year: in 14 years the weakest rock stands with more than 5 %."""
     assert 14 * CURVE.rates[0] < -np.log(0.05) < 15 * CURVE.rates[0]
-    assert rk.hazard.allowed_scale(ROCK, 14.0, CURVE) == np.inf
-    assert 1 < rk.hazard.allowed_scale(ROCK, 15.0, CURVE) < np.inf
-    assert rk.hazard.allowed_scale(Step(1e-9), 2000.0, CURVE) == 0
-    slope = jax.jit(jax.grad(lambda age: rk.hazard.allowed_scale(ROCK, age, CURVE)))
-    assert slope(14.0) == 0
-    near = [float(rk.hazard.allowed_scale(ROCK, age, CURVE)) for age in (100.01, 99.99)]
-    np.testing.assert_allclose(slope(100.0), (near[0] - near[1]) / 0.02, rtol=1e-6)
+    certain = rk.hazard.TabulatedFragility([1e-9, 2e-9, 3e-9, 4e-9], [1.0, 1.0, 1.0, 1.0])
+    assert rk.hazard.allowed_scale(certain, 2000.0, CURVE) == 0
+    values, slopes, _ = zip(
+        *(jax.device_get(with_derivatives(age, CURVE)) for age in (14.0, 15.0, 99.99, 100.0, 100.01))
+    )
+    assert values[0] == np.inf and 1 < values[1] < np.inf
+    assert slopes[0][0] == 0
+    np.testing.assert_allclose(slopes[3][0], (values[4] - values[2]) / 0.02, rtol=1e-6)
 
 
 def test_allowed_scale_is_the_first_of_several():
     """A rock that only middling shakings topple stands under weak and under strong hazard."""
     rock = rk.hazard.TabulatedFragility([0.2, 0.3, 0.5, 0.6], [0.0, 1.0, 1.0, 0.0])
-    curve = rk.hazard.HazardCurve([0.1, 0.11], [1e-3, 1e-3 * (1 - 1e-9)])
+    levels = np.geomspace(0.1, 0.11, LEVELS.size)
+    curve = rk.hazard.HazardCurve(levels, 1e-3 * (1 - 1e-9 * np.linspace(0.0, 1.0, LEVELS.size)), "PGA")
     scale = float(rk.hazard.allowed_scale(rock, 6000.0, curve))
     assert 2.0 < scale / (0.1 / 0.11) and scale < 3.0
     for factor, probability in ((1.5, 1.0), (0.999 * scale, 0.0515), (1.001 * scale, 0.0485), (7.0, 1.0)):
@@ -433,24 +459,43 @@ def test_allowed_scale_is_the_first_of_several():
 
 def rebuilt(numbers):
     """Rocks, ages and a curve from 9 numbers."""
-    medians, dispersions, ages, rest = numbers[:2], numbers[2:4], numbers[4:6], numbers[6:]
+    medians, dispersions, ages, rest = numbers[:2], numbers[2:4], numbers[4:6], numbers[6:9]
     rocks = [rk.hazard.LogNormalFragility(m, b) for m, b in zip(medians, dispersions)]
     rocks += [rk.hazard.TabulatedFragility(jnp.append(rest[0], 0.5), jnp.append(0.2, rest[1]))]
     curve = rk.hazard.HazardCurve(LEVELS, CURVE.rates * jnp.asarray(LEVELS) ** (rest[2] - 1))
     return rocks, jnp.append(ages, 80.0), curve
 
 
+def results(numbers):
+    """Rates of two of the rocks, survival of all where shakings are times the tenth number, and the factor that the
+    last one allows."""
+    rocks, ages, curve = rebuilt(numbers)
+    rates = [rk.hazard.toppling_rate(rock, curve) for rock in (rocks[0], rocks[2])]
+    survival = rk.hazard.survival_probability(rocks, ages, curve.scaled(numbers[9]))
+    return jnp.stack([*rates, survival, rk.hazard.allowed_scale(rocks, ages, curve, numbers[10])])
+
+
+NUMBERS = np.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05, 1.1, 0.05])
+RESULTS = pushed(results)
+
+
 def test_derivatives():
-    """By medians, dispersions, ages, an edge and a value of a table, and the slope of the curve."""
+    """By medians, dispersions, ages, an edge and a value of a table, the slope of the curve, what multiplies its
+    levels, and the probability that is asked for."""
+    assert_slopes(RESULTS, NUMBERS)
 
-    def results(numbers):
-        rocks, ages, curve = rebuilt(numbers)
-        rates = [rk.hazard.toppling_rate(rock, curve) for rock in (rocks[0], rocks[2])]
-        return jnp.stack(
-            [*rates, rk.hazard.survival_probability(rocks, ages, curve), rk.hazard.allowed_scale(rocks, ages, curve)]
-        )
 
-    assert_slopes(results, np.array([0.35, 0.6, 0.4, 0.25, 150.0, 40.0, 0.21, 0.7, 1.05]))
+def test_allowed_scale_brings_survival_to_the_probability():
+    rows = np.tile(NUMBERS, (STEPS.size, 1))  # as many as above
+    probabilities = np.array([0.01, 0.05, 0.5])
+    rows[:3, 10] = probabilities
+    scales = np.asarray(RESULTS(rows, rows)[0])[:3, 3]
+    rows[:4, 9] = *scales, 1.001 * scales[1]
+    *survival, beyond = np.asarray(RESULTS(rows, rows)[0])[:4, 2]
+    np.testing.assert_allclose(survival, probabilities, rtol=1e-12)
+    assert beyond < 0.05
+    np.testing.assert_allclose(CURVE.scaled(3.0).levels, 3 * LEVELS, rtol=1e-15)
+    np.testing.assert_array_equal(CURVE.scaled(3.0).rates, CURVE.rates)
 
 
 SLOPES = [
@@ -592,9 +637,10 @@ def test_fit_to_counts_at_two_levels():
 def test_fit_recovers_a_fragility():
     """Over many data sets of 200 shakings the truth lies in the ellipse of 95 % in 95 % of them."""
     rng = np.random.default_rng(3)
-    levels = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (300, 200)))
-    toppled = rng.uniform(size=levels.shape) < ndtr(np.log(levels / 0.35) / 0.4)
-    fits = jax.device_get(jax.jit(jax.vmap(rk.hazard.fit_fragility))(levels, toppled))
+    levels = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (300, 25)))
+    toppled = rng.binomial(8, ndtr(np.log(levels / 0.35) / 0.4))
+    many = jax.jit(jax.vmap(lambda *data: rk.hazard.fit_fragility(*data, 8)))
+    fits = jax.device_get(many(levels, toppled))
     assert np.all(fits.status == rk.hazard.FitStatus.successful)
     off = np.log(np.stack([fits.fragility.median / 0.35, fits.fragility.dispersion / 0.4], -1))
     assert np.abs(off.mean(0)).max() < 0.03
@@ -641,11 +687,11 @@ def test_fit_says_what_the_data_do_not(levels, toppled, status, between):
 def test_fit_has_derivatives():
     """How median and dispersion follow levels and counts."""
 
-    def results(numbers):
+    def line(numbers):
         fit = rk.hazard.fit_fragility(numbers[:4], numbers[4:], 8)
         return jnp.stack([fit.fragility.median, fit.fragility.dispersion])
 
-    assert_slopes(results, np.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
+    assert_slopes(pushed(line), np.array([0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 4.0, 5.0]))
 
 
 # --------------------------------------------------------------------------------------- files
@@ -708,11 +754,15 @@ def test_files_of_several_branches(file):
     assert found.kinds == tuple(kinds)
     assert found.curves.levels.shape == found.curves.rates.shape == (3, 2, 5)
     np.testing.assert_allclose(np.asarray(found.at(0, 2).rates)[1], -np.log1p(-0.8 * 0.65) / 50, rtol=1e-12)
-    survival = jax.jit(jax.vmap(lambda curve: rk.hazard.survival_probability(ROCK, 1000.0, curve)))(found.at(1))
+    both = lambda curve: (
+        rk.hazard.survival_probability(ROCK, 1000.0, curve),
+        rk.hazard.toppling_rate(ROCK, curve),
+    )
+    survival, rate = jax.device_get(jax.jit(jax.vmap(jax.vmap(both)))(found.curves))
     single = [rk.hazard.survival_probability(ROCK, 1000.0, found.at(1, branch)) for branch in range(3)]
-    np.testing.assert_allclose(survival, single, rtol=1e-13)
-    sites = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda curve: rk.hazard.toppling_rate(ROCK, curve))))(found.curves))
-    np.testing.assert_allclose(sites[2, 1], rk.hazard.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
+    np.testing.assert_allclose(survival[:, 1], single, rtol=1e-13)
+    np.testing.assert_array_equal(found.at(1).rates, found.curves.rates[:, 1])
+    np.testing.assert_allclose(rate[2, 1], rk.hazard.toppling_rate(ROCK, found.at(1, 2)), rtol=1e-13)
 
 
 OLD = "lon,lat,depth,poe-0.1,poe-0.4,poe-1.0\n0.00000,0.00000,-0.10000,4.528811E-01,5.589804E-02,5.585141E-03\n"
@@ -857,7 +907,8 @@ def test_slopes_where_a_knot_is_a_level_of_the_curve():
     def closed(median):
         return jnp.exp(-1000 * rk.hazard.toppling_rate(rk.hazard.LogNormalFragility(median, 0.35), curve))
 
-    first, second = jax.jit(lambda x: [[d(f)(x) for f in (survival, closed)] for d in (jax.grad, jax.hessian)])(0.4)
+    slopes = jax.jit(lambda x: [jax.jvp(jax.grad(f), (x,), (1.0,)) for f in (survival, closed)])
+    first, second = np.transpose(slopes(0.4))
     np.testing.assert_allclose(*first, rtol=1e-9)
     np.testing.assert_allclose(*second, rtol=1e-8)
 

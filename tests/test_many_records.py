@@ -1,5 +1,7 @@
 """Records of many lengths are one program, and many scales of a record share its arrays."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -14,26 +16,36 @@ class Unpadded(rk.Record):
     """A record that the engines take as it is."""
 
 
+KINDS, BLOCK = (rk.Record, Unpadded), rk.Block(0.15, 3.0)
+
+
+@functools.cache
+def with_and_without_room(count):
+    """Samples, and of both kinds of record all that an outcome tells, and the slope of its margin by the time step."""
+    samples = 1.5 * np.asarray(rk.example_record().samples)[380 : 380 + count]
+
+    def margin(dt, kind):
+        found = rk.outcome(BLOCK, kind(samples, dt), **QUICK)
+        return found.margin, found
+
+    found = [jax.value_and_grad(margin, has_aux=True)(0.01, kind) for kind in KINDS]
+    return samples, [outcome for (_, outcome), _ in found], [slope for _, slope in found]
+
+
 @pytest.mark.parametrize("count", [65, pytest.param(300, marks=pytest.mark.slow)])
 def test_room_for_more_samples_changes_nothing(count):
     """A record gets room for more samples, so that one program serves many lengths: results are those without."""
-    samples, block = 1.5 * np.asarray(rk.example_record().samples)[380 : 380 + count], rk.Block(0.15, 3.0)
-    kinds = rk.Record, Unpadded
-    for found, expected in zip(*(jax.tree.leaves(rk.outcome(block, kind(samples, 0.01), **QUICK)) for kind in kinds)):
+    samples, outcomes, _ = with_and_without_room(count)
+    for found, expected in zip(*map(jax.tree.leaves, outcomes)):
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-15)
-    histories = [rk.simulate(block, kind(samples, 0.01), samples=101, **QUICK) for kind in kinds]
+    histories = [rk.simulate(BLOCK, kind(samples, 0.01), samples=101, **QUICK) for kind in KINDS]
     np.testing.assert_allclose(*(history.time for history in histories), rtol=1e-15)
     np.testing.assert_allclose(*(history.rotation for history in histories), atol=1e-12)
 
 
 def test_derivatives_by_the_time_step_with_room():
     """The record's end moves with its time step, too."""
-    samples, block = 1.5 * np.asarray(rk.example_record().samples)[380:510], rk.Block(0.15, 3.0)
-
-    def slope(kind):
-        return jax.grad(lambda dt: rk.outcome(block, kind(samples, dt), **QUICK).margin)(0.01)
-
-    found, expected = slope(rk.Record), slope(Unpadded)
+    _, _, (found, expected) = with_and_without_room(65)
     assert abs(expected) > 1
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 

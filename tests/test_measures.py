@@ -159,7 +159,7 @@ def test_the_flag_errs_as_often_as_it_says(each):
 
 def test_many_lists_of_measures_are_fitted_at_once():
     """Where nobody can ask what became of a fit."""
-    levels, fell = np.random.default_rng(5).uniform(0.1, 1.0, (3, 20)), np.arange(20) % 3 == 0
+    levels, fell = np.random.default_rng(5).uniform(0.1, 1.0, (3, 200)), np.arange(200) % 3 == 0
     found = jax.vmap(lambda level: rk.hazard.fit_probit({"x": level}, fell).intercept)(levels)
     alone = [rk.hazard.fit_probit({"x": level}, fell).intercept for level in levels]
     np.testing.assert_allclose(found, alone, rtol=1e-9)

@@ -187,7 +187,7 @@ def test_what_is_refused(given, message):
 
 # ---------------------------------------------------------------------------------------------- probit fits
 
-N = 300
+N = 180
 MEASURES = {"PGA": np.exp(RANDOM.normal(-1, 0.5, N)), "ratio": np.exp(RANDOM.normal(-2, 0.4, N))}
 TRUTH = np.array([4.0, 2.0, 1.2])
 DESIGN = np.stack([np.ones(N), *map(np.log, MEASURES.values())])
@@ -232,9 +232,9 @@ def test_against_an_established_package(clusters):
 
 
 def test_errors_for_few_motions():
-    """Of 15 motions with 20 scenes each: intervals of the jackknife hold the slope's truth more often."""
+    """Of 15 motions with 12 scenes each: intervals of the jackknife hold the slope's truth more often."""
     inside = {"information": 0, "clusters": 0, "jackknife": 0}
-    labels, repetitions = np.repeat(np.arange(15), 20), 40
+    labels, repetitions = np.repeat(np.arange(15), N // 15), 40
     for seed in range(repetitions):
         random = np.random.default_rng(seed)
         level = np.exp(random.normal(0, 0.5, labels.size))
@@ -251,8 +251,8 @@ def test_errors_for_few_motions():
 
 def test_a_jackknife_of_what_parts_without_one_row():
     """Without the third of them no line is the best: errors are not known, the fit is."""
-    levels, fell = np.resize([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], 300), np.resize([0, 0, 1, 0, 1, 1], 300)
-    labels = np.where(np.arange(300) % 6 == 2, 2, np.arange(300) % 15 + (np.arange(300) % 15 == 2))  # 15, as above
+    levels, fell = np.resize([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], N), np.resize([0, 0, 1, 0, 1, 1], N)
+    labels = np.where(np.arange(N) % 6 == 2, 2, np.arange(N) % 15 + (np.arange(N) % 15 == 2))  # 15, as above
     fit = rk.hazard.fit_probit({"PGA": levels}, fell, clusters=labels, errors="jackknife")
     assert fit.status == rk.hazard.FitStatus.successful and np.isnan(fit.standard_errors).all()
     other = rk.hazard.fit_probit({"PGA": levels}, fell, clusters=labels, errors="clusters")
