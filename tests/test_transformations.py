@@ -146,9 +146,7 @@ def test_slopes_by_all_samples_within_shard_map():
 
     def velocities(samples, alpha):
         record = rk.Record(samples, 0.02)
-        return jax.vmap(
-            lambda a: rk.outcome(rk.Block(a, 2.0), record, rk.Linear(), engine=engine).max_velocity
-        )(alpha)
+        return jax.vmap(lambda a: rk.outcome(rk.Block(a, 2.0), record, rk.Linear(), engine=engine).max_velocity)(alpha)
 
     whole, every = PartitionSpec(), PartitionSpec("scenes")
     each = jax.shard_map(velocities, mesh=mesh(), in_specs=(whole, every), out_specs=every)
