@@ -266,7 +266,7 @@ def test_fragility(command, column, tmp_path):
 
 def test_errors_of_one_record_are_not_known():
     """It says nothing of others, whatever its blocks did."""
-    levels = np.geomspace(0.2, 6.0, 10)
+    levels = jnp.geomspace(0.2, 6.0, 10)
     verdict = (np.arange(10)[:, None] > np.array([2, 5, 8])).astype(np.int8)[None]
     found = rk.hazard.SimulatedFragility(levels, verdict, *jnp.ones((2, 1)), ("a",), "PGA")
     entries = {entry.label: entry for entry in _entries(found, {"lower": found.fit()})}
