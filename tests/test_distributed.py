@@ -3,7 +3,9 @@
 The processes are those of one machine, which talk over its loopback as machines do over a network.
 """
 
+import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -16,13 +18,14 @@ import pytest
 
 PATIENCE = 240  # seconds; all of it takes some ten
 
-# Every process of a job runs this: own number, number of processes, port, folder, function, block at which to die.
+# Every process of a job runs this: own number, number of processes, port, block at which to die, folder of results, and
+# sweeps, each a function and a folder, one after the other.
 WORKER = """
-import os, signal, sys
+import json, os, signal, sys
 import jax
 jax.config.update("jax_enable_x64", True)
-own, count, port, kill = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[6])
-folder, kind = sys.argv[4:6]
+own, count, port, kill = map(int, sys.argv[1:5])
+results, sweeps = sys.argv[5], json.loads(sys.argv[6])
 import jaxrock as rk
 if count > 1:
     jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
@@ -46,18 +49,20 @@ def outcome(alpha, p):
 def refused(alpha, p):
     return chaotic(checked("p", p, "be below 3.85", lambda p: p < 3.85), 1.0)
 
-store = None if folder == "-" else folder
-if kind == "refused":  # one process fails, and the other hears of it
+def full(self, number, leaves):
+    raise OSError(28, "No space left")
+
+def fail(store):  # one process fails, and the other hears of it
     side = dict(p=np.linspace(1.0, 3.9, 31), alpha=np.ones(31), outer=False, progress=False)
-    def full(self, number, leaves):
-        raise OSError(28, "No space left")
-    for folder, own_write in ((None, Store.write), (store, full if own == 1 else Store.write)):
-        Store.write = own_write
+    own_write = Store.write
+    for function, folder, write in ((refused, None, own_write), (chaotic, store, full if own == 1 else own_write)):
+        Store.write = write
         try:
-            rk.sweep(refused if folder is None else chaotic, store=folder, block=16, **side)
+            rk.sweep(function, store=folder, block=16, **side)
         except Exception as error:
             print(type(error).__name__, error, flush=True)
-    store, kind = None, "chaotic"
+    Store.write = own_write
+
 if kill >= 0:
     write, done = Store.write, []
     class Deadly:
@@ -70,26 +75,32 @@ if kill >= 0:
         done.append(place)
     Store.write = dying
 axes = dict(alpha=np.linspace(0.05, 0.3, 23), p=np.linspace(1.0, 3.9, 31))
-for _ in range(2 if store is None else 1):
+for number, (kind, store) in enumerate(sweeps):
+    print("sweep", number, file=sys.stderr, flush=True)
+    if kind == "refused":
+        fail(store)
+        store, kind = None, "chaotic"
     # Results of the job that dies stay in the store.
-    grid = rk.sweep(globals()[kind], store=store, block=100, load=kill < 0, progress=False, **axes)
-leaves = {f"a{k}": leaf for k, leaf in enumerate(jax.tree.leaves(grid.values))}
-np.savez(f"{sys.argv[7]}/{own}.npz", resumed=grid.resumed, processes=jax.process_count(), **leaves)
+    for _ in range(2 if store is None else 1):
+        grid = rk.sweep(globals()[kind], store=store, block=100, load=kill < 0, progress=False, **axes)
+    leaves = {f"a{k}": leaf for k, leaf in enumerate(jax.tree.leaves(grid.values))}
+    np.savez(f"{results}/{own}.{number}.npz", resumed=grid.resumed, processes=jax.process_count(), **leaves)
 """
 
 
-def job(count, folder, out, kind="chaotic", kill=-1):
-    """Start all processes of a job; the last one may die. Results of each, or how many blocks there were at the end."""
+def job(count, out, *sweeps, kill=-1):
+    """Start all processes of a job, which do some sweeps; the last one may die. Of every sweep: the results of each
+    process, with what it said."""
     out.mkdir()
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))} | {"JAX_PLATFORMS": "cpu"}
     environment["JAXROCK_CACHE"] = str(out.parent / "kept")  # jobs of one test compile once
+    todo = json.dumps([[kind, store and str(store)] for kind, store in sweeps])
     processes = []
     for own in range(count):
-        dies = kill if own == count - 1 else -1
-        words = map(str, (own, count, port, folder, kind, dies, out))
+        words = map(str, (own, count, port, kill if own == count - 1 else -1, out, todo))
         with (out / f"{own}.log").open("w") as log:
             processes.append(
                 subprocess.Popen([sys.executable, "-c", WORKER, *words], env=environment, stdout=log, stderr=log)
@@ -106,11 +117,19 @@ def job(count, folder, out, kind="chaotic", kill=-1):
         for process in processes:
             process.kill()
             process.wait()
-    return [dict(np.load(out / f"{own}.npz")) for own in range(count)]
+    said = [re.split(r"^sweep \d+\n", (out / f"{own}.log").read_text(), flags=re.M)[1:] for own in range(count)]
+    return [
+        [dict(np.load(out / f"{own}.{number}.npz")) | {"said": said[own][number]} for own in range(count)]
+        for number in range(len(sweeps))
+    ]
 
 
 def bits(results):
     return {name: (values.dtype, values.shape, values.tobytes()) for name, values in results.items() if name[0] == "a"}
+
+
+ALL = 23 * 31
+DAMAGED = (0, 1, 4)  # blocks
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +137,8 @@ def finished(tmp_path_factory):
     """A store that one process has made, with its results."""
     pytest.importorskip("zarr")
     folder = tmp_path_factory.mktemp("job")
-    return folder / "a.zarr", bits(job(1, folder / "a.zarr", folder / "alone")[0])
+    ((found,),) = job(1, folder / "alone", ("chaotic", folder / "a.zarr"))
+    return folder / "a.zarr", bits(found)
 
 
 @pytest.fixture(scope="module")
@@ -126,9 +146,33 @@ def alone(finished):
     return finished[1]
 
 
+def block_of(store, number):
+    return store / "x" / "c" / str(number) / "0"
+
+
+@pytest.fixture(scope="module")
+def of_two(finished, tmp_path_factory):
+    """Sweeps that a job of two processes does one after the other, by name; and its stores. One of them is of a job
+    that was killed, another is damaged."""
+    folder = tmp_path_factory.mktemp("two")
+    stores = {name: folder / f"{name}.zarr" for name in ("killed", "damaged", "refused")}
+    job(2, folder / "first", ("chaotic", stores["killed"]), kill=1)
+    shutil.copytree(finished[0], stores["damaged"])
+    for number in DAMAGED:
+        block_of(stores["damaged"], number).unlink()
+    sweeps = {
+        "shared": ("chaotic", None), "refused": ("refused", stores["refused"]),
+        "killed": ("chaotic", stores["killed"]), "damaged": ("chaotic", stores["damaged"]),
+    }  # fmt: skip
+    return dict(zip(sweeps, job(2, folder / "second", *sweeps.values()))), stores
+
+
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_processes_share_a_sweep(tmp_path, alone, count):
-    found = job(count, "-", tmp_path / "out")
+def test_processes_share_a_sweep(request, tmp_path, alone, count):
+    if count == 2:
+        found = request.getfixturevalue("of_two")[0]["shared"]
+    else:
+        (found,) = job(count, tmp_path / "out", ("chaotic", None))
     assert [int(results["processes"]) for results in found] == [count] * count
     for results in found:
         assert bits(results) == alone
@@ -145,38 +189,39 @@ def test_processes_share_a_sweep(tmp_path, alone, count):
 def test_a_killed_job_goes_on(tmp_path, request, count, kind):
     """The last process dies in the middle of its second block; started again, the job computes only what is missing."""
     pytest.importorskip("zarr")
+    store = tmp_path / "a.zarr"
     if kind == "chaotic":
         alone = request.getfixturevalue("alone")
     else:
-        alone = bits(job(1, "-", tmp_path / "alone", kind)[0])
-    store = tmp_path / "a.zarr"
-    job(count, store, tmp_path / "first", kind, kill=1)
-    for results in job(count, store, tmp_path / "second", kind):
+        alone = bits(job(1, tmp_path / "alone", (kind, None))[0][0])
+    if (count, kind) == (2, "chaotic"):
+        found = request.getfixturevalue("of_two")[0]["killed"]
+    else:
+        job(count, tmp_path / "first", (kind, store), kill=1)
+        (found,) = job(count, tmp_path / "second", (kind, store))
+    for results in found:
         assert bits(results) == alone
-        assert 0 < int(results["resumed"]) < 23 * 31
+        assert 0 < int(results["resumed"]) < ALL
     if kind == "outcome":  # all is there
-        for results in job(1, store, tmp_path / "third", kind):
-            assert bits(results) == alone and int(results["resumed"]) == 23 * 31
+        for results in job(1, tmp_path / "third", (kind, store))[0]:
+            assert bits(results) == alone and int(results["resumed"]) == ALL
 
 
-def test_a_job_verifies_its_store_together(tmp_path, finished):
+def test_a_job_verifies_its_store_together(of_two, alone):
     """Each process looks at some of the blocks; all hear which are damaged, and the first names them."""
-    whole, alone = finished
-    store = shutil.copytree(whole, tmp_path / "a.zarr")
-    for number in (0, 1, 4):
-        (store / "x" / "c" / str(number) / "0").unlink()
-    for own, results in enumerate(job(2, store, tmp_path / "second")):
+    found, stores = of_two
+    for own, results in enumerate(found["damaged"]):
         assert bits(results) == alone
-        said = (tmp_path / "second" / f"{own}.log").read_text()
-        assert all((str(store / "x" / "c" / f"{number}" / "0") in said) == (own == 0) for number in (0, 1, 4))
-        assert int(results["resumed"]) == 23 * 31 - 3 * 93
+        for number in DAMAGED:
+            assert (str(block_of(stores["damaged"], number)) in str(results["said"])) == (own == 0)
+        assert int(results["resumed"]) == ALL - len(DAMAGED) * 93
 
 
-def test_a_failure_in_one_process_is_one_in_all(tmp_path, alone):
+def test_a_failure_in_one_process_is_one_in_all(of_two, alone):
     """No other process is left waiting, and the next sweep finds all of them at the same place."""
-    for own, results in enumerate(job(2, tmp_path / "a.zarr", tmp_path / "out", "refused")):
+    for own, results in enumerate(of_two[0]["refused"]):
         assert bits(results) == alone
-        refused, full = (tmp_path / "out" / f"{own}.log").read_text().splitlines()[-2:]
+        refused, full = str(results["said"]).splitlines()[-2:]
         assert refused.startswith("ValueError" if own == 1 else "RuntimeError Process 1 of this job failed: ValueError")
         assert "Argument `p` must be below 3.85" in refused
         assert full.startswith("OSError" if own == 1 else "RuntimeError Process 1 of this job failed: OSError")
@@ -185,6 +230,6 @@ def test_a_failure_in_one_process_is_one_in_all(tmp_path, alone):
 
 @pytest.mark.slow
 def test_processes_share_outcomes(tmp_path):
-    alone = bits(job(1, "-", tmp_path / "alone", "outcome")[0])
-    for results in job(2, "-", tmp_path / "out", "outcome"):
+    alone = bits(job(1, tmp_path / "alone", ("outcome", None))[0][0])
+    for results in job(2, tmp_path / "out", ("outcome", None))[0]:
         assert bits(results) == alone

@@ -1,6 +1,8 @@
 """The shape of the package: imports go downward, files and functions stay short, importing has no side effects."""
 
 import ast
+import functools
+import json
 import operator
 import os
 import re
@@ -107,11 +109,24 @@ def lengths(*kinds: type) -> dict[str, int]:
     }
 
 
-def fresh(code: str) -> str:
-    """What a fresh interpreter prints, with nothing set for JAX."""
+IMPORTED = """
+import json, sys, jax
+settings = lambda: dict(jax.config.values.items())
+before = settings()
+import jaxrock
+told = {"settings": settings() == before, "x64": jax.config.jax_enable_x64, "imported": list(sys.modules)}
+jaxrock.plot.history
+print(json.dumps(told | {"with figures": list(sys.modules)}))
+"""
+
+
+@functools.cache
+def imported() -> dict:
+    """What a fresh interpreter, with nothing set for JAX, tells of itself after it imported the package, and then when
+    it was asked for figures."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
+        [sys.executable, "-W", "error", "-c", IMPORTED],
         cwd=PACKAGE.parent,
         env=environment | {"JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -119,7 +134,7 @@ def fresh(code: str) -> str:
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return json.loads(done.stdout)
 
 
 def test_the_table_names_every_package():
@@ -298,10 +313,7 @@ def test_old_names_say_where_they_are(name):
 
 def test_importing_takes_little():
     """SciPy's optimisers, filters and the rest come with what needs them."""
-    assert (
-        fresh("import sys, jaxrock; print([name for name in ('scipy', 'optax', 'diffrax') if name in sys.modules])")
-        == "[]"
-    )
+    assert not {"scipy", "optax", "diffrax"} & set(imported()["imported"])
 
 
 ROOT = PACKAGE.parent
@@ -333,16 +345,13 @@ def test_what_tests_and_benchmarks_share_lies_in_references(folder, allowed):
 
 
 def test_import_draws_nothing_and_configures_nothing():
-    settings = "{k: v for k, v in jax.config.values.items()}"
-    code = f"import sys, jax; before = {settings}; import jaxrock; after = {settings}\n"
-    code += "print(before == after, jax.config.jax_enable_x64, 'matplotlib.pyplot' in sys.modules)"
-    assert fresh(code) == "True False False"
+    found = imported()
+    assert found["settings"] and not found["x64"] and "matplotlib.pyplot" not in found["imported"]
 
 
 def test_figures_come_when_they_are_asked_for():
-    code = "import sys, jaxrock; before = 'jaxrock.plot' in sys.modules; jaxrock.plot.history; "
-    code += "print(before, *(name in sys.modules for name in ('jaxrock.plot', 'scipy', 'optax')))"
-    assert fresh(code) == "False True False False"
+    assert "jaxrock.plot" not in imported()["imported"] and "jaxrock.plot" in imported()["with figures"]
+    assert not {"scipy", "optax"} & set(imported()["with figures"])
 
 
 def test_unknown_names_raise():

@@ -282,20 +282,38 @@ print(Traced.of(lambda p: rk.outcome(rk.Block(0.1, p), record), {"p": jax.ShapeD
     assert fresh(code, seed="1") == fresh(code, seed="2")
 
 
-@pytest.mark.parametrize(
-    "code, printed",
-    [
-        ("import jax; from jaxrock.studies import use_cpu_devices as use; print(use(3), use(3), jax.device_count())",
-         "3 3 3"),
-        ("import jax; from jaxrock.studies import use_cpu_devices as use; use(2); jax.devices(); print(use(2))", "2"),
-        ("import os, jaxrock as rk; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-         "print(rk.studies.use_cpu_devices())", "1"),
-        ("import os, jax; from jaxrock.__main__ import main; main(['run', '--out', '/dev/null']); "
-         "print(jax.device_count() == len(os.sched_getaffinity(0)))", "True"),
-    ],
-)  # fmt: skip
-def test_cpu_devices(code, printed):
-    assert fresh(code) == printed
+USE = "import jax; from jaxrock.studies import use_cpu_devices as use; "
+PRINTED = {
+    USE + "print(use(3), use(3), jax.device_count())": "3 3 3",
+    USE + "use(2); jax.devices(); print(use(2))": "2",
+    "import os, jaxrock as rk; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+    "print(rk.studies.use_cpu_devices())": "1",
+    "import os, jax; from jaxrock.__main__ import main; main(['run', '--out', '/dev/null']); "
+    "print(jax.device_count() == len(os.sched_getaffinity(0)))": "True",
+}  # fmt: skip
+# JAX starts nothing when it is imported, so every copy of such a process is as a fresh one.
+COPIES = """
+import os, sys, jax, jaxrock
+for code in {codes}:
+    sys.stdout.flush()
+    copy = os.fork()
+    if copy == 0:
+        exec(code)
+        print(end="\\0", flush=True)
+        os._exit(0)
+    assert os.waitpid(copy, 0)[1] == 0
+"""
+
+
+@pytest.fixture(scope="module")
+def printed():
+    """What each code prints in a process of its own."""
+    return dict(zip(PRINTED, fresh(COPIES.format(codes=list(PRINTED))).split("\0")))
+
+
+@pytest.mark.parametrize("code", PRINTED, ids=[f"code{n}-{text}" for n, text in enumerate(PRINTED.values())])
+def test_cpu_devices(printed, code):
+    assert printed[code].strip() == PRINTED[code]
 
 
 def test_cpu_devices_come_too_late():

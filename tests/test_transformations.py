@@ -5,6 +5,7 @@ Values by one call for each number; derivatives by differences of these, and of 
 
 import functools
 import itertools
+import json
 import pickle
 import subprocess
 import sys
@@ -140,17 +141,18 @@ def test_slopes(way, function, slopes):
 
 def test_slopes_by_all_samples_within_shard_map():
     """Of blocks that are dealt to devices, by a record which all of them share: the sum of what each tells."""
-    samples, alpha = 0.3 * jnp.sin(0.3 * jnp.arange(70)), jnp.linspace(0.2, 0.3, 4)
+    engine = rk.Series(order=4, tolerance=1e-3)  # few steps, of which both ways tell the same
+    samples, alpha = jnp.asarray(0.3 * np.sin(0.3 * np.arange(70))), jnp.linspace(0.2, 0.3, 4)
 
     def velocities(samples, alpha):
         record = rk.Record(samples, 0.02)
-        return jax.vmap(lambda a: rk.outcome(rk.Block(a, 2.0), record, **QUICK).max_velocity)(alpha)
+        return jax.vmap(lambda a: rk.outcome(rk.Block(a, 2.0), record, rk.Linear(), engine=engine).max_velocity)(alpha)
 
     whole, every = PartitionSpec(), PartitionSpec("scenes")
     each = jax.shard_map(velocities, mesh=mesh(), in_specs=(whole, every), out_specs=every)
     there = jax.jit(jax.grad(lambda s: each(s, alpha).sum()))(samples)
-    of_one = lambda change: jax.jvp(lambda s: velocities(s, alpha).sum(), (samples,), (change,))[1]
-    slopes = jax.jit(jax.vmap(of_one))(jnp.eye(70))  # without a tape
+    of_one = jax.jit(lambda change: jax.jvp(lambda s: velocities(s, alpha).sum(), (samples,), (change,))[1])
+    slopes = [of_one(change) for change in np.eye(70)]  # without a tape
     np.testing.assert_allclose(there, slopes, rtol=1e-12)
 
 
@@ -192,23 +194,35 @@ def exported(function, platforms, shape=()):
     return jax.export.export(function, platforms=platforms)(jax.ShapeDtypeStruct(shape, jnp.float64))
 
 
-def test_a_program_for_other_processes(function, values, tmp_path):
+WITHOUT_THE_PACKAGE = """
+import json, sys, jax
+jax.config.update("jax_enable_x64", True)
+sys.modules["jaxrock"] = None
+for line in sys.stdin:
+    path, *numbers = json.loads(line)
+    program = jax.export.deserialize(bytearray(open(path, "rb").read()))
+    print(json.dumps([float(program.call(number)) for number in numbers]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process without the package, which runs serialised programs."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", WITHOUT_THE_PACKAGE], **pipes) as process:
+        yield process
+        process.stdin.close()
+        assert process.wait(60) == 0
+
+
+def test_a_program_for_other_processes(function, values, elsewhere, tmp_path):
     """Serialised, loaded where the package is not, and run."""
     program = exported(jax.jit(function), ["cpu"])
     assert "jaxrock" not in str(program.mlir_module()).split("loc(")[0]
     path = tmp_path / "program"
     path.write_bytes(program.serialize())
-    code = (
-        "import sys, jax; jax.config.update('jax_enable_x64', True)\n"
-        "sys.modules['jaxrock'] = None\n"
-        "program = jax.export.deserialize(bytearray(open(sys.argv[1], 'rb').read()))\n"
-        "print(repr(float(program.call(float(sys.argv[2])))), repr(float(program.call(-1.0))))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(path), str(float(AT[1]))], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    found, of_nonsense = map(float, done.stdout.split())
+    print(json.dumps([str(path), float(AT[1]), -1.0]), file=elsewhere.stdin, flush=True)
+    found, of_nonsense = json.loads(elsewhere.stdout.readline())
     assert found == pytest.approx(values[1], rel=1e-11)
     assert of_nonsense != 0
 
@@ -216,9 +230,9 @@ def test_a_program_for_other_processes(function, values, tmp_path):
 ACCELERATORS = ("cuda", "rocm", "tpu")
 # Function, shape, most letters.
 LOWERED = (
-    (jax.jit(of_housner), (), 1.5e6),
-    (jax.jit(jax.vmap(of_housner)), (1024,), 3e6),
-    (jax.jit(jax.vmap(jax.grad(of_housner))), (1024,), 6e6),
+    (jax.jit(jax.value_and_grad(of_housner)), (), 1.5e6),
+    (jax.jit(jax.vmap(outcome)), (1024,), 2e6),
+    (jax.jit(jax.vmap(jax.grad(outcome))), (1024,), 2.5e6),
 )
 
 
@@ -335,5 +349,5 @@ def test_settings_are_made_anywhere():
 def test_what_is_kept_belongs_to_no_trace():
     """The first scene of a session may be asked for where JAX traces what is known."""
     _usual.clear()
-    jax.grad(lambda x: dealt(jax.vmap(outcome))(x).sum())(AT)
+    dealt(jax.vmap(outcome))(AT)
     assert not any(isinstance(x, jax.core.Tracer) for x in start_of((0.0, 0.0)))
