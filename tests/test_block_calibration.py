@@ -18,7 +18,7 @@ COUNT, ALPHA, SCATTER, P = 200, 0.2, 0.3, 3.0
 PULSES = np.stack([RANDOM.uniform(0.2, 0.6, COUNT), RANDOM.uniform(0.2, 0.9, COUNT)], axis=1)  # amplitude and period
 TRUE = ALPHA * np.exp(SCATTER * RANDOM.normal(size=COUNT))
 UNKNOWN, SPREAD = rk.inverse.Unknown(0.05, 0.5), rk.inverse.Unknown(0.05, 0.8)
-QUICK = {"model": rk.Linear(), "engine": rk.Series(order=12), "progress": False}
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=8, tolerance=1e-10), "progress": False}
 POINT = {"alpha": 0.18, "alpha_sd": 0.2}
 
 
@@ -44,7 +44,7 @@ def outcomes(*scenes):
     """Whether blocks overturn, and their peak rotation over their slenderness: any number, by one program."""
     arrays = np.broadcast_arrays(*scenes)
     count = arrays[0].size
-    lists = [np.resize(x, (-(-count // COUNT), COUNT)) for x in arrays]
+    lists = [np.resize(x, (-(-count // 64), 64)) for x in arrays]
     found = [jax.device_get(_outcomes(*part)) for part in zip(*lists)]
     return [np.concatenate(x)[:count] for x in zip(*found)]
 

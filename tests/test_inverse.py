@@ -243,7 +243,7 @@ def logs_at(seen, **over):
 
 def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     seen = rocks(truth(3))
-    found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
+    found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=4)
     lists = {name: np.geomspace(float(x.low), float(x.high), 256) for name, x in UNKNOWNS.items()}
     assert logs_at(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
     ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}

@@ -11,7 +11,7 @@ BOX = np.array([-10.0, -10.0]), np.array([10.0, 10.0])
 def normal(x, mean, covariance):
     """Log-density of a normal distribution."""
     away = x - mean
-    return -np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away) / 2 - np.log(np.linalg.det(covariance)) / 2
+    return -np.sum(away @ np.linalg.inv(covariance) * away, axis=1) / 2 - np.log(np.linalg.det(covariance)) / 2
 
 
 def two_normals(x):

@@ -76,9 +76,10 @@ def test_parts_of_a_scene(name, traced):
 
 
 def test_all_that_makes_a_scene_takes_throw():
-    offered = {name: getattr(space, name) for space in (rk, rk.blocks, rk.motions) for name in dir(space)}
-    named = [kind for name, kind in offered.items() if name.endswith(("Block", "Pulse")) or name == "Record"]
-    classes = [kind for kind in named if isinstance(kind, type)]
+    spaces, ends = (rk, rk.blocks, rk.motions), ("Block", "Pulse")
+    named = {name: space for space in spaces for name in dir(space) if name.endswith(ends) or name == "Record"}
+    offered = [getattr(space, name) for name, space in named.items()]
+    classes = [kind for kind in offered if isinstance(kind, type)]
     made = [kind for kind in classes if not inspect.isabstract(kind)]
     made += [getattr(kind, name) for kind in classes for name in dir(kind) if name.startswith("from_")]
     made += [rk.outcome, rk.simulate, rk.responses.outcome_flexible, rk.responses.simulate_flexible]
