@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from jaxrock._checks import Range, below_one, checked, one_of, size, truth, whole, with_throw
+from jaxrock._checks import Range, below_one, checked, one_of, one_program, size, truth, whole, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, leaves_of, parameter, set_parameters
 from jaxrock.blocks.cantilever import unit_column
@@ -137,6 +137,7 @@ class FlexibleBlock(Owner):
         return Corners(self.alpha, self.alpha, self.p)
 
     @property
+    @one_program
     def first_period(self) -> Real:
         """First period of the clamped continuous column of the block's height [s].
 
@@ -150,6 +151,7 @@ class FlexibleBlock(Owner):
         return 8 * math.sqrt(3) * math.pi / 1.8751040687119611**2 * slowness * self.height**2 / (2 * self.width)
 
     @property
+    @one_program
     def frequencies(self) -> Inexact[Array, "*batch modes"]:
         """Angular frequencies of the clamped column of masses [rad/s]."""
         return self._bending_rate[..., None] * unit_column(self.masses).frequencies
@@ -191,6 +193,7 @@ class FlexibleBlock(Owner):
         return self.base != "sine" and self.rotations == "small" and not self.p_delta
 
     @property
+    @one_program
     def damping_rates(self) -> tuple[Real, Inexact[Array, "*batch modes"]]:
         """Decay rate a0 of the masses, and d of each clamped mode of the column: q'' + (a0 + d) q' + ... [1/s]."""
         frequencies = self.frequencies
@@ -208,15 +211,15 @@ class FlexibleBlock(Owner):
 _DEMANDS: tuple[tuple[str, Callable], ...] = (
     (
         "make the column stiffer than its base is unstable",
-        lambda block: jnp.sum(block._column_stiffness, -1) > block.spring_rate,
+        one_program(lambda block: jnp.sum(block._column_stiffness, -1) > block.spring_rate),
     ),
     (
         "make the column at most 1e12 times as stiff as its base is unstable: rounding shows above (a rigid block)",
-        lambda block: jnp.sum(block._column_stiffness, -1) < 1e12 * block.spring_rate,
+        one_program(lambda block: jnp.sum(block._column_stiffness, -1) < 1e12 * block.spring_rate),
     ),
     (
         "make the column, held at its base, bear twice its own weight when `p_delta` is True",
-        lambda block: not block.p_delta or _bears_itself(block),
+        one_program(lambda block: not block.p_delta or _bears_itself(block)),
     ),
 )
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from jaxrock._checks import Range, check_shapes, checked, is_traced, not_negative, share, size, with_throw
+from jaxrock._checks import Range, check_shapes, checked, if_traced, is_traced, not_negative, share, size, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, check_declared, is_ours, parameter, set_parameters
 from jaxrock.numerics.choice import where
@@ -325,7 +325,10 @@ def fitting_width(law: AbstractRestitution, width: Real, height: Real) -> Real:
 
 def fits(law: AbstractRestitution, width: ArrayLike, height: Real) -> ArrayLike:
     """Whether the law has a value for rectangles so wide."""
-    return not isinstance(law, Housner) or law._loss * width**2 <= (1 + 1e-6) * (width**2 + height**2)
+    if not isinstance(law, Housner):
+        return True
+    width, height, loss = map(if_traced, (width, height, law._loss))
+    return loss * width**2 <= (1 + 1e-6) * (width**2 + height**2)
 
 
 class Reset(eqx.Module):

@@ -17,6 +17,7 @@ from jaxrock.engines.trajectory import Trajectory, followed, times_of
 from jaxrock.flexible.nonlinear import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.turned import has_vertical
 from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable
 
@@ -205,7 +206,7 @@ def _given(
 
 def _duration(block: FlexibleBlock, motion: AbstractMotion, duration: ArrayLike | None, throw: bool) -> Scalar:
     check_single(block=block, motion=motion)
-    if motion.vertical_bounds is not None:
+    if has_vertical(motion):
         raise ValueError(
             "Argument `motion` must not be vertical for a FlexibleBlock, whose base does not weigh anything."
         )

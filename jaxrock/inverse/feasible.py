@@ -21,7 +21,7 @@ from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
-from jaxrock.motions.turned import felt
+from jaxrock.motions.turned import felt, has_vertical
 from jaxrock.studies.critical import critical_amplitudes
 from jaxrock.studies.parameters import amplitude_of
 from jaxrock.studies.spectra import axis
@@ -183,7 +183,7 @@ def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMo
     one = eqx.filter_eval_shape(motion, *first)
     if not isinstance(one, AbstractMotion):
         raise ValueError(f"Argument `motion` must make a motion of amplitude and duration, but makes {shown(one)}.")
-    is_level = eqx.filter_eval_shape(lambda *x: motion(*x).vertical_bounds, *first) is None
+    is_level = not has_vertical(one)
 
     def turned(way, duration):
         made = motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)

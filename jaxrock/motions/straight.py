@@ -63,8 +63,8 @@ def straight(motion: AbstractMotion) -> Straight:
         inner, delay = straight(motion.motion), float(motion.delay)
         before = (0.0, 0.0, delay)
         return Straight(*(np.append(x, part) for x, part in zip(before, inner))) if delay else inner
-    lengths = np.asarray(motion.lengths, float)
-    counts = _counts(lengths, None if motion.scales is None else np.asarray(motion.scales, float))
+    lengths, scales = jax.tree.map(lambda x: np.asarray(x, float), _pieces(motion))
+    counts = _counts(lengths, scales)
     piece = np.repeat(np.arange(lengths.size), counts)
     number = np.arange(piece.size) - np.repeat(np.cumsum(counts) - counts, counts)
     step = (lengths / np.maximum(counts, 1))[piece]
@@ -89,6 +89,11 @@ def _values(motion: AbstractMotion, piece: np.ndarray, local: np.ndarray) -> np.
     """Acceleration [g] at times from the beginnings of pieces, from within them."""
     room = (0, (1 << (piece.size - 1).bit_length()) - piece.size)  # few lengths: each is a program
     return np.asarray(_series(motion, np.pad(piece, room, "edge"), np.pad(local, room, "edge")), float)[: piece.size]
+
+
+@jax.jit
+def _pieces(motion: AbstractMotion):
+    return motion.lengths, motion.scales
 
 
 @jax.jit

@@ -1,5 +1,6 @@
 """Motions as a block feels them that may be turned round: mirrored, but for what the ground does vertically."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -9,9 +10,14 @@ from jaxrock.motions.motion import AbstractMotion, AtTheSameTimes, Piece, Scalar
 from jaxrock.motions.shaking import Envelope
 
 
+def has_vertical(motion: AbstractMotion) -> bool:
+    """Whether the ground moves vertically; how much is not computed."""
+    return jax.eval_shape(lambda motion: motion.vertical_bounds, motion) is not None
+
+
 def felt(motion: AbstractMotion, times: Scalar) -> AbstractMotion:
     """A motion `times` as strong; if that is negative, as a block feels it that is turned round."""
-    if motion.vertical_bounds is None:
+    if not has_vertical(motion):
         return Scaled(motion, times)
     return Scaled(Turned(motion, jnp.where(times < 0, -1.0, 1.0)), jnp.abs(times))
 

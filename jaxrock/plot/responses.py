@@ -11,6 +11,7 @@ import numpy as np
 from jaxrock.flexible.response import FlexibleResponse
 from jaxrock.models.coefficients import Coefficients
 from jaxrock.motions.motion import AbstractMotion
+from jaxrock.motions.turned import has_vertical
 from jaxrock.plot.style import BLUE, GREY, RED, SAND, figure
 from jaxrock.responses.history import Response
 from jaxrock.status import Status
@@ -45,14 +46,12 @@ def _vertical(motion: AbstractMotion, time: jax.Array) -> jax.Array:
         series = motion.vertical_series(piece, t - knots[piece], jnp.ones_like(t), 0)
         return jnp.where((t >= 0) & (t < knots[-1]), series[0], 0.0)
 
-    return jax.vmap(at)(time)
+    return jax.vmap(at)(jnp.asarray(time, knots.dtype))
 
 
 def vertical_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray | None:
     """Vertical acceleration at times (n,) [g], positive upward; None: the ground has none."""
-    if motion.vertical_bounds is None:
-        return None
-    return np.asarray(_vertical(motion, jnp.asarray(time, motion.knots.dtype)))
+    return np.asarray(_vertical(motion, time)) if has_vertical(motion) else None
 
 
 def why_not(status: Status) -> str:
