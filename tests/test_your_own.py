@@ -21,7 +21,7 @@ from jaxrock.responses.outcome import _outcome
 from jaxrock.studies.parameters import declarations, named
 
 BLOCK = rk.Block(0.2, 2.0)
-QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}  # compiles in half the time
+QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
 CORNERS = np.array([0.0, 0.3, -0.25, 0.35, -0.1, 0.0])
 
 
