@@ -179,13 +179,18 @@ def test_beside_jax(case, moves):
 )
 def test_twice(case):
     """Of a program that was made so: second derivatives are those of JAX."""
-    function, numbers = OF_NUMBERS[case], (jnp.asarray(X), jnp.asarray(Y))
-    moves, unit = (True, True), [jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])]
-    once = told(lambda *x: pushed(told(function, *x), x, moves, unit, 2), *numbers)
-    found = pushed(once, numbers, moves, [d[0] for d in unit], None)[1]
-    by_jax = functools.partial(expected, function, moves=moves, directions=unit)
-    exact = jax.jvp(lambda *x: by_jax(x), numbers, tuple(d[0] for d in unit))[1]
-    for own, change in zip(found, jax.tree.leaves(exact), strict=True):
+    function, moves = OF_NUMBERS[case], (True, True)
+    unit = [np.array([1.0, 0.0]), np.array([0.0, 1.0])]
+    once = told(lambda *x: pushed(told(function, *x), x, moves, unit, 2), np.float64(X), np.float64(Y))
+
+    @jax.jit
+    def both(numbers, first):
+        by_jax = functools.partial(expected, function, moves=moves, directions=unit)
+        exact = jax.jvp(lambda *x: by_jax(x), numbers, first)[1]
+        return pushed(once, numbers, moves, list(first), None)[1], jax.tree.leaves(exact)
+
+    found, exact = both((np.float64(X), np.float64(Y)), (np.float64(1.0), np.float64(0.0)))
+    for own, change in zip(found, exact, strict=True):
         np.testing.assert_allclose(own, change, rtol=1e-12, atol=1e-14)
 
 
