@@ -153,10 +153,11 @@ def by_all(kind):
 def test_all_samples_of_a_record(model):
     """5,690 derivatives at once, in reverse: some against 40-digit differences, all of them summed along the record."""
     record = rk.example_record()
+    samples = np.asarray(record.samples)
     rows, x = points("record", model, "samples")
     assert len(rows) >= 3
     for row, q in zip(rows, x):
-        whole_x = q[3] * record.samples, record.dt, jnp.array([*q[:3], 0.7])
+        whole_x = q[3] * samples, record.dt, np.array([*q[:3], 0.7])
         (value, *_), (slopes, *_) = by_all(model)(whole_x, (0.0, 0.0), WEIGHTS["max_rotation"])
         known = row["samples"]
         exact = np.array([float(c) for c in known["max_rotation"]]) / q[3]  # by samples before they are scaled
@@ -166,7 +167,7 @@ def test_all_samples_of_a_record(model):
         # After the peak, and while the block rests, a sample changes nothing: exactly.
         quiet = np.isin(known["indices"], known["rest"] + known["after"])
         assert np.all(np.asarray(slopes)[np.array(known["indices"])[quiet]] == 0)
-        summed = float(jnp.dot(slopes, record.samples))
+        summed = float(np.dot(slopes, samples))
         assert summed == pytest.approx(float(row["max_rotation"]["gradient"][3]), rel=1e-9)
 
 
@@ -179,18 +180,19 @@ def test_along_the_steps_slopes_are_differences(kind, factor):
 
     Under the end of a record as long as that above, which begins with quiet, but where the block starts in motion."""
     record = rk.example_record()
-    part, quiet = factor * record.samples[500:1500], jnp.zeros(0 if kind == "in motion" else record.samples.size - 1000)
-    x, start = (jnp.concatenate([quiet, part]), record.dt, jnp.array([0.2, 2.0, 0.9, 0.7])), (0.0, 0.0)
+    samples = np.asarray(record.samples)
+    part, quiet = factor * samples[500:1500], np.zeros(0 if kind == "in motion" else samples.size - 1000)
+    x, start = (np.concatenate([quiet, part]), float(record.dt), np.array([0.2, 2.0, 0.9, 0.7])), (0.0, 0.0)
     random = np.random.default_rng(1)
-    change = jax.tree.map(lambda value: 0.1 * value * random.normal(size=jnp.shape(value)), x)
+    change = jax.tree.map(lambda value: 0.1 * value * random.normal(size=np.shape(value)), x)
 
     def moved(t):
-        return whole(kind, jax.tree.map(lambda a, b: a + t * b, x, change), start)
+        return np.asarray(by_all(kind)(jax.tree.map(lambda a, b: a + t * b, x, change), start, WEIGHTS["margin"])[0])
 
     differences = (moved(1e-5) - moved(-1e-5)) / 2e-5
     for weights, difference in zip(WEIGHTS.values(), differences):
         _, slopes = by_all(kind)(x, start, weights)
-        along = sum(float(jnp.sum(slope * d)) for slope, d in zip(slopes, change))
+        along = sum(float(np.sum(slope * d)) for slope, d in zip(map(np.asarray, slopes), change))
         assert along == pytest.approx(float(difference), rel=1e-5, abs=1e-8)
     assert np.count_nonzero(differences) >= (5 if (kind, factor) == ("linear", 2.0) else 1)  # there a clearance, too
 
@@ -198,19 +200,20 @@ def test_along_the_steps_slopes_are_differences(kind, factor):
 def test_all_samples_where_a_tape_is_longer_than_that_of_a_history():
     """A block that hops on and on until it is thrown down, after more steps than a history keeps: beside forward mode
     along the scale of the record."""
-    samples = jnp.full(rk.example_record().samples.size, 0.002).at[60:63].set(jnp.array([-0.31, 0.35, 0.35]))
-    numbers, start = jnp.array([0.3, 30.0, 0.9999, 0.7]), (0.03, 0.0)
+    samples = np.full(rk.example_record().samples.size, 0.002)
+    samples[60:63] = -0.31, 0.35, 0.35
+    numbers, start = np.array([0.3, 30.0, 0.9999, 0.7]), (0.03, 0.0)
     usual = POLICY.history_steps + 2 * roomy(samples.size)
 
     def margin(scale, **more):
         found = rk.outcome(rk.Block(*numbers[:3]), scale * rk.Record(samples, 1.0), rk.Linear(), initial=start, **more)
         return found.margin, found
 
-    along, found = jax.grad(margin, has_aux=True)(1.0)
+    along, found = jax.jit(jax.grad(margin, has_aux=True))(1.0)
     assert found.overturned and found.status == rk.Status.successful
     assert margin(1.0, engine=rk.Series(max_steps=usual))[1].status == rk.Status.step_budget_exhausted
     _, (slopes, *_) = by_all("linear")((samples, 1.0, numbers), start, WEIGHTS["margin"])
-    assert float(slopes @ samples) == pytest.approx(float(along), rel=1e-8) != 0
+    assert float(np.asarray(slopes) @ samples) == pytest.approx(float(along), rel=1e-8) != 0
 
 
 def test_by_more_numbers_than_machine_code_takes_at_once(caplog):
@@ -221,8 +224,8 @@ def test_by_more_numbers_than_machine_code_takes_at_once(caplog):
         motion = rk.SinePulse(x[3], x[4]) + rk.MavroeidisPapageorgiouPulse(*x[5:9]) + rk.CosinePulse(x[9], x[10])
         return rk.outcome(rk.Block(*x[:3]), motion, rk.Linear(), engine=rk.Series(order=6)).max_rotation
 
-    x = [0.2, 1.5, 0.9, 0.4, 1.0, 0.1, 1.4, 2.0, 0.3, 0.1, 0.6]
-    all_at_once = jax.jit(jax.vmap(jax.grad(peak)))(jnp.array(x) * jnp.array([[1.0], [1.01]]))
+    x = np.array([0.2, 1.5, 0.9, 0.4, 1.0, 0.1, 1.4, 2.0, 0.3, 0.1, 0.6])
+    all_at_once = jax.jit(jax.vmap(jax.grad(peak)))(x * np.array([[1.0], [1.01]]))
     assert "left to XLA" not in caplog.text
     places = [0, 4, 7, 10]
 
@@ -230,9 +233,9 @@ def test_by_more_numbers_than_machine_code_takes_at_once(caplog):
         numbers = dict(enumerate(x)) | dict(zip(places, t))
         return peak([numbers[k] for k in range(11)])
 
-    alone = np.array(jax.grad(of_few)([x[k] for k in places]))
+    alone = np.array(jax.jit(jax.grad(of_few))([x[k] for k in places]))
     assert np.all(alone != 0)
-    np.testing.assert_allclose(all_at_once[0, places], alone, rtol=1e-11)
+    np.testing.assert_allclose(np.asarray(all_at_once)[0, places], alone, rtol=1e-11)
 
 
 SETTINGS = {"linear": {"model": rk.Linear(), "engine": rk.Series(order=6)}, "nonlinear": {}}
@@ -313,84 +316,104 @@ def test_a_history_in_both_modes():
     np.testing.assert_allclose(forward, differences.T, rtol=1e-7, atol=1e-9)
 
 
+@functools.cache
+def peak_by_start(engine):
+    """The peak of a linear block under a lobe, and its slope by the start: rotation and velocity."""
+
+    def peak(start, pulse):
+        block, start = rk.Block(0.2, 2.0, 0.9), (start[0], start[1])
+        return rk.outcome(block, pulse, rk.Linear(), initial=start, engine=engine).max_rotation
+
+    return jax.jit(jax.value_and_grad(peak))
+
+
 def test_a_block_at_rest_does_not_lean():
     """From rest a little rotation to either side falls back before the ground moves: its slope is zero."""
-
-    @jax.jit
-    def peak(rotation):
-        block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
-        return rk.outcome(block, pulse, initial=(rotation, 0.0), **QUICKLY).max_rotation
-
-    assert jax.grad(peak)(0.0) == 0
-    np.testing.assert_allclose([peak(1e-7), peak(-1e-7)], peak(0.0), rtol=1e-9)
+    rising = rk.ExponentialPulse(0.4, 0.6, 0.0)
+    (peak, slope), *aside = (peak_by_start(QUICKLY["engine"])(np.array([x, 0.0]), rising) for x in (0.0, 1e-7, -1e-7))
+    assert slope[0] == 0
+    np.testing.assert_allclose([value for value, _ in aside], peak, rtol=1e-9)
 
 
 @pytest.mark.parametrize("engine", [QUICKLY["engine"], pytest.param(rk.Diffrax(), marks=pytest.mark.slow)])
 def test_a_block_that_is_lifted_at_once_leans_to_its_side(engine):
     """Where a pulse begins by a jump a start on the side to which the block goes, here -1, is one that it keeps."""
-
-    @jax.jit
-    def peak(start):
-        block, pulse = rk.Block(0.2, 2.0, 0.9), rk.RectangularPulse(0.3, 0.4)
-        return rk.outcome(block, pulse, rk.Linear(), initial=(start[0], start[1]), engine=engine).max_rotation
-
-    start, step = jnp.zeros(2), -1e-6
-    aside = [(peak(step * row) - peak(start)) / step for row in np.eye(2)]
+    jump, step = rk.RectangularPulse(0.3, 0.4), -1e-6
+    (peak, slope), *moved = (peak_by_start(engine)(start, jump) for start in (np.zeros(2), *(step * np.eye(2))))
+    aside = [(float(value) - float(peak)) / step for value, _ in moved]
     assert max(aside) < -0.1
-    np.testing.assert_allclose(jax.grad(peak)(start), aside, rtol=1e-4)
+    np.testing.assert_allclose(slope, aside, rtol=1e-4)
+
+
+BY_HISTORY = ("alpha", "amplitude", "period", "rotation", "velocity", "time")  # what it is differentiated by
+OF_HISTORY = ("rotation", "velocity", "second impact", "least normal", "largest friction")
+
+
+def a_history(x, duration):
+    """What `OF_HISTORY` says, at the time, by what `BY_HISTORY` says; with all its impacts."""
+    block, start = rk.Block(x[0], 2.0, 0.9), (x[3], x[4])
+    found = rk.simulate(block, rk.SinePulse(x[1], x[2]), duration=duration, initial=start, samples=2, **QUICKLY)
+    forces = rk.responses.contact_forces(found, block)
+    of = jnp.stack([*found(x[5]), found.impact_times[1], forces.least_normal, forces.largest_friction])
+    return of, (found.impact_times, found.impact_velocities)
+
+
+@jax.jit
+def slopes_of_a_history(x, duration):
+    """Values, slopes in forward and in reverse mode, and impacts."""
+    value, pushed, impacts = jax.linearize(lambda x: a_history(x, duration), x, has_aux=True)
+    pulled = jax.linear_transpose(pushed, x)  # of one linearization: twice it would be compiled twice
+    forward = jax.vmap(pushed, out_axes=1)(np.eye(len(BY_HISTORY)))
+    return value, forward, jax.vmap(lambda row: pulled(row)[0])(np.eye(len(OF_HISTORY))), impacts
 
 
 def test_derivatives_at_the_end_of_a_history_and_of_its_events():
     """By time the velocity, also where the history ends in motion; events outside of jit as within."""
-    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
-    history = rk.simulate(block, pulse, duration=3.0, samples=2, **QUICKLY)
-    by_time = jax.grad(lambda t: history(t)[0])
-    assert abs(history(3.0)[1]) > 0.01
     for time in (1.0, 3.0):
-        assert by_time(time) == pytest.approx(float(history(time)[1]), rel=1e-12)
+        x = np.array([0.2, 0.4, 0.6, 0.0, 0.0, time])
+        value, slopes = map(np.asarray, slopes_of_a_history(x, 3.0)[:2])
+        assert time == 1.0 or abs(value[1]) > 0.01
+        assert slopes[0, 5] == pytest.approx(float(value[1]), rel=1e-12)
 
     def second_impact(alpha):
+        pulse = rk.SinePulse(0.4, 0.6)
         return rk.simulate(rk.Block(alpha, 2.0, 0.9), pulse, duration=3.0, samples=2, **QUICKLY).impact_times[1]
 
-    assert jax.grad(second_impact)(0.2) == pytest.approx(float(jax.jit(jax.grad(second_impact))(0.2)), rel=1e-12)
+    assert jax.grad(second_impact)(0.2) == pytest.approx(float(slopes[2, 0]), rel=1e-12)
 
 
 def test_a_history_of_the_diffrax_engine_moves_at_its_end():
     """Rotation and velocity: their derivatives by time there are those just before."""
-    response = rk.simulate(
-        rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6), rk.Linear(), duration=3.0, samples=2, engine=rk.Diffrax()
-    )
-    slopes = jax.jit(jax.jacrev(lambda t: jnp.stack(response(t))))
-    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-6)
+    block, pulse = rk.Block(0.2, 2.0, 0.9), rk.SinePulse(0.4, 0.6)
+
+    @jax.jit
+    def slopes(times):
+        response = rk.simulate(block, pulse, rk.Linear(), duration=3.0, samples=2, engine=rk.Diffrax())
+        return jax.vmap(jax.jacrev(lambda t: jnp.stack(response(t))))(times)
+
+    at_the_end, before = slopes(np.array([3.0, 3.0 - 1e-9]))
+    np.testing.assert_allclose(at_the_end, before, rtol=1e-6)
 
 
 def test_the_history_of_a_column_moves_at_its_end():
     block = rk.blocks.FlexibleBlock(1.0, 5.0, 3e9, 2000.0, 0.02, 3, restitution=0.9)
-    response = rk.simulate(block, rk.SinePulse(0.4, 0.9), duration=3.0, samples=2)
-    slopes = jax.jit(jax.jacfwd(lambda t: jnp.stack(response(t))))
-    np.testing.assert_allclose(slopes(3.0), slopes(3.0 - 1e-9), rtol=1e-5)
+
+    @jax.jit
+    def slopes(times):
+        response = rk.simulate(block, rk.SinePulse(0.4, 0.9), duration=3.0, samples=2)
+        return jax.vmap(jax.jacfwd(lambda t: jnp.stack(response(t))))(times)
+
+    at_the_end, before = slopes(np.array([3.0, 3.0 - 1e-9]))
+    np.testing.assert_allclose(at_the_end, before, rtol=1e-5)
 
 
 def test_slopes_of_forces_in_both_modes():
     """By slenderness, amplitude and duration: steps that were not taken are no numbers, and have no part in it."""
-
-    def forces(x):
-        block = rk.Block(x[0], 2.0)
-        response = rk.simulate(block, rk.SinePulse(x[1], x[2]), duration=2.0, samples=2, **QUICKLY)
-        found = rk.responses.contact_forces(response, block)
-        return jnp.stack([found.least_normal, found.largest_friction])
-
-    @jax.jit
-    def both(x):  # of one linearization: twice it would be compiled twice
-        _, pushed = jax.linearize(forces, x)
-        pulled = jax.linear_transpose(pushed, x)
-        return jax.vmap(pushed, out_axes=1)(jnp.eye(3)), jax.vmap(lambda row: pulled(row)[0])(jnp.eye(2))
-
-    forward, reverse = both(jnp.array([0.2, 0.4, 0.6]))
-    assert np.abs(forward).min() > 1e-4
-    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
-    forward, reverse = both(jnp.array([0.2, 1.5, 0.6]))  # of a block that comes back from beyond its balance
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    for amplitude, within in ((0.4, 1e-11), (1.5, 1e-9)):  # the second comes back from beyond its balance
+        _, forward, reverse, _ = slopes_of_a_history(np.array([0.2, amplitude, 0.6, 0.0, 0.0, 1.0]), 2.0)
+        forward, reverse = (np.asarray(x)[3:, :3] for x in (forward, reverse))
+        assert amplitude > 1 or np.abs(forward).min() > 1e-4
+        np.testing.assert_allclose(reverse, forward, rtol=within)
 
 
 @pytest.mark.slow
@@ -416,15 +439,19 @@ def test_second_derivatives_of_a_history():
 def test_second_derivatives_of_a_speed_between_impacts(engine):
     """The largest speed, where it is an extremum within a step, which moves: differences of first derivatives."""
     record = rk.Record(0.35 * np.sin(0.3 * np.arange(40)), 0.025)
-    x = jnp.array([0.2, 2.0, 1.0])
+    x = np.array([0.2, 2.0, 1.0])
 
     def speed(q):
         return rk.outcome(rk.Block(q[0], q[1]), q[2] * record, engine=engine).max_velocity
 
-    found = jax.jit(jax.hessian(speed))(x)
-    steps = 1e-4 * jnp.diag(x)
-    slopes = jax.jit(jax.vmap(jax.grad(speed)))(jnp.concatenate([x + k * steps for k in (-2, -1, 1, 2)]))
-    slopes = slopes.reshape(4, 3, 3)
+    def sloped(q):
+        slope = jax.grad(speed)(q)
+        return slope, slope
+
+    steps = 1e-4 * np.diag(x)
+    nearby = np.concatenate([x[None], *(x + k * steps for k in (-2, -1, 1, 2))])
+    (found, *_), slopes = map(np.asarray, jax.jit(jax.vmap(jax.jacfwd(sloped, has_aux=True)))(nearby))
+    slopes = slopes[1:].reshape(4, 3, 3)
     differences = (slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12e-4 * x[:, None])
     np.testing.assert_allclose(found, differences, rtol=1e-6, atol=1e-6)
     assert np.abs(found).min() > 1e-3
@@ -540,17 +567,10 @@ def test_a_step_against_its_own_series(model, vertical):
 def test_saltation():
     """Linear, three impacts: transition matrices of the flow, between them the saltation matrices of the impacts."""
     alpha, p, e, amplitude, period = 0.2, 2.0, 0.9, 0.21, 1.4
-    block, pulse = rk.Block(alpha, p, e), rk.SinePulse(amplitude, period)
-    start = np.array([-0.01, 0.0])
-
-    def end(initial):
-        engine = rk.Series(order=6)  # compiles in half the time
-        more = {"initial": tuple(initial), "duration": 1.2, "samples": 2, "engine": engine}
-        response = rk.simulate(block, pulse, rk.Linear(), **more)
-        return jnp.stack(response(jnp.array(1.2))), (response.impact_times, response.impact_velocities)
-
-    found, (times, speeds) = jax.jit(jax.jacfwd(end, has_aux=True))(start)
-    times, speeds = (np.asarray(x)[np.isfinite(times)] for x in (times, speeds))
+    x = np.array([alpha, amplitude, period, -0.01, 0.0, 1.2])
+    _, found, _, impacts = slopes_of_a_history(x, 1.2)
+    found = np.asarray(found)[:2, 3:5]  # rotation and velocity at the end by those at the start
+    times, speeds = (x[np.isfinite(impacts[0])] for x in map(np.asarray, impacts))
     assert len(times) == 3
 
     def flow(duration):
@@ -578,10 +598,18 @@ def bisected(function, lower, upper):
     return lower, upper
 
 
+TIME = np.arange(0, 60, 0.02)  # of records that share what is compiled
+
+
+@functools.cache
+def without_motion():
+    """Sensitivities of a linear block under a ground that stays where it is."""
+    return rk.studies.sensitivity(rk.Block(0.2, 2.0), rk.Record(0.0 * TIME, 0.02), rk.Linear())
+
+
 def test_a_block_that_does_not_uplift_has_no_slopes():
     """Nor under a ground that does not move, in which there is no peak to scale."""
-    still = rk.Record([0.0, 0.0, 0.0], 0.01)
-    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), still, rk.Linear(), engine=rk.Series(order=4))
+    found = without_motion()
     for slopes in (found.max_rotation, found.max_velocity):
         assert slopes.value == 0 and np.isinf(slopes.reach) and slopes.status == rk.studies.SlopeStatus.useful
         assert not np.any(slopes.derivative) and not np.any(slopes.elasticity)
@@ -589,8 +617,7 @@ def test_a_block_that_does_not_uplift_has_no_slopes():
 
 def test_nothing_is_far_of_a_scene_that_was_not_computed():
     """NaN says that no distance is known: infinite would be safe. Nor is one known without a slope."""
-    still = rk.Record([0.0, 0.0, 0.0], 0.01)
-    found = rk.studies.sensitivity(rk.Block(0.2, 2.0), still, rk.Linear(), engine=rk.Series(order=4))  # as above
+    found = without_motion()
     assert found.boundary_distance == found.graze_distance == np.inf  # computed, and nothing moves it
     rows, names, result = np.zeros((4, 5)), found.names[:-1], found.outcome
     numbers = found.values[:-1], jnp.asarray(0.2)
@@ -698,9 +725,6 @@ def test_a_pulse_that_is_scaled_or_shifted_has_one_amplitude():
         np.testing.assert_allclose(each.boundary_distance, alone.boundary_distance, rtol=1e-9)
 
 
-TIME = np.arange(0, 60, 0.02)  # of records that share what is compiled
-
-
 def one_sine():
     """A wave of 0.25 g and 1.4 s, and a minute of rest."""
     return rk.Record(np.where(TIME < 1.4, 0.25 * np.sin(2 * np.pi * TIME / 1.4), 0.0), 0.02)
@@ -725,7 +749,8 @@ def moved(found, motion, changes):
     values = dict(zip(found.names, np.asarray(found.values)[:-1] * (1 + changes)))
     amplitude = float(np.asarray(found.values)[found.names.index("amplitude")])
     record = rk.Record(values["amplitude"] / amplitude * np.asarray(motion.samples), values["dt"])
-    return rk.outcome(rk.Block(values["alpha"], values["p"], values["restitution"]), record, rk.Linear())
+    block = rk.Block(values["alpha"], values["p"], values["restitution"])
+    return rk.studies.sensitivity(block, record, rk.Linear()).outcome
 
 
 def test_distances_tell_how_far_is_too_far():
@@ -773,26 +798,77 @@ def test_sensitivity_map():
 
 
 WAVES = np.sin(0.3 * np.arange(70))
-LIFTING = rk.RectangularPulse(0.3, 0.25)
-LAST = rk.RectangularPulse(-0.25, 0.4)
+LAST, LIFTING = rk.RectangularPulse(-0.25, 0.4), rk.RectangularPulse(0.3, 0.25)
+
+
+def one_after_the_other(x, _):
+    return rk.HalfSinePulse(0.45, x[0]) + LAST.shifted(x[1])
+
+
+def three(x, sizes):
+    first, last = rk.RectangularPulse(sizes[0], x[0]).shifted(x[1]), rk.RectangularPulse(sizes[1], 0.4).shifted(x[3])
+    return first + (rk.HalfSinePulse(0.45, x[2]) + last)
+
+
+def two_later(x, _):
+    return (rk.SinePulse(0.4, x[0]) + rk.RectangularPulse(0.1, x[1])).shifted(x[2])
+
+
+def beside_a_record(x, numbers):
+    size, another, duration, share = numbers
+    pulse = rk.RectangularPulse(another, duration).shifted(x[1])
+    return rk.HalfSinePulse(size, x[0]) + pulse + rk.Record(share * WAVES, x[2])
+
+
+def with_vertical(x, _):
+    return rk.SinePulse(0.4, x[0]).with_vertical(rk.CosinePulse(0.2, x[1]))
+
+
+def lifted_there(x, _):
+    return LIFTING.shifted(x[0]) + rk.TriangularPulse(-0.15, 0.5).shifted(x[1])
+
+
+def record_upward(x, _):
+    return rk.Record(0.4 * WAVES, x[0] / 25).with_vertical(rk.Record(WAVES, x[1] / 25))
+
+
+# A motion, its durations and delays, linear in two of which knots come together, its other numbers, and where they do.
+# What has no size is there for what others of its kind have.
 TOGETHER = {
-    "a pulse that begins where another ends": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b), 0.5),
-    "the other way round": (lambda a, b: LAST.shifted(b) + rk.HalfSinePulse(0.45, a), 0.5),
-    "pulses that end together": (lambda a, b: rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b), 0.6),
-    "three": (
-        lambda a, b: rk.RectangularPulse(0.1, b) + (rk.HalfSinePulse(0.45, a) + LAST.shifted(a + b - 0.5)),
-        0.5,
-    ),
-    "with the vertical motion": (lambda a, b: rk.SinePulse(0.4, a).with_vertical(rk.CosinePulse(0.2, b)), 0.6),
-    "later": (lambda a, b: (rk.SinePulse(0.4, a) + rk.RectangularPulse(0.1, b)).shifted(a), 0.6),
-    "beside a record": (lambda a, b: rk.HalfSinePulse(0.45, a) + LAST.shifted(b) + rk.Record(0.1 * WAVES, 0.02), 0.5),
-    "lifted there": (lambda a, b: LIFTING.shifted(a) + rk.TriangularPulse(-0.15, 0.5).shifted(b), 0.75),
-    "lifted there, beside a record": (lambda a, b: LIFTING.shifted(a) + rk.Record(0.05 * WAVES, b / 15), 0.75),
-    "a record upward, too": (lambda a, b: rk.Record(0.4 * WAVES, a / 25).with_vertical(rk.Record(WAVES, b / 25)), 0.5),
+    "a pulse that begins where another ends": (one_after_the_other, lambda a, b: (a, b), (), 0.5),
+    "the other way round": (three, lambda a, b: (0.4, b, a, 2.0), (-0.25, 0.0), 0.5),
+    "pulses that end together": (two_later, lambda a, b: (a, b, 0), (), 0.6),
+    "three": (three, lambda a, b: (b, 0, a, a + b - 0.5), (0.1, -0.25), 0.5),
+    "with the vertical motion": (with_vertical, lambda a, b: (a, b), (), 0.6),
+    "later": (two_later, lambda a, b: (a, b, a), (), 0.6),
+    "beside a record": (beside_a_record, lambda a, b: (a, b, 0.02), (0.45, -0.25, 0.4, 0.1), 0.5),
+    "lifted there": (lifted_there, lambda a, b: (a, b), (), 0.75),
+    "lifted there, beside a record": (beside_a_record, lambda a, b: (2.5, a, b / 16), (0, 0.3, 0.25, 0.05), 0.75),
+    "a record upward, too": (record_upward, lambda a, b: (a, b), (), 0.5),
 }
+NONLINEAR = (one_after_the_other, record_upward)  # the others compile in half the time
 
 
-NONLINEAR = {"a pulse that begins where another ends", "a record upward, too"}  # the others compile in half the time
+@functools.cache
+def where_knots_come_together(make, engine):
+    """Peak and margin of a motion's numbers, and their slopes in both modes (of the series engine) by two in which
+    those are linear: compiled once for all motions of a kind."""
+    exact, fully = isinstance(engine, rk.Series), isinstance(engine, rk.Series) and make in NONLINEAR
+    model = rk.Housner() if fully else rk.Linear()
+    engine = QUICKLY["engine"] if exact and not fully else engine
+
+    def slopes(x, start, by, rest):
+        def results(x):
+            found = rk.outcome(rk.Block(0.2, 2.0, 0.9), make(start + by @ x, rest), model, engine=engine)
+            return jnp.stack([found.max_rotation, found.margin])
+
+        seen, pushed = jax.linearize(results, x)
+        forward = jax.vmap(pushed, out_axes=1)(np.eye(2))
+        pulled = jax.linear_transpose(pushed, x)  # of one linearization: twice it would be compiled twice
+        return seen, forward, jax.vmap(lambda row: pulled(row)[0])(np.eye(2)) if exact else forward
+
+    many = jax.jit(jax.vmap(slopes, in_axes=(0, None, None, None)))
+    return lambda *given: tuple(map(np.asarray, many(*given)))
 
 
 @pytest.mark.parametrize(
@@ -800,31 +876,20 @@ NONLINEAR = {"a pulse that begins where another ends", "a record upward, too"}  
 )
 def test_where_knots_come_together(case, engine):
     """Each has a slope of its own: what differences say, on both sides of the tie."""
-    make, at = TOGETHER[case]
-    block, x = rk.Block(0.2, 2.0, 0.9), jnp.array([at, at])
-    exact, fully = isinstance(engine, rk.Series), isinstance(engine, rk.Series) and case in NONLINEAR
-    model = rk.Housner() if fully else rk.Linear()
-    engine = QUICKLY["engine"] if exact and not fully else engine
-
-    def results(x):
-        found = rk.outcome(block, make(*x), model, engine=engine)
-        seen = jnp.stack([found.max_rotation, found.margin])
-        return seen, seen
-
-    @jax.jit
-    @jax.vmap
-    def slopes(x):
-        forward, seen = jax.jacfwd(results, has_aux=True)(x)
-        return seen, forward, jax.jacrev(results, has_aux=True)(x)[0] if exact else forward
-
+    make, of, rest, at = TOGETHER[case]
+    exact, x = isinstance(engine, rk.Series), np.array([at, at])
+    start, *by = (np.array(of(*x), float) for x in ((0, 0), (1, 0), (0, 1)))
+    linear = start, np.stack(by, axis=1) - start[:, None], np.array(rest, float)
+    slopes = where_knots_come_together(make, engine)
     step = 1e-5 if exact else 1e-4
     ways = step * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
-    seen, forward, reverse = slopes(x + ways)
+    seen, forward, reverse = slopes(x + ways, *linear)
     found, differences = forward[0], (seen[1:3] - seen[3:]) / (2 * step)
     np.testing.assert_allclose(found, differences.T, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(reverse[0], found, rtol=1e-12, atol=1e-14)
-    if fully:
-        np.testing.assert_allclose(slopes(jnp.broadcast_to(x, (70, 2)))[1][3], found, rtol=1e-12, atol=1e-14)
+    if exact and make in NONLINEAR:
+        many = slopes(np.broadcast_to(x, (70, 2)), *linear)[1]
+        np.testing.assert_allclose(many[3], found, rtol=1e-12, atol=1e-14)
 
 
 def test_a_history_where_knots_come_together():
@@ -836,9 +901,9 @@ def test_a_history_where_knots_come_together():
         return found, found
 
     both = jax.jit(jax.jacfwd(rotations, has_aux=True))
-    x, step = jnp.array([0.6, 0.6]), 1e-5
-    for until in ((3.0, jnp.array([0.5, 0.6, 1.0])), (0.6, jnp.array([0.5, 0.55, 0.6]))):
-        ends = [[both(x + way * each, *until)[1] for way in (step, -step)] for each in jnp.eye(2)]
+    x, step = np.array([0.6, 0.6]), 1e-5
+    for until in ((3.0, np.array([0.5, 0.6, 1.0])), (0.6, np.array([0.5, 0.55, 0.6]))):
+        ends = [[np.asarray(both(x + way * each, *until)[1]) for way in (step, -step)] for each in np.eye(2)]
         differences = [(above - below) / (2 * step) for above, below in ends]
         np.testing.assert_allclose(both(x, *until)[0], np.stack(differences, axis=1), atol=1e-5)
 
@@ -869,14 +934,21 @@ def test_by_all_samples_where_all_knots_come_together(kind):
 
 def test_nothing_is_lifted_between_knots_that_come_together():
     """Two pulses, each too weak, one of which ends as the other begins: never both at once."""
-    block, first = rk.Block(0.3, 2.0), rk.RectangularPulse(0.2, 0.4).shifted(0.1)
+    first = rk.RectangularPulse(0.2, 0.4).shifted(0.1)
     second = rk.RectangularPulse(0.2, 0.4).shifted(0.5)
-    factors = jnp.linspace(0.9, 1.0, 70)
+    factors = np.linspace(0.9, 1.0, 70)
+
+    @jax.jit
+    def each_way(motion):
+        of = functools.partial(rk.outcome, rk.Block(0.3, 2.0), **QUICKLY)
+        many = jax.vmap(lambda factor: of(factor * motion))(factors)
+        history = rk.simulate(rk.Block(0.3, 2.0), motion, **QUICKLY, samples=2)
+        found = of(1.0 * motion), jax.tree.map(lambda x: x[-1], many), history
+        return motion.bounds, [(each.max_rotation, each.impact_count, each.margin) for each in found]
+
     for motion in (first + second, second + first):
-        np.testing.assert_array_less(motion.bounds, 0.2 + 1e-12)
-        of = functools.partial(rk.outcome, block, **QUICKLY)
-        many = jax.vmap(lambda factor, motion=motion, of=of: of(factor * motion))(factors)
-        history = rk.simulate(block, motion, **QUICKLY, samples=2)
-        for found in (of(motion), jax.tree.map(lambda x: x[-1], many), history):
-            assert found.max_rotation == 0 and found.impact_count == 0
-            np.testing.assert_allclose(found.margin, 2 - 0.2 / 0.3, rtol=1e-12)
+        bounds, found = each_way(motion)
+        np.testing.assert_array_less(bounds, 0.2 + 1e-12)
+        for max_rotation, impact_count, margin in found:
+            assert max_rotation == 0 and impact_count == 0
+            np.testing.assert_allclose(margin, 2 - 0.2 / 0.3, rtol=1e-12)
