@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
-from jaxrock._parameters import check_single, in_precision
+from jaxrock._checks import put_down
+from jaxrock._parameters import check_single, in_precision, is_ours
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Reset, on_sides
 from jaxrock.blocks.rigid import Block
@@ -33,6 +34,13 @@ def peak_bound(motion: AbstractMotion) -> Scalar:
 
 def _moments(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     """Coefficients of side 1, and of side 2 if it has one of its own; times are p t, or p1 t on both sides."""
+    if is_ours(model):  # of what is traced they were asked before (`responses.current_model`): none in machine code
+        with put_down():
+            return _made(block, model)
+    return _made(block, model)
+
+
+def _made(block: Block | AsymmetricBlock, model: AbstractEquation) -> tuple:
     if isinstance(block, Block):
         moments = model.moments(block)
         return moments.balanced if isinstance(moments, Coefficients) else moments, None

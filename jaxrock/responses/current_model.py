@@ -82,11 +82,9 @@ def _none_where(bad: Bool[Array, ""], block: Block | AsymmetricBlock) -> Block |
 
 
 def _balanced(block: Block | AsymmetricBlock, spring: Spring, throw: bool) -> Block | AsymmetricBlock:
-    """The block, whose angles are checked where they are known, and marked where nothing is to be raised."""
+    """The block, whose angles are checked, and marked where nothing is to be raised."""
     for name in ("alpha",) if isinstance(block, Block) else ("alpha1", "alpha2"):
         alpha = getattr(block, name)
-        if throw and is_traced(alpha):
-            continue
         with throwing(throw):
             found = spring.balanced(f"block.{name}", alpha)
         if found is not alpha:

@@ -312,7 +312,9 @@ def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
 def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:
     if taped or not stepper.engine.in_lanes:
         return conclude(stepper, state)
-    return differentiable(_end, name="end", in_lanes=True, derivatives="in a direction")((stepper, state))
+    return differentiable(_end, None, None, "end", outcome_like, in_lanes=True, derivatives="in a direction")(
+        (stepper, state)
+    )
 
 
 def _end(given) -> Outcome:

@@ -68,7 +68,8 @@ class Lanes:
             return [jnp.zeros((0, *x.shape), x.dtype) for x in jax.tree.leaves(self.recipe.results)]
         if self.in_machine_code:
             return self._one_natively(leaves) if self.size is None else self._many_natively(leaves)
-        return list(self.recipe(leaves)) if self.size is None else self._many_by_xla(leaves)
+        with marking(self.on_cpu):
+            return list(self.recipe(leaves)) if self.size is None else self._many_by_xla(leaves)
 
     @functools.cached_property
     def in_machine_code(self) -> bool:

@@ -76,12 +76,10 @@ def _without_outside(recipe: Recipe, leaves: list) -> tuple[Recipe, list]:
     Where there are any, what is left of it is the whole, traced: its parts and its way over a tape take no such leaves,
     so that many scenes go the careful way, and derivatives by very many numbers the usual one.
     """
-    if recipe.facts is not None:
+    if not recipe.holds_traced:
         return recipe, leaves
     program, shapes = recipe.program, recipe.results
     outside = [isinstance(x, jax.core.Tracer) for x in program.consts]
-    if not any(outside):
-        return recipe, leaves
     more = [_strong(x) for x, traced in zip(program.consts, outside) if traced]
     count = len(leaves)
 

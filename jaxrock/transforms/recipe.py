@@ -14,8 +14,9 @@ from jax.interpreters import partial_eval
 from jaxrock._garbage import not_collected
 from jaxrock.keeping.facts import settings
 from jaxrock.keeping.folder import name_of
-from jaxrock.numerics.xla_cpu import are_marked
+from jaxrock.numerics.xla_cpu import are_marked, marking
 from jaxrock.transforms.fingerprint import Program
+from jaxrock.transforms.turns import as_loops
 
 Derivatives = Literal["at once", "a few at once", "by directions", "in a direction", "on a tape"]
 
@@ -120,7 +121,8 @@ class Recipe:
             made = jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)
             program, shapes = made(*self.like)
         needed, _ = partial_eval.dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
-        return ClosedJaxpr(needed, program.consts), shapes
+        program = ClosedJaxpr(needed, program.consts)
+        return (program if self.derivatives == "on a tape" else as_loops(program)), shapes
 
     @property
     def program(self) -> ClosedJaxpr:
@@ -137,8 +139,19 @@ class Recipe:
     def results(self) -> Any:
         """What it returns, a tree of `jax.ShapeDtypeStruct`."""
         if self._results is None:
-            self._results = self._traced(quick=False)[1]
+            self._results = self._first[1]
         return self._results
+
+    @property
+    def _first(self) -> tuple[ClosedJaxpr, Any]:
+        """Traced before it is known for what: as it will most likely be wanted, machine code needs no marks."""
+        with marking(are_marked() and not self.in_lanes):
+            return self._traced(quick=False)
+
+    @property
+    def holds_traced(self) -> bool:
+        """Whether its function holds traced values of what is around it."""
+        return self.facts is None and any(isinstance(x, jax.core.Tracer) for x in self._first[0].consts)
 
     def __call__(self, leaves: Sequence) -> list:
         """Compute it for one scene."""

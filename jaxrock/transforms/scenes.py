@@ -125,7 +125,8 @@ def _pushed(leaves, changes, *, recipe, own, size):
     too_many = recipe.derivatives == "a few at once" and numbers > _MANY
     if too_many or recipe.derivatives == "in a direction":
         return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
-    if recipe.derivatives == "by directions" or (recipe.order and recipe.in_lanes):
+    alone = size is None and numbers > 1  # directions are lanes of one vector then, and its program is the smallest
+    if recipe.derivatives == "by directions" or (recipe.in_lanes and (recipe.order or alone)):
         value, jacobian = _jacobian_by_directions(leaves, moves, recipe, own, size)
     elif recipe.in_lanes and numbers > AT_ONCE:
         value, jacobian = _jacobian_in_rows(leaves, moves, recipe, own, size)
