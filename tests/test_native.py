@@ -765,6 +765,9 @@ SCENES = {
     "spring": lambda a, u: (
         rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM1", "linear"), **SHORT_SERIES).margin
     ),
+    "a plastic spring": lambda a, u: (
+        rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM3", "plastic"), **SHORT_SERIES).margin
+    ),
     "an equation with a damper": damped,
     "its derivatives by diffrax": jax.grad(damped, (0, 1)),
     "another solver of diffrax": lambda a, u: by_diffrax(a, u, solver=diffrax.Dopri8()).margin,

@@ -1,0 +1,90 @@
+"""Loops of a known number of turns, of which JAX makes scans: the same numbers and derivatives as of a loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import jaxpr_as_fun
+
+import jaxrock as rk
+from jaxrock.transforms.turns import as_loops
+
+
+def powers(x, y):
+    """Sums of y^k x^k, by a loop."""
+    return lax.fori_loop(0, 5, lambda k, total: total + (x * y) ** k, 0.0 * x)
+
+
+def nested(x, y):
+    return lax.fori_loop(0, 3, lambda k, total: total * powers(x + k, y), y)
+
+
+def in_a_case(x, y):
+    return lax.cond(x > 0, lambda: powers(x, y), lambda: y)
+
+
+def in_a_loop(x, y):
+    return lax.while_loop(lambda carry: carry[0] < 3, lambda carry: (carry[0] + 1, powers(carry[1], y)), (0, x))[1]
+
+
+def in_a_call(x, y):
+    return jax.jit(powers)(x, y) + powers(y, x)
+
+
+def that_returns_what_it_is_given(x, y):
+    x, unchanged, total = lax.fori_loop(0, 4, lambda k, carry: (carry[0], carry[1], carry[2] + carry[1]), (x, y, 1.0))
+    return x * unchanged + lax.fori_loop(0, 0, lambda k, total: total + x, total)
+
+
+def of_rows(x, y):
+    """What takes or makes rows stays a scan."""
+    return lax.scan(lambda total, row: (total + row * x, total), y, jnp.arange(4.0))[1][3]
+
+
+FUNCTIONS = (powers, nested, in_a_case, in_a_loop, in_a_call, that_returns_what_it_is_given, of_rows)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
+def test_loops_are_what_scans_are(function):
+    program = as_loops(jax.make_jaxpr(function)(0.3, 0.7))
+    assert ("scan" in str(program)) == (function is of_rows)
+    found = lambda *point: jaxpr_as_fun(program)(*point)[0]
+    for point in ((0.3, 0.7), (-0.4, 1.1)):
+        np.testing.assert_array_equal(found(*point), function(*point))
+        np.testing.assert_allclose(jax.jacfwd(found)(*point), jax.jacfwd(function)(*point), rtol=1e-14)
+
+
+def test_a_program_without_is_left():
+    program = jax.make_jaxpr(lambda x: jnp.sin(x) + lax.while_loop(lambda x: x < 3, lambda x: x + 1, x))(0.3)
+    assert as_loops(program) is program
+
+
+class Halved(rk.Linear):
+    """Half of all moments."""
+
+    def moments(self, block):
+        return super().moments(block).times(0.5)
+
+
+class HalvedTwice(rk.Linear):
+    """The same, from double of them."""
+
+    def moments(self, block):
+        return super().moments(block).times(lax.fori_loop(0, 2, lambda _, part: part / 2, 2.0 + 0.0 * block.alpha))
+
+
+def test_a_model_of_ones_own_may_take_turns(caplog):
+    """It is machine code, and differentiated, as the same without a loop."""
+
+    def peak_and_slope(model):
+        def peak(a):
+            pulse, engine = rk.RectangularPulse(a, 0.3), rk.Series(order=8)
+            return rk.outcome(rk.Block(0.2, 2.0, 0.9), pulse, model, engine=engine).max_rotation
+
+        return jax.value_and_grad(peak)(0.25)
+
+    with caplog.at_level("DEBUG", "jaxrock"):
+        found = peak_and_slope(HalvedTwice())
+    assert "left to XLA" not in caplog.text
+    np.testing.assert_allclose(found, peak_and_slope(Halved()), rtol=1e-13)
