@@ -276,11 +276,9 @@ class AsymmetricBlock(Owner):
         return flat if self.given_radius_ratio is None else self.given_radius_ratio
 
     @property
-    @one_program
     def inertia_ratio2(self) -> Real:
         """m R2^2/I2."""
-        square = self.radius_ratio**2
-        return square / (square + 1 / self.inertia_ratio - 1)
+        return _second_inertia(self)
 
     @property
     def p2(self) -> Real:
@@ -337,3 +335,9 @@ def _of_rates(p1: Real, p2: Real, kappa: Real) -> tuple[Real, Bool[Array, "..."]
 @one_program
 def _second_rate(block: AsymmetricBlock) -> Real:
     return block.p1 * jnp.sqrt(block.inertia_ratio2 / (block.inertia_ratio * block.radius_ratio))
+
+
+@one_program
+def _second_inertia(block: AsymmetricBlock) -> Real:
+    square = block.radius_ratio**2
+    return square / (square + 1 / block.inertia_ratio - 1)
