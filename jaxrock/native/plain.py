@@ -24,6 +24,7 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_
 _TABLE = 256  # numbers of a constant that may be looked into: a solver's table
 _MOST = 64  # of an array that is computed here
 _TURNS, _OPERATIONS = 32, 1 << 14  # of a loop that is unrolled, at most
+_SMALL = 4  # operations of a program that is gone through again rather than remembered
 
 
 def plain(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -67,11 +68,22 @@ class _Run:
     """Goes through a program with values that are known (of NumPy) or not: then they are traced; or, unless it `binds`,
     they are None, and it only tells which results are known."""
 
-    def __init__(self, binds: bool):
+    def __init__(self, binds: bool, told: dict | None = None):
         self.binds = binds
+        self.told = {} if told is None else told  # which results are known, by programs and what is given of them
 
     def of(self, program: ClosedJaxpr, given: Sequence) -> list:
         """The results of a program (closed)."""
+        if self.binds or len(program.jaxpr.eqns) < _SMALL:
+            return self._through(program, given)
+        # Of a loop within loops the same is asked again and again.
+        values = tuple(None if x is None else (x.dtype, x.shape, x.tobytes()) for x in given)
+        key = id(program.jaxpr), tuple(map(id, program.consts)), values
+        if key not in self.told:
+            self.told[key] = program, self._through(program, given)  # the program, too: its number is not another's
+        return self.told[key][1]
+
+    def _through(self, program: ClosedJaxpr, given: Sequence) -> list:
         jaxpr = program.jaxpr
         values: dict[Any, Any] = dict(zip(jaxpr.invars, given, strict=True))
         consts = map(_known, program.consts)
@@ -133,7 +145,7 @@ class _Run:
 
         def run(*leaves):
             mixed = [x if _is_known(x) else leaf for x, leaf in zip(given, leaves)]
-            found = _Run(binds=True).of(program, mixed)
+            found = _Run(binds=True, told=self.told).of(program, mixed)
             return [x if x is not None else y for x, y in zip(keep or [None] * len(found), found)]
 
         return _traced(run, program)
@@ -161,7 +173,8 @@ class _Run:
         n_cond, n_body = parameters["cond_nconsts"], parameters["body_nconsts"]
         of_cond, of_body, carry = given[:n_cond], given[n_cond : n_cond + n_body], given[n_cond + n_body :]
         cond, body = parameters["cond_jaxpr"], parameters["body_jaxpr"]
-        asks, for_cond, for_body, same = _Run(binds=False), *map(_only_known, (of_cond, of_body, carry))
+        asks = _Run(binds=False, told=self.told)
+        for_cond, for_body, same = map(_only_known, (of_cond, of_body, carry))
         turns = _turns(lambda s: asks.of(cond, [*for_cond, *s])[0], lambda s: asks.of(body, [*for_body, *s]), same)
         if turns is not None and _is_short(turns, body):
             for _ in range(turns):
