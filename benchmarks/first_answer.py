@@ -74,6 +74,12 @@ QUESTIONS = {
         "answer = jax.grad(lambda a: rk.outcome(block, rk.SinePulse(a, 0.8)).max_rotation)(0.3)",
         6.0, 1.0,
     ),
+    "grad5": (
+        "`jax.grad` by 5 numbers, one scene",
+        "def peak(x): return rk.outcome(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4])).max_rotation\n"
+        "answer = jax.grad(peak)(jnp.array([0.2, 2.0, 0.9, 0.3, 0.8]))",
+        None, None,
+    ),
     "slopes": (
         "value and 5 derivatives of 1,000",
         "def peak(x): return rk.outcome(rk.Block(x[0], x[1], x[2]), rk.SinePulse(x[3], x[4])).max_rotation\n"
@@ -128,6 +134,22 @@ QUESTIONS = {
         "answer = jax.vmap(lambda a: rk.outcome(rock, a * motion))(jnp.linspace(0.5, 2.0, 1000))",
         6.0, 0.8,
     ),
+    "spring": (
+        "plastic spring",
+        "answer = rk.outcome(block, pulse, rk.Spring('SM1', 'plastic'))",
+        None, None,
+    ),
+    "own": (
+        "model of one's own with `fori_loop`",
+        "class Model(rk.Linear):\n"
+        "    def moments(self, block):\n"
+        "        part = jax.lax.fori_loop(0, 9, lambda k, part: part + 1 / 9, 0.0 * block.alpha)\n"
+        "        return super().moments(block).times(part)\n"
+        "answer = rk.outcome(block, pulse, Model())",
+        None, None,
+    ),
+    "critical": ("`critical_amplitudes`", "answer = rk.critical_amplitudes(block, pulse, progress=False)", None, None),
+    "sensitivity": ("`sensitivity`", "answer = rk.studies.sensitivity(block, pulse)", None, None),
     "diffrax": ("Diffrax engine, `outcome`", "answer = rk.outcome(block, pulse, engine=rk.Diffrax())", 5.0, 1.0),
     "closed": (
         "gradient of a closed form",
