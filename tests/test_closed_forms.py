@@ -1,6 +1,7 @@
 """Closed forms against the papers' (corrected) formulas in 220 digits; the linear engine against the closed forms."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -610,3 +611,30 @@ def test_slopes_by_time_at_an_impact_are_those_before_it():
 def test_a_triangle_has_the_slope_by_shape_of_its_neighbours():
     slopes = [each(jax.grad(single_lobe.pulse, 1), 0.3, shape) for shape in (-1e-7, 0.0, 1e-7)]
     np.testing.assert_allclose(slopes, -0.12, rtol=1e-6)
+
+
+def test_arrays_of_any_shape_are_of_a_few_programs():
+    """Each of their elements is that of the array of all, to the bit; a new length compiles nothing."""
+    times, rotation = (
+        np.linspace(0.1, 1.4, 64),
+        functools.partial(single_lobe.rotation, uplift_strength=0.4, pulse_duration=1.5),
+    )
+    of_all = np.asarray(rotation(times, shape=0.7))
+    programs = []
+    listen = lambda name, *_, **__: programs.append(name)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for shape in ((1,), (3,), (2, 5), (63,), (4, 1, 4)):
+            count = math.prod(shape)
+            found = rotation(times[:count].reshape(shape), shape=np.full(shape[-1:], 0.7))
+            assert found.shape == shape and isinstance(found, jax.Array)
+            np.testing.assert_array_equal(np.asarray(found).ravel(), of_all[:count])
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not [name for name in programs if name.endswith("backend_compile_duration")]
+    longer = np.asarray(rotation(np.linspace(0.1, 1.4, 5001), shape=0.7))  # room for a few more
+    assert longer.shape == (5001,)
+    assert longer[[0, -1]] == pytest.approx(of_all[[0, -1]], rel=1e-15)
+    assert rotation(np.zeros((0, 3)), shape=0.7).shape == (0, 3)
+    here = jax.device_put(times[:5], jax.devices("cpu")[1])  # stays where its user has put it
+    assert rotation(here, shape=0.7).devices() == {jax.devices("cpu")[1]}

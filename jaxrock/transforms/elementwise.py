@@ -2,15 +2,17 @@
 
 import functools
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any, get_args, get_origin
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
-from jaxrock._checks import check_shapes
+from jaxrock._checks import check_shapes, is_traced, placed
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -22,7 +24,8 @@ def elementwise(**checks: Callable) -> Callable:
 
     def decorate(function: Callable) -> Callable:
         signature = inspect.signature(function)
-        compiled = _with_kept_derivatives(function)
+        compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
+        derived = _with_kept_derivatives(function, compiled)
 
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
@@ -30,15 +33,36 @@ def elementwise(**checks: Callable) -> Callable:
             given = {name: checks[name](name, value) for name, value in given.items()}
             check_shapes(**given)
             kind = jnp.result_type(*given.values())
-            return compiled(*(x.astype(kind) for x in given.values()))
+            values = [x.astype(kind) for x in given.values()]
+            if is_traced(values) or any(x.committed or x.size == 0 for x in values):
+                return derived(*values)
+            return _with_room(compiled, values)
 
         return checked_and_compiled
 
     return decorate
 
 
-def _with_kept_derivatives(function: Callable) -> Callable:
-    compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
+_LEAST, _DOUBLED = 64, 4096  # elements for which there is room, and up to which room is doubled
+
+
+def _with_room(function: Callable, values: list) -> Any:
+    """The function of known arrays: of any shape in a few lengths, for each of which it is compiled."""
+    shape = np.broadcast_shapes(*(x.shape for x in values))
+    if shape == ():
+        return function(*values)
+    size = math.prod(shape)
+    doubled = 1 << (max(size, _LEAST) - 1).bit_length()
+    room = doubled if size <= _DOUBLED else -(-size // (doubled // 8)) * (doubled // 8)
+    filled = [np.empty(room, x.dtype) for x in values]
+    for whole, x in zip(filled, values):
+        whole[:size] = np.broadcast_to(np.asarray(x), shape).ravel()
+        whole[size:] = whole[size - 1]  # elements like another: none takes longer
+    found = function(*filled)
+    return jax.tree.map(lambda x: placed(np.asarray(x)[:size].reshape(shape)), found)
+
+
+def _with_kept_derivatives(function: Callable, compiled: Callable) -> Callable:
     one = differentiable(
         lambda values: function(*values),
         name=f"{function.__module__}.{function.__qualname__}",
