@@ -25,10 +25,13 @@ def _programs(parameters: dict) -> list:
 
 
 def _is_counted(equation) -> bool:
+    """Whether it is a scan without rows: all that it takes and makes is as within. (How JAX tells how many are carried
+    differs from version to version.)"""
     if equation.primitive.name != "scan" or equation.params["jaxpr"].consts:
         return False
-    carried = equation.params["num_carry"]
-    return len(equation.outvars) == carried and len(equation.invars) == equation.params["num_consts"] + carried
+    turn = equation.params["jaxpr"]
+    pairs = [*zip(equation.invars, turn.in_avals, strict=True), *zip(equation.outvars, turn.out_avals, strict=True)]
+    return all(len(x.aval.shape) == len(within.shape) for x, within in pairs)
 
 
 def _with_loops(jaxpr):
@@ -66,7 +69,7 @@ def _is_program(value) -> bool:
 
 def _loop(equation):
     """The program of a scan that takes turns."""
-    turns, count = equation.params["length"], equation.params["num_consts"]
+    turns, count = equation.params["length"], len(equation.invars) - len(equation.outvars)  # the last are carried
     turn = jaxpr_as_fun(equation.params["jaxpr"])
 
     def run(*operands):
