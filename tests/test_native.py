@@ -22,6 +22,7 @@ from llvmlite import binding, ir  # noqa: E402
 
 import jaxrock as rk  # noqa: E402
 from jaxrock import _foreign  # noqa: E402
+from jaxrock._programs import programs_of  # noqa: E402
 from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
 from jaxrock.native.builder import Builder  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
@@ -591,7 +592,7 @@ def test_powers(power):
 
 def names_in(program) -> set[str]:
     """Names of all operations of a program, and of the programs in it."""
-    inner = [names_in(p) for equation in program.eqns for p in plain_programs._programs(equation)]
+    inner = [names_in(p) for equation in program.eqns for p in programs_of(equation)]
     return {equation.primitive.name for equation in program.eqns}.union(*inner)
 
 

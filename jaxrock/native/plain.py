@@ -17,6 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
+from jaxrock._programs import programs_of
 from jaxrock.native.operations import KNOWN, MOVES, NOTHING, Unsupported
 from jaxrock.native.partition import needed_by
 
@@ -52,12 +53,7 @@ def is_foreign(equation) -> bool:
 
 def has_foreign(jaxpr) -> bool:
     """Whether a program holds an operation of another library."""
-    return any(is_foreign(equation) or any(map(has_foreign, _programs(equation))) for equation in jaxpr.eqns)
-
-
-def _programs(equation) -> list:
-    values = [v for p in equation.params.values() for v in (p if isinstance(p, (tuple, list)) else (p,))]
-    return [p for p in (getattr(v, "jaxpr", v) for v in values) if hasattr(p, "eqns")]
+    return any(is_foreign(equation) or any(map(has_foreign, programs_of(equation))) for equation in jaxpr.eqns)
 
 
 def _like(aval) -> jax.ShapeDtypeStruct:
@@ -251,7 +247,7 @@ def _is_short(turns: int, program: ClosedJaxpr) -> bool:
 
 
 def _size(jaxpr) -> int:
-    return sum(1 + sum(map(_size, _programs(equation))) for equation in jaxpr.eqns)
+    return sum(1 + sum(map(_size, programs_of(equation))) for equation in jaxpr.eqns)
 
 
 def _only_known(values: Iterable) -> list:

@@ -125,7 +125,9 @@ def _pushed(leaves, changes, *, recipe, own, size):
     too_many = recipe.derivatives == "a few at once" and numbers > _MANY
     if too_many or recipe.derivatives == "in a direction":
         return _pushed_in_a_direction(leaves, moves, moving, recipe, own, size)
-    alone = size is None and numbers > 1  # directions are lanes of one vector then, and its program is the smallest
+    # Few directions of one scene are lanes of a vector, and the program of one is the smallest. (Lists of a record,
+    # which one scene looks up for all lanes, would take a fifth longer.)
+    alone = size is None and 1 < numbers <= AT_ONCE and not any(x.shape for x in recipe.like)
     if recipe.derivatives == "by directions" or (recipe.in_lanes and (recipe.order or alone)):
         value, jacobian = _jacobian_by_directions(leaves, moves, recipe, own, size)
     elif recipe.in_lanes and numbers > AT_ONCE:

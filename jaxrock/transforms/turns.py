@@ -6,6 +6,8 @@ import jax
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from jaxrock._programs import programs_of
+
 
 def as_loops(program: ClosedJaxpr) -> ClosedJaxpr:
     """The same program; its scans that neither take nor make rows (`jax.lax.fori_loop`) are loops, which reverse mode
@@ -15,16 +17,11 @@ def as_loops(program: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(_with_loops(program.jaxpr), program.consts)
 
 
-def _has_counted(jaxpr) -> bool:
-    return any(_is_counted(each) or any(map(_has_counted, _programs(each.params))) for each in jaxpr.eqns)
+def _has_counted(jaxpr: Any) -> bool:
+    return any(_is_counted(each) or any(map(_has_counted, programs_of(each))) for each in jaxpr.eqns)
 
 
-def _programs(parameters: dict) -> list:
-    values = [v for p in parameters.values() for v in (p if isinstance(p, (tuple, list)) else (p,))]
-    return [p for p in (getattr(v, "jaxpr", v) for v in values) if hasattr(p, "eqns")]
-
-
-def _is_counted(equation) -> bool:
+def _is_counted(equation: Any) -> bool:
     """Whether it is a scan without rows: all that it takes and makes is as within. (How JAX tells how many are carried
     differs from version to version.)"""
     if equation.primitive.name != "scan" or equation.params["jaxpr"].consts:
@@ -34,7 +31,7 @@ def _is_counted(equation) -> bool:
     return all(len(x.aval.shape) == len(within.shape) for x, within in pairs)
 
 
-def _with_loops(jaxpr):
+def _with_loops(jaxpr: Any) -> Any:
     found: dict[Any, Any] = {}  # what loops make, by the variables of the scans
     equations = []
     for equation in jaxpr.eqns:
@@ -54,7 +51,7 @@ def _renamed(variables: list, names: dict) -> list:
     return [x if isinstance(x, Literal) else names.get(x, x) for x in variables]
 
 
-def _inside(value):
+def _inside(value: Any) -> Any:
     """A parameter of an operation, where it is a program, or some."""
     if isinstance(value, (tuple, list)):
         return type(value)(map(_inside, value)) if any(map(_is_program, value)) else value
@@ -63,11 +60,11 @@ def _inside(value):
     return _with_loops(value) if _is_program(value) else value
 
 
-def _is_program(value) -> bool:
+def _is_program(value: Any) -> bool:
     return hasattr(getattr(value, "jaxpr", value), "eqns")
 
 
-def _loop(equation):
+def _loop(equation: Any) -> Any:
     """The program of a scan that takes turns."""
     turns, count = equation.params["length"], len(equation.invars) - len(equation.outvars)  # the last are carried
     turn = jaxpr_as_fun(equation.params["jaxpr"])
