@@ -23,7 +23,8 @@ from pathlib import Path
 import jax
 import matplotlib
 import pytest
-from jaxtyping import install_import_hook
+
+from references.checked_shapes import check_shapes
 
 INNERMOST = {"polynomial", "expansion", "lookup", "elementary"}
 
@@ -37,7 +38,7 @@ def checked_modules():
             yield ".".join(["jaxrock", *path.relative_to(package).with_suffix("").parts])
 
 
-install_import_hook(list(checked_modules()), "beartype.beartype")
+check_shapes(list(checked_modules()))
 
 # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
 gc.set_threshold(1_000_000, 10, 10)

@@ -3,8 +3,11 @@ that it states is held against the value."""
 
 import inspect
 
+import jax.numpy as jnp
 import pytest
+from jaxtyping import TypeCheckError
 
+from jaxrock.inverse.calibration_grid import weighed
 from references import typed_use
 
 PARTS = [
@@ -27,3 +30,12 @@ def test_types_are_what_checkers_are_told(name, tmp_path, monkeypatch):
     part = getattr(typed_use, name)
     part(*[tmp_path] * len(inspect.signature(part).parameters))
     assert len(stated) == inspect.getsource(part).count("assert_type(")
+
+
+def test_shapes_are_checked_of_what_is_given_and_returned():
+    """See `references.checked_shapes`; two functions of the package stand for all."""
+    assert weighed(jnp.ones((2, 3)), [jnp.ones(3)]).shape == (2,)
+    with pytest.raises(TypeCheckError, match="parameter 'shares'"):
+        weighed(jnp.ones(()), [])
+    with pytest.raises(TypeCheckError, match="return"):
+        weighed(jnp.ones((2, 3)), [])
