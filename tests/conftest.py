@@ -53,6 +53,7 @@ if "XLA_FLAGS" not in os.environ:
     )
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads than one wait at full speed
 
 # What one process has compiled all find again, after it was forgotten, too. What one has half written another may read:
 # JAX says so, which is no error here (see `filterwarnings`), and compiles it. The first one clears the place away.
@@ -72,7 +73,7 @@ matplotlib.use("Agg")
 # last test of a file, and within one, where the next test may need what was compiled for this.
 _AFTER_A_FILE, _WITHIN, _LEAST_GROWTH = 1.2e9, 1.35e9, 2e8
 _MOST_MAPS = 30_000
-_TESTS = 10  # after so many it is looked how many maps there are, for to read them takes as long as a small test
+_TESTS = 50  # after so many it is looked how many maps there are, for to read them takes as long as a small test
 _held, _left = [0.0], [_TESTS]  # bytes after they were last forgotten; tests until maps are looked at
 _OF_C = ctypes.CDLL(None) if os.name == "posix" else None
 

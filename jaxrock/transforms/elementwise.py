@@ -43,7 +43,7 @@ def elementwise(**checks: Callable) -> Callable:
     return decorate
 
 
-_LEAST, _DOUBLED = 64, 4096  # elements for which there is room, and up to which room is doubled
+_LEAST, _DOUBLED = 8, 4096  # elements for which there is room, and up to which room is doubled
 
 
 def _with_room(function: Callable, values: list) -> Any:
