@@ -53,13 +53,6 @@ def rows():
     return found
 
 
-def ids(row):
-    return f"{row[0]} {row[1]} {row[2][0]}"
-
-
-over_rows = pytest.mark.parametrize("row", rows(), ids=ids)
-
-
 @pytest.mark.parametrize("paper", PAPERS)
 @pytest.mark.parametrize("kind", ["equation", "figure"])
 def test_every_number_has_one_row(paper, kind):
@@ -72,8 +65,7 @@ def test_the_papers_are_counted():
     assert [sum(len(PRINTED[name][i]) for name in PAPERS) for i in (0, 1)] == [116, 44 + 2]
 
 
-@over_rows
-def test_no_cell_is_empty(row):
+def is_full(row):
     """A dash is for sketches, and for notebooks of figures that are not drawn."""
     _, kind, (numbers, function, notebook, test, judge) = row
     assert judge and judge != "-"
@@ -86,8 +78,7 @@ def test_no_cell_is_empty(row):
         assert "sketch" in judge or "drawn" in judge
 
 
-@over_rows
-def test_functions_are_there(row):
+def has_its_functions(row):
     for path in re.findall("`([^`]+)`", row[2][1]):
         owner = jaxrock
         for part in path.split("."):
@@ -99,8 +90,7 @@ def test_functions_are_there(row):
         assert callable(owner) or path.endswith("QUANTITIES")
 
 
-@over_rows
-def test_notebooks_are_there(row):
+def has_its_notebooks(row):
     """And those of figures say that they draw them."""
     _, kind, (numbers, _, notebook, _, _) = row
     links = re.findall(r"\]\(([^)]+)\)", notebook)
@@ -130,8 +120,18 @@ def functions_of(name: str) -> set[str]:
     return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-@over_rows
-def test_tests_are_there(row):
+def has_its_tests(row):
     for found in re.findall("`([^`]+)`", row[2][3]):
         module, function = found.split("::")
         assert function.startswith("test_") and function in functions_of(module)
+
+
+@pytest.mark.parametrize("check", [is_full, has_its_functions, has_its_notebooks, has_its_tests])
+def test_every_row(check):
+    wrong = {}
+    for paper, kind, cells in rows():
+        try:
+            check((paper, kind, cells))
+        except AssertionError as error:
+            wrong[f"{paper} {kind} {cells[0]}"] = str(error)
+    assert len(rows()) > 100 and not wrong
