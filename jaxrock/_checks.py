@@ -29,6 +29,12 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def is_at_hand(tree: Any) -> bool:
+    """Whether NumPy may compute with the arrays in it: they are known, and where nobody has put them."""
+    leaves = jax.tree.leaves(tree)
+    return not is_traced(leaves) and not any(getattr(leaf, "committed", False) for leaf in leaves)
+
+
 def check_known(**values: Any) -> None:
     """Raise ValueError for what is traced, where NumPy takes over."""
     for name, value in values.items():

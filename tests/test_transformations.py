@@ -351,3 +351,24 @@ def test_what_is_kept_belongs_to_no_trace():
     _usual.clear()
     dealt(jax.vmap(outcome))(AT)
     assert not any(isinstance(x, jax.core.Tracer) for x in start_of((0.0, 0.0)))
+
+
+def test_steps_before_times_are_found_by_numpy_as_within_jit():
+    """To the bit: at steps, between and after them, at an impact, of times of any shape, where steps were too few."""
+    for steps, is_whole in ((None, True), (6, False)):
+        engine = rk.Series(order=6, max_steps=steps)
+        response = rk.simulate(BLOCK, rk.SinePulse(0.3, 0.8), rk.Linear(), engine=engine, samples=5)
+        path = response.trajectory
+        assert is_whole == (response.status == rk.Status.successful)
+        assert path.equally_spaced(5)[-1] == path.duration
+        known = np.asarray(path.times)
+        known = known[np.isfinite(known) & (known <= path.duration)]
+        times = np.concatenate([known, (known[1:] + known[:-1]) / 2, np.linspace(0, path.duration, 9)])
+        found = jax.tree.leaves(path.before(times))
+        within = jax.tree.leaves(jax.jit(lambda path, t: path.before(t))(path, times))
+        assert all(isinstance(x, np.ndarray) for x in found) and np.isnan(found[-1]).any() != is_whole
+        for one, other in zip(found, within, strict=True):
+            np.testing.assert_array_equal(one, other)
+        rows = times[: times.size // 2 * 2].reshape(2, -1)
+        for one, other in zip(response(rows), jax.jit(lambda r, t: r(t))(response, rows), strict=True):
+            np.testing.assert_array_equal(one, other)

@@ -11,7 +11,7 @@ import numpy as np
 from equinox.internal import unvmap_any
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
-from jaxrock._checks import Values, checked, if_traced, is_traced, placed
+from jaxrock._checks import Values, checked, if_traced, is_at_hand, is_traced, placed
 from jaxrock.numerics.choice import where
 from jaxrock.status import still_where
 from jaxrock.transforms.differentiation import differentiable
@@ -47,23 +47,32 @@ class Trajectory(eqx.Module):
         time = checked("time", time, allowed, lambda t: (t >= 0) & ~(t > end))
         return time.astype(jnp.result_type(time, self.duration))
 
-    def at_times(self, time: Inexact[Array, "..."], follow: Callable) -> PyTree:
-        """`follow(node, elapsed)` from the node before each time; results have the shape of `time` in front."""
+    def equally_spaced(self, samples: int) -> Inexact[Array, " samples"]:
+        """So many times from 0 to the duration, equal to the bit within `jax.jit` and outside."""
+        shares = np.linspace(0, 1, samples).astype(self.duration.dtype)
+        return placed(np.asarray(self.duration) * shares) if is_at_hand(self.duration) else self.duration * shares
 
-        def at(t):
-            return follow(*self.before(t))
+    def before(self, time: Inexact[Array | np.ndarray, " n"]) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
+        """The node before each time, and how long after it that is [s]; not a number where no step was left for that.
 
-        found = jax.tree.map(lambda x: x.reshape(*time.shape, *x.shape[1:]), jax.vmap(at)(time.ravel()))
-        return still_where(jnp.isnan(self.duration), found)
+        By NumPy where all is at hand: XLA would compile for longer than a whole history takes.
+        """
+        given = self.nodes, self.times, self.duration, time
+        known = is_at_hand(given)
+        xp, (nodes, times, duration, time) = (np, jax.tree.map(np.asarray, given)) if known else (jnp, given)
+        last = times.size - 1
 
-    def before(self, time: Inexact[Array, ""]) -> tuple[PyTree, Inexact[Array, ""]]:
-        """The node before a time, and how long after it that is [s]; not a number where no step was left for that."""
-        index = jnp.clip(jnp.searchsorted(self.times, time, side="right") - 1, 0, self.times.size - 1)
-        node = jax.tree.map(lambda x: x[index], self.nodes)
-        elapsed = where(time <= self.duration, time, self.duration) - self.times[index]
-        following = where(index < self.times.size - 1, self.times[index + 1], jnp.inf)
-        is_followed = node.done | jnp.isfinite(following) | (elapsed <= 0)
-        return node, where(is_followed, elapsed, jnp.nan)
+        def at(index):
+            if known:
+                return lambda x: x[index]
+            return lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+        index = xp.clip(xp.searchsorted(times, time, side="right") - 1, 0, last)
+        node = jax.tree.map(at(index), nodes)
+        elapsed = xp.where(time <= duration, time, duration) - at(index)(times)
+        following = xp.where(index < last, at(xp.minimum(index + 1, last))(times), xp.inf)
+        is_followed = node.done | xp.isfinite(following) | (elapsed <= 0)
+        return node, xp.where(is_followed, elapsed, xp.nan)
 
     def events(self, told: Callable) -> tuple:
         """Values at the nodes where something happened, in order; under jit filled up: infinite times, zeros beside
@@ -78,6 +87,15 @@ class Trajectory(eqx.Module):
             return found
         traced = is_traced(found)  # known events, of which something moves
         return tuple(value[: int(count)] if traced else placed(np.asarray(value)[: int(count)]) for value in found)
+
+
+def at_times(
+    follow: Callable, node: PyTree, elapsed: Any, duration: Inexact[Array, ""], shape: tuple[int, ...]
+) -> PyTree:
+    """`follow(node, elapsed)` of all that `before` has found; the results have the shape of the times in front. Of a
+    history that is none, not numbers."""
+    found = jax.vmap(follow)(node, elapsed)
+    return still_where(jnp.isnan(duration), jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found))
 
 
 @functools.partial(jax.jit, static_argnames="told")

@@ -1,5 +1,6 @@
 """What a flexible block does under a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
 
+import functools
 from typing import Annotated
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
-from jaxrock.engines.trajectory import Trajectory, followed, times_of
+from jaxrock.engines.trajectory import Trajectory, at_times, followed, times_of
 from jaxrock.flexible.nonlinear import scene_of
 from jaxrock.flexible.stepper import FlexibleOutcome, FlexibleScene
 from jaxrock.motions.motion import AbstractMotion
@@ -188,7 +189,7 @@ def simulate_flexible(
     say_if_single()
     given = _given(block, motion, duration, throw)
     result, path = _simulate(*given, _budget(block, motion, max_steps))
-    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
+    time = path.equally_spaced(samples)
     rotation, displacement, bending = _at_times(path, time, "outputs")[:3]
     response = FlexibleResponse(time, rotation, displacement, bending, result, path)
     return response if throw else marked_result(response, given)
@@ -247,10 +248,13 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
     return differentiable(run, derivatives="a few at once")((block, motion, stop))
 
 
-@eqx.filter_jit
 def _at_times(path: Trajectory, time, what: str):
     """Outputs, displacements of the masses, or energies, at times."""
-    scene = path.stepper
+    return _after_nodes(path.stepper, *path.before(time.ravel()), path.duration, time.shape, what)
+
+
+@functools.partial(jax.jit, static_argnames=("shape", "what"))
+def _after_nodes(scene, node, elapsed, duration, shape, what: str):
     reach = jnp.cos(scene.numbers.alpha) * scene.block.length
     scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * reach
 
@@ -263,4 +267,4 @@ def _at_times(path: Trajectory, time, what: str):
         state = curve.state(x)
         return scene.energy(state) if what == "energy" else reach * scene.column(state)
 
-    return path.at_times(time, follow)
+    return at_times(follow, node, elapsed, duration, shape)

@@ -20,7 +20,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import State, initial_state, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.engines.trajectory import Trajectory, rows_of, states_of, times_of
+from jaxrock.engines.trajectory import Trajectory, at_times, rows_of, states_of, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
@@ -28,7 +28,7 @@ from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
-from jaxrock.status import Status, marked_result, still_if_none, still_where
+from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
 
 Scalar = Inexact[Array, "..."]
@@ -242,16 +242,10 @@ def simulate(
     block, motion, model, start, duration = given if throw else still_if_none(given)
     given = standing(block, model, engine, throw), padded(motion), model, start, duration
     summary, path = _simulate(*(given if throw else still_if_none(given)), engine)
-    time, rotation, velocity = _equally_spaced(path, samples)
+    time = path.equally_spaced(samples)
+    rotation, velocity = _evaluate(path, time)
     response = Response(time, rotation, velocity, summary, path)
     return response if throw else marked_result(response, given)
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def _equally_spaced(path: Trajectory, samples: int):
-    """Times from 0 to the duration, rotation and velocity."""
-    time = jnp.linspace(jnp.zeros_like(path.duration), path.duration, samples)
-    return time, *_evaluate(path, time)
 
 
 @jax.jit
@@ -321,12 +315,14 @@ def _end(given) -> Outcome:
     return conclude(*given)
 
 
-@jax.jit
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    at = evaluation(path.stepper)
-    found = jax.vmap(lambda t: at(*path.before(t)))(time.ravel())
-    return still_where(jnp.isnan(path.duration), jax.tree.map(lambda x: x.reshape(time.shape), found))
+    return _after_nodes(path.stepper, *path.before(time.ravel()), path.duration, time.shape)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _after_nodes(stepper: AbstractStepper, node, elapsed, duration, shape):
+    return at_times(evaluation(stepper), node, elapsed, duration, shape)
 
 
 def evaluation(stepper: AbstractStepper) -> Callable:

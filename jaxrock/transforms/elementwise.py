@@ -12,7 +12,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
-from jaxrock._checks import check_shapes, is_traced, placed
+from jaxrock._checks import check_shapes, is_at_hand, placed
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -34,7 +34,7 @@ def elementwise(**checks: Callable) -> Callable:
             check_shapes(**given)
             kind = jnp.result_type(*given.values())
             values = [x.astype(kind) for x in given.values()]
-            if is_traced(values) or any(x.committed or x.size == 0 for x in values):
+            if not is_at_hand(values) or any(x.size == 0 for x in values):
                 return derived(*values)
             return _with_room(compiled, values)
 
