@@ -152,12 +152,12 @@ def _in_strides(stride: Callable, state: PyTree, budget: int, loop: Callable, le
     def step(carry):
         turn, state, nodes = carry
         state, rows = stride(state)
-        kept = jax.tree.map(
-            lambda buffer, x: jax.lax.dynamic_update_slice_in_dim(buffer, x, turn * length + 1, 0), nodes, rows
-        )
+        place = (turn * length + 1).astype(jnp.uint32)  # of integers with a sign each leaf would ask which it has
+        kept = jax.tree.map(lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, place, 0), nodes, rows)
         return turn + 1, state, kept
 
-    nodes = jax.tree.map(lambda x: jnp.zeros((most * length + 1, *x.shape), x.dtype).at[0].set(x), state)
+    # (`zeros.at[0].set` is a scatter, of which XLA makes a loop.)
+    nodes = jax.tree.map(lambda x: jnp.pad(x[None], [(0, most * length), *[(0, 0)] * x.ndim]), state)
     # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
     # wait, and keep their last state once more.
     _, state, nodes = loop(
