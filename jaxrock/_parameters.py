@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrock._checks import RANGES, Range, check_shapes, finite, is_traced, one_of, placed, throws
+from jaxrock._checks import RANGES, Range, check_shapes, finite, is_at_hand, is_traced, one_of, placed, throws
 
 
 class Parameter(NamedTuple):
@@ -190,7 +190,11 @@ def broadcast(owner: Any, shape: tuple[int, ...]) -> Any:
 
 def one_of_many(owners: Any, index: Any) -> Any:
     """One of many owners in one tree, whose numbers have a leading axis."""
-    return jax.tree.map(lambda x, own: x if own else x[index], owners, shared(owners))
+
+    def one(x):
+        return placed(np.asarray(x)[np.asarray(index)]) if is_at_hand((x, index)) else x[index]
+
+    return jax.tree.map(lambda x, own: x if own else one(x), owners, shared(owners))
 
 
 def in_precision(owner: Any, dtype: Any) -> Any:

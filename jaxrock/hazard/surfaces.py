@@ -24,6 +24,7 @@ from jaxrock._checks import (
     inner_share,
     level,
     not_negative,
+    one_program,
     positive,
     scalar,
     shown,
@@ -89,7 +90,12 @@ class SurfaceFragility(eqx.Module):
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
         probability, median = inner_share("probability", probability), self._median(ratio)
         check_shapes(probability=probability, ratio=median)
-        return median * jnp.exp(self.dispersion * jax.scipy.special.ndtri(probability))
+        return _contour(median, self.dispersion, probability)
+
+
+@one_program
+def _contour(median, dispersion, probability):
+    return median * jnp.exp(dispersion * jax.scipy.special.ndtri(probability))
 
 
 class SurfaceFit(eqx.Module):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import finite, scalar, shown
+from jaxrock._checks import finite, one_program, scalar, shown
 from jaxrock._described import described
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
@@ -84,7 +84,7 @@ class Components(eqx.Module):
         **Raises:** ValueError for an angle that is not finite.
         """
         angle = scalar("angle", finite("angle", angle))
-        samples = jnp.cos(angle) * self.first.samples + jnp.sin(angle) * self.second.samples
+        samples = _combined(angle, self.first.samples, self.second.samples)
         name = "" if not self.first.name else f"{self.first.name}, turned"
         return Record(samples, self.first.dt, name, self.first.origin._replace(component=""))
 
@@ -188,3 +188,8 @@ def components_of_stream(stream: Any, unit: Annotated[str, word_of(*PER_G)]) -> 
     if len(stations) > 1:
         raise ValueError(f"Argument `stream` must be of one station, but is of {sorted(each for each, _ in stations)}.")
     return _together("stream", records)
+
+
+@one_program
+def _combined(angle, first, second):
+    return jnp.cos(angle) * first + jnp.sin(angle) * second

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, is_traced, not_negative, placed, size, strength, with_throw
+from jaxrock._checks import Values, is_traced, not_negative, of_each, placed, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
@@ -122,7 +122,7 @@ class Record(Straight):
         # A single sample is a piece of no length: the ground never moves.
         if self.samples.shape[-1] == 1:
             return jnp.zeros(2, self.samples.dtype)
-        return self.dt * jnp.arange(self.samples.shape[-1])
+        return of_each(lambda dt: dt * np.arange(self.samples.shape[-1], dtype=dt.dtype), self.dt)
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
@@ -210,4 +210,4 @@ def _with_room(samples, dt, more: int):
     else:
         with jax.ensure_compile_time_eval():  # known to what is traced, too
             roomier = placed(np.pad(np.asarray(samples), room))
-    return roomier, dt, dt * (samples.shape[-1] - 1)
+    return roomier, dt, of_each(lambda dt: dt * (samples.shape[-1] - 1), dt)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxrock._arguments import arguments, list_of
-from jaxrock._checks import Values, direction, is_traced, shown, watched
+from jaxrock._checks import Values, direction, is_traced, placed, shown, watched
 from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
@@ -102,7 +102,10 @@ class Suite(AbstractNamed):
         if len(self.names) != len(own):
             raise ValueError(f"Argument `names` must name {len(own)} motions, but has {len(self.names)} names.")
         self.sources = self.names if sources is None else sources
-        self.peak_acceleration, self.peak_velocity = map(jnp.concatenate, zip(*map(_peaks, self.groups)))
+        peaks = zip(*map(_peaks, self.groups))
+        self.peak_acceleration, self.peak_velocity = (
+            jnp.concatenate(x) if is_traced(x) else placed(np.concatenate(x)) for x in peaks
+        )
         if is_traced(self.peak_acceleration):
             peaks = self.peak_acceleration, self.peak_velocity
             failed = ~jnp.all((peaks[0] > _LEAST) & (peaks[1] > 0))
