@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact, Int
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import Values, delay, factor, if_known, not_nan, with_throw
+from jaxrock._checks import Values, delay, factor, if_known, not_nan, of_each, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.motions.finer import Finer
@@ -97,7 +97,7 @@ class AbstractMotion(Owner):
     @property
     def end(self) -> Scalar:
         """Time at which the ground comes to rest [s]."""
-        return self.knots[-1]
+        return of_each(lambda knots: knots[-1], self.knots)
 
     def acceleration(self, time: Values) -> Inexact[Array, "..."]:
         """Ground acceleration.

@@ -4,8 +4,10 @@ import re
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Inexact
 
+from jaxrock._checks import is_at_hand, placed
 from jaxrock.motions.motion import AbstractMotion, Piece as Piece
 
 Real = Inexact[Array, "..."]
@@ -13,6 +15,8 @@ Real = Inexact[Array, "..."]
 
 def one_piece(end: Real) -> Real:
     """Knots of a motion that is smooth from 0 to `end`."""
+    if is_at_hand(end):
+        return placed(np.stack([np.zeros_like(end), end]))
     return jnp.stack([jnp.zeros_like(end), end])
 
 
