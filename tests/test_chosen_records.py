@@ -16,10 +16,19 @@ from jaxrock.motions.joined_records import Chosen, JoinedRecords
 SAMPLES = 1.5 * np.asarray(rk.example_record().samples)
 LENGTHS, STEPS = (300, 2, 310, 265), (0.01, 0.02, 0.005, 0.013)
 RECORDS = [rk.Record(SAMPLES[380 : 380 + n] + 0.02, dt, f"of {n}") for n, dt in zip(LENGTHS, STEPS)]
-SUITE = rk.motions.Suite(RECORDS)
 BLOCK = rk.Block(0.15, 3.0)
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
 SCALES = np.geomspace(0.3, 6.0, 20)
+
+
+@functools.cache
+def joined():
+    return rk.motions.Suite(RECORDS)
+
+
+@functools.cache
+def mixed():
+    return rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
 
 
 def outcome(motion, scale=1.0):
@@ -34,7 +43,7 @@ def at_scales(motion, scales):
 @pytest.fixture(scope="module")
 def grid():
     """Eighty scenes: the quick pass, too."""
-    return rk.sweep(outcome, motion=SUITE, scale=SCALES, progress=False)
+    return rk.sweep(outcome, motion=joined(), scale=SCALES, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +113,9 @@ def test_lanes_share_the_samples_of_all_records():
     """No lane has arrays of its own."""
 
     def margin(number):
-        return outcome(SUITE[number]).margin
+        return outcome(joined()[number]).margin
 
-    numbers = np.arange(60) % len(SUITE)  # without a quick pass, which takes longer to compile
+    numbers = np.arange(60) % len(joined())  # without a quick pass, which takes longer to compile
     memory = jax.jit(jax.vmap(margin)).lower(numbers).compile().memory_analysis()
     lanes = numbers.size * max(LENGTHS) * SAMPLES.itemsize  # one copy for each
     assert memory.temp_size_in_bytes < lanes / 2
@@ -115,12 +124,12 @@ def test_lanes_share_the_samples_of_all_records():
 def test_what_is_known_stays_so():
     """Else every call would put all records together again, and every suite be a program of its own."""
     found = []
-    jax.jit(lambda number: found.append(SUITE[number].joined) or number)(1)
+    jax.jit(lambda number: found.append(joined()[number].joined) or number)(1)
     assert not is_traced(found)
 
 
 def peak(number):
-    return rk.intensity.peak_acceleration(SUITE[number])
+    return rk.intensity.peak_acceleration(joined()[number])
 
 
 def test_numbers_without_a_record_are_no_other_record():
@@ -131,7 +140,7 @@ def test_numbers_without_a_record_are_no_other_record():
     with pytest.raises(Exception, match=r"must be in \[0, 3\]"):
         jax.block_until_ready(compiled(jax.device_put(numbers, dealt)))
     exported = jax.export.export(compiled)(jax.ShapeDtypeStruct(numbers.shape, numbers.dtype))
-    expected = [np.nan, *np.asarray(SUITE.peak_acceleration)[[0, 3]], np.nan]
+    expected = [np.nan, *np.asarray(joined().peak_acceleration)[[0, 3]], np.nan]
     np.testing.assert_allclose(exported.call(numbers), expected, rtol=1e-12)
     nothing = Chosen(JoinedRecords.of(RECORDS), jnp.int32(0), jnp.asarray(jnp.nan))
 
@@ -146,7 +155,7 @@ def test_numbers_without_a_record_are_no_other_record():
 
 @pytest.mark.slow
 def test_an_exported_outcome_without_a_record():
-    compiled = jax.jit(jax.vmap(lambda number: outcome(SUITE[number])))
+    compiled = jax.jit(jax.vmap(lambda number: outcome(joined()[number])))
     found = jax.export.export(compiled)(jax.ShapeDtypeStruct((2,), int)).call(np.array([0, 9]))
     assert np.isnan(found.margin).tolist() == [False, True]
     assert (found.status == rk.Status.not_finite).tolist() == [False, True]
@@ -154,7 +163,7 @@ def test_an_exported_outcome_without_a_record():
 
 def test_measures_of_a_chosen_record():
     peaks = jax.jit(jax.vmap(peak))(np.arange(4))
-    np.testing.assert_allclose(peaks, SUITE.peak_acceleration, rtol=1e-12)
+    np.testing.assert_allclose(peaks, joined().peak_acceleration, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -162,10 +171,10 @@ def test_derivatives_and_other_ways_go_through():
     """A chosen record within other motions has samples of its own."""
 
     def margin(number, scale, delay):
-        return rk.outcome(BLOCK, (scale * SUITE[number]).shifted(delay), **QUICK).margin
+        return rk.outcome(BLOCK, (scale * joined()[number]).shifted(delay), **QUICK).margin
 
     def in_place(number, scale):
-        return outcome(SUITE[number], scale).margin
+        return outcome(joined()[number], scale).margin
 
     numbers = jnp.arange(4)
     assert_close = np.testing.assert_allclose
@@ -173,7 +182,7 @@ def test_derivatives_and_other_ways_go_through():
     assert_close(jax.vmap(margin, (0, None, None))(numbers, 1.2, 0.3), apart, rtol=1e-8)
     slopes = [jax.grad(lambda s, m=motion: outcome(m, s).margin)(1.2) for motion in RECORDS]
     assert_close(jax.vmap(jax.grad(in_place, 1), (0, None))(numbers, 1.2), slopes, rtol=1e-7)
-    one, other = (rk.simulate(BLOCK, motion, samples=51, **QUICK) for motion in (RECORDS[2], SUITE[2]))
+    one, other = (rk.simulate(BLOCK, motion, samples=51, **QUICK) for motion in (RECORDS[2], joined()[2]))
     assert_close(one.rotation, other.rotation, rtol=0, atol=1e-12)
 
 
@@ -192,16 +201,17 @@ def test_records_times_factors_are_chosen_by_number():
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
-MIXED = rk.motions.Suite([RECORDS[0], rk.SinePulse(0.4, 0.5)])
-
-
 @pytest.mark.parametrize(
     "choose, error, message",
     [
-        (lambda: SUITE[4], IndexError, "out of range"),
-        (lambda: float(jax.jit(lambda k: outcome(SUITE[k]).margin)(4)), Exception, r"must be in \[0, 3\]"),
-        (lambda: jax.jit(lambda k: outcome(SUITE[k]).margin)(1.5), ValueError, "has a whole number"),
-        (lambda: jax.jit(lambda k: outcome(MIXED[k]).margin)(1), ValueError, "must be records, also times factors, or"),
+        (lambda: joined()[4], IndexError, "out of range"),
+        (lambda: float(jax.jit(lambda k: outcome(joined()[k]).margin)(4)), Exception, r"must be in \[0, 3\]"),
+        (lambda: jax.jit(lambda k: outcome(joined()[k]).margin)(1.5), ValueError, "has a whole number"),
+        (
+            lambda: jax.jit(lambda k: outcome(mixed()[k]).margin)(1),
+            ValueError,
+            "must be records, also times factors, or",
+        ),
     ],
 )
 def test_what_is_refused(choose, error, message):
@@ -210,8 +220,8 @@ def test_what_is_refused(choose, error, message):
 
 
 def test_a_suite_is_a_sequence():
-    assert [motion.samples.size for motion in SUITE] == list(LENGTHS)
-    assert SUITE[-1].samples.size == LENGTHS[-1] and MIXED[1].acceleration(0.125) == pytest.approx(0.4)
+    assert [motion.samples.size for motion in joined()] == list(LENGTHS)
+    assert joined()[-1].samples.size == LENGTHS[-1] and mixed()[1].acceleration(0.125) == pytest.approx(0.4)
 
 
 def test_compiled_functions_do_not_see_names():

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -186,7 +187,7 @@ def test_damaged_at_random(count):
     assert sum(often for (*_, what), often in found.items() if what.startswith("loaded")) == count
 
 
-# A full disk.
+# A full disk, and a save that is killed.
 
 
 @pytest.fixture
@@ -198,7 +199,7 @@ def small_disk():
 
 
 SAVES = """
-import os, resource, sys
+import itertools, os, resource, sys
 import numpy as np
 import jaxrock as rk
 grid = rk.studies.Grid({"k": np.arange(12000.0)}, {f"r{n}": np.arange(12000.0) + n for n in range(5)})
@@ -224,23 +225,66 @@ for ending in (".zarr", ".nc"):
     again = rk.studies.Grid.load(path)
     assert all((again.values[name] == grid.values[name]).all() for name in grid.values)
     print("alive after", ending, flush=True)
+
+print("waits", flush=True)
+place = sys.stdin.readline().strip()
+grid = rk.studies.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
+for number in itertools.count():  # until it is killed
+    for ending in (".nc", ".zarr"):
+        grid.save(f"{place}/{number}{ending}")
 """
+
+
+class Saves(NamedTuple):
+    """A process that saves grids, what it has said, and where it waits to save more."""
+
+    process: subprocess.Popen
+    said: list[str]
+    folder: Path
 
 
 @pytest.fixture(scope="module")
 def saves(tmp_path_factory):
-    """What a process says that saves grids on disks that are ever less full: HDF5 ended Python when it could not."""
+    """It saves on disks that are ever less full: HDF5 ended Python when it could not."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {"JAX_PLATFORMS": "cpu"}
-    return subprocess.run(
-        [sys.executable, "-c", SAVES, tmp_path_factory.mktemp("saves")], env=environment,
-        cwd=Path(rk.__file__).parents[1], capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("saves")
+    with (folder / "errors").open("w") as errors, subprocess.Popen(
+        [sys.executable, "-c", SAVES, folder], env=environment, cwd=Path(rk.__file__).parents[1], text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
+    ) as process:  # fmt: skip
+        patience, said = threading.Timer(300, process.kill), []
+        try:
+            patience.start()
+            for line in process.stdout:
+                said.append(line.strip())
+                if line == "waits\n":
+                    break
+            patience.cancel()
+            yield Saves(process, said, folder)
+        finally:
+            patience.cancel()
+            process.kill()
 
 
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])
 def test_a_grid_is_saved_whole_or_not_at_all(saves, ending):
-    assert f"alive after {ending}" in saves.stdout.splitlines(), saves.stderr
-    assert ending != ".nc" or saves.returncode == 0, saves.stderr
+    errors = (saves.folder / "errors").read_text()
+    assert f"alive after {ending}" in saves.said, errors
+    assert ending != ".nc" or saves.said[-1] == "waits", errors
+
+
+def test_a_killed_save_leaves_all_or_nothing(saves, tmp_path, grid):
+    process, wait = saves.process, 0.2 * np.random.default_rng(4).random()
+    process.stdin.write(f"{tmp_path}\n")
+    process.stdin.flush()
+    end = time.monotonic() + 100
+    while not (tmp_path / "1.zarr").exists() and time.monotonic() < end:
+        time.sleep(0.01)
+    time.sleep(wait)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    there = [path for path in tmp_path.iterdir() if not path.name.endswith(".partial")]
+    assert len(there) >= 4 and all(damage.bits(rk.studies.Grid.load(path)) == damage.bits(grid) for path in there)
 
 
 def test_results_outlive_a_full_disk(tmp_path, small_disk, grid):
@@ -341,32 +385,6 @@ def test_killed_at_random(number, count, block):
     """Processes that share a job, and others that know nothing of each other: every file is as if undisturbed."""
     found = kills.attack(number, seed=3, count=count, block=block)
     assert found["kills"] >= number and found["stores compared"] > 0
-
-
-SAVING = """
-import itertools, sys
-import numpy as np
-import jaxrock as rk
-grid = rk.studies.Grid({"k": np.arange(3000.0)}, {f"r{n}": np.arange(3000.0) + n for n in range(20)})
-for number in itertools.count():
-    for ending in (".nc", ".zarr"):
-        grid.save(f"{sys.argv[1]}/{number}{ending}")
-"""
-
-
-def test_a_killed_save_leaves_all_or_nothing(tmp_path, grid):
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {"JAX_PLATFORMS": "cpu"}
-    root, wait = Path(rk.__file__).parents[1], 0.2 * np.random.default_rng(4).random()
-    with subprocess.Popen([sys.executable, "-c", SAVING, tmp_path], env=environment, cwd=root) as process:
-        try:
-            end = time.monotonic() + 100
-            while not (tmp_path / "1.zarr").exists() and time.monotonic() < end:
-                time.sleep(0.01)
-            time.sleep(wait)
-        finally:
-            process.kill()
-    there = [path for path in tmp_path.iterdir() if not path.name.endswith(".partial")]
-    assert len(there) >= 4 and all(damage.bits(rk.studies.Grid.load(path)) == damage.bits(grid) for path in there)
 
 
 # Two writers, and threads.

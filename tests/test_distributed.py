@@ -6,34 +6,23 @@ The processes are those of one machine, which talk over its loopback as machines
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pytest
 
+import jaxrock as rk
+
 PATIENCE = 240  # seconds; all of it takes some ten
 
-# Every process of a job runs this: own number, number of processes, port, block at which to die, folder of results, and
-# sweeps, each a function and a folder, one after the other.
-WORKER = """
-import json, os, signal, sys
-import jax
-jax.config.update("jax_enable_x64", True)
-own, count, port, kill = map(int, sys.argv[1:5])
-results, sweeps = sys.argv[5], json.loads(sys.argv[6])
-import jaxrock as rk
-if count > 1:
-    jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
-rk.studies.use_cpu_devices(1 + own % 2)
-import jax.numpy as jnp
-import numpy as np
-from jaxrock._checks import checked
-from jaxrock.sweeps.store import Store
+# What is swept over which axes; before it jaxrock is `rk`.
+SWEEPS = """
+import jax, jax.numpy as jnp, numpy as np
 
 def chaotic(alpha, p):
     x, steps = jax.lax.while_loop(
@@ -46,6 +35,27 @@ motion = rk.Record(0.4 * np.sin(np.linspace(0, 14, 120)), 0.02)
 def outcome(alpha, p):
     return rk.outcome(rk.Block(alpha, p), motion)
 
+axes = dict(alpha=np.linspace(0.05, 0.3, 23), p=np.linspace(1.0, 3.9, 31))
+"""
+
+# Every process of a job runs this: own number, number of processes, port, block at which to die, folder of results, and
+# sweeps one after the other, each a function, a folder, and files that vanish before it: of a sweep that all have left.
+WORKER = (
+    """
+import json, os, signal, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+own, count, port, kill = map(int, sys.argv[1:5])
+results, sweeps = sys.argv[5], json.loads(sys.argv[6])
+import jaxrock as rk
+if count > 1:
+    jax.distributed.initialize(f"127.0.0.1:{port}", count, own, initialization_timeout=100)
+rk.studies.use_cpu_devices(1 + own % 2)
+from jaxrock._checks import checked
+from jaxrock.sweeps.store import Store
+"""
+    + SWEEPS
+    + """
 def refused(alpha, p):
     return chaotic(checked("p", p, "be below 3.85", lambda p: p < 3.85), 1.0)
 
@@ -74,9 +84,10 @@ if kill >= 0:
         write(self, place, leaves)
         done.append(place)
     Store.write = dying
-axes = dict(alpha=np.linspace(0.05, 0.3, 23), p=np.linspace(1.0, 3.9, 31))
-for number, (kind, store) in enumerate(sweeps):
+for number, (kind, store, lost) in enumerate(sweeps):
     print("sweep", number, file=sys.stderr, flush=True)
+    for file in lost if own == 0 else ():
+        os.remove(file)
     if kind == "refused":
         fail(store)
         store, kind = None, "chaotic"
@@ -86,6 +97,7 @@ for number, (kind, store) in enumerate(sweeps):
     leaves = {f"a{k}": leaf for k, leaf in enumerate(jax.tree.leaves(grid.values))}
     np.savez(f"{results}/{own}.{number}.npz", resumed=grid.resumed, processes=jax.process_count(), **leaves)
 """
+)
 
 
 def job(count, out, *sweeps, kill=-1):
@@ -95,9 +107,9 @@ def job(count, out, *sweeps, kill=-1):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))} | {"JAX_PLATFORMS": "cpu"}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | {"JAX_PLATFORMS": "cpu"}
     environment["JAXROCK_CACHE"] = str(out.parent / "kept")  # jobs of one test compile once
-    todo = json.dumps([[kind, store and str(store)] for kind, store in sweeps])
+    todo = json.dumps([[kind, store and str(store), [*map(str, lost)]] for kind, store, *lost in sweeps])
     processes = []
     for own in range(count):
         words = map(str, (own, count, port, kill if own == count - 1 else -1, out, todo))
@@ -133,17 +145,12 @@ DAMAGED = (0, 1, 4)  # blocks
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A store that one process has made, with its results."""
-    pytest.importorskip("zarr")
-    folder = tmp_path_factory.mktemp("job")
-    ((found,),) = job(1, folder / "alone", ("chaotic", folder / "a.zarr"))
-    return folder / "a.zarr", bits(found)
-
-
-@pytest.fixture(scope="module")
-def alone(finished):
-    return finished[1]
+def alone():
+    """What one process finds, this one."""
+    given = {"rk": rk}
+    exec(SWEEPS, given)
+    grid = rk.sweep(given["chaotic"], block=100, progress=False, **given["axes"])
+    return bits({f"a{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(grid.values))})
 
 
 def block_of(store, number):
@@ -151,18 +158,17 @@ def block_of(store, number):
 
 
 @pytest.fixture(scope="module")
-def of_two(finished, tmp_path_factory):
+def of_two(tmp_path_factory):
     """Sweeps that a job of two processes does one after the other, by name; and its stores. One of them is of a job
-    that was killed, another is damaged."""
+    that was killed, another is damaged once it is finished."""
+    pytest.importorskip("zarr")
     folder = tmp_path_factory.mktemp("two")
     stores = {name: folder / f"{name}.zarr" for name in ("killed", "damaged", "refused")}
     job(2, folder / "first", ("chaotic", stores["killed"]), kill=1)
-    shutil.copytree(finished[0], stores["damaged"])
-    for number in DAMAGED:
-        block_of(stores["damaged"], number).unlink()
+    lost = [block_of(stores["damaged"], number) for number in DAMAGED]
     sweeps = {
-        "shared": ("chaotic", None), "refused": ("refused", stores["refused"]),
-        "killed": ("chaotic", stores["killed"]), "damaged": ("chaotic", stores["damaged"]),
+        "shared": ("chaotic", stores["damaged"]), "refused": ("refused", stores["refused"]),
+        "killed": ("chaotic", stores["killed"], *lost), "damaged": ("chaotic", stores["damaged"]),
     }  # fmt: skip
     return dict(zip(sweeps, job(2, folder / "second", *sweeps.values()))), stores
 

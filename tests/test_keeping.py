@@ -137,12 +137,22 @@ def test_what_is_a_users_own_has_no_facts():
 
 
 # Of what compiles quickly, in all ways. Who asks little keeps a program of a user's own, too, with checks.
+# JAX starts nothing when it is imported, so a copy of a process that has done no more is a session as any other.
 _ANSWER = """
-import sys, jax, jax.monitoring
+import os, pathlib, sys, jax, jax.monitoring
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np, jaxrock as rk
 from jaxrock.transforms.recipe import Recipe
-questions = sys.argv[1]
+kept = pathlib.Path(os.environ["JAXROCK_CACHE"])
+questions, copy = sys.argv[1].split(), os.fork()
+questions = questions[copy > 0]
+if questions == "few":  # after the other, and after all that was kept is damaged
+    assert os.waitpid(copy, 0)[1] == 0
+    for path in kept.rglob("*"):
+        if path.is_file() and "OF_JAX" not in path.parts:
+            content = bytearray(path.read_bytes())
+            content[-20] ^= 255
+            path.write_bytes(content)
 if questions != "all":
     rk.keep_compiled()
 traced = []
@@ -153,12 +163,14 @@ def peak(x): return rk.outcome(rk.Block(x[0], 2.0), rk.SinePulse(x[1], 0.8), **g
 x = np.array([0.2, 0.3]) * np.linspace(0.98, 1.02, 70)[:, None]
 found = [peak(x[0])]
 if questions != "one":
-    found += [jax.vmap(peak)(x)]
+    found += [jax.jit(jax.vmap(peak))(x)]
 if questions == "all":
-    found += [*jax.vmap(jax.grad(peak))(x).T,
+    found += [*jax.jit(jax.vmap(jax.grad(peak)))(x).T,
               rk.simulate(rk.Block(0.2, 2.0), rk.SinePulse(0.3, 0.8), **given).rotation,
               rk.overturning_map(x[::9, 1] * 5, [2.0, 3.0], progress=False, **given).margin]
 assert "scipy" not in sys.modules  # JAX takes it to get LAPACK ready, which takes longer than an answer
+if questions == "all" and copy:
+    assert os.waitpid(copy, 0)[1] == 0
 print(len(traced), np.concatenate(list(map(np.ravel, found))).tobytes().hex())
 if questions != "all":
     events = []
@@ -169,13 +181,16 @@ if questions != "all":
         print(float(function(-0.3)))
     except Exception as error:
         print(error)
-"""
+print(end="\\0", flush=True)
+""".replace("OF_JAX", folder.OF_JAX)
 
 
-def started(place, questions):
-    """A session that answers `"all"` questions, a `"few"`, which are the first of these, or `"one"`."""
+def sessions_of(place, questions):
+    """What two sessions say that answer `"all"` questions, a `"few"`, which are the first of these, or `"one"`."""
     environment, words = os.environ | {"JAXROCK_CACHE": str(place)}, [sys.executable, "-c", _ANSWER, questions]
-    return subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return map(told, done.stdout.split("\0")[:2])
 
 
 class Told(NamedTuple):
@@ -187,9 +202,7 @@ class Told(NamedTuple):
     own: list[str]
 
 
-def told(session):
-    said, errors = session.communicate(timeout=300)
-    assert session.returncode == 0, errors
+def told(said):
     traced, numbers, *own = said.split(maxsplit=4)
     return Told(int(traced), numbers, own)
 
@@ -209,16 +222,11 @@ class Sessions(NamedTuple):
 def sessions(tmp_path_factory):
     place = tmp_path_factory.mktemp("sessions")
     start = time.time()
-    first, beside = map(told, [started(place, "all"), started(place, "one")])
+    beside, first = sessions_of(place, "one all")
     seconds = time.time() - start
-    later = told(started(place, "all"))
-    files = [path for path in place.rglob("*") if path.is_file() and folder.OF_JAX not in path.parts]
-    for path in files:
-        content = bytearray(path.read_bytes())
-        content[-20] ^= 255
-        path.write_bytes(content)
-    kept = {path.parent.name for path in files}
-    return Sessions(first, beside, later, told(started(place, "few")), kept, seconds)
+    kept = {path.parent.name for path in place.rglob("*") if path.is_file() and folder.OF_JAX not in path.parts}
+    later, damaged = sessions_of(place, "all few")
+    return Sessions(first, beside, later, damaged, kept, seconds)
 
 
 def test_another_session_traces_nothing_and_answers_the_same_bits(sessions):
@@ -330,12 +338,13 @@ def test_what_is_patched_asks_anew_and_is_kept_for_nobody_else(place, monkeypatc
     for first in ("patched", "as it is"):
         monkeypatch.setenv("JAXROCK_CACHE", str(place / first))
         answers = {}
-        for now in (first, *({"patched", "as it is"} - {first}), first):
+        for now in 2 * (first, *({"patched", "as it is"} - {first})):
             with monkeypatch.context() as patched:
                 if now == "patched":
                     patch(patched)
                 assert (facts.versions() == known) == (now == "as it is")
-                assert answers.setdefault(now, ask()) == ask()
+                found = ask()
+                assert answers.setdefault(now, found) == found
         assert (answers["patched"] != answers["as it is"]) == (kind == "a class")
 
 

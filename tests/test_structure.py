@@ -19,8 +19,7 @@ FILES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
-MODULES = [name for name in TREES if name != "__init__"]
+MODULES = [name for name in FILES if name != "__init__"]
 
 # At the bottom: `status`, and helpers (one underscore). They import each other, and all others may import them.
 BOTTOM = {"status"} | {name for name in MODULES if re.match("_[^_]", name)}
@@ -54,12 +53,18 @@ MOST_LINES_OF_A_CLASS = 200
 MOST_LINES_OF_A_FUNCTION = 60
 
 
+@functools.cache
+def trees() -> dict[str, ast.Module]:
+    """Every file, as Python reads it."""
+    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
+
+
 def room(module: str) -> str:
     """The package that a module is in."""
     return module.split(".")[0]
 
 
-def imported(tree: ast.Module) -> set[str]:
+def imports_of(tree: ast.Module) -> set[str]:
     """Modules of the package that a file imports, wherever in it; the package itself is `__init__`."""
     found = set()
     for node in ast.walk(tree):
@@ -69,7 +74,7 @@ def imported(tree: ast.Module) -> set[str]:
             assert node.level == 0, f"relative import in line {node.lineno}"
             # `from jaxrock import x`: a module x, or something that the package exports.
             names = [f"{node.module}.{a.name}" for a in node.names]
-            names = [n if n.removeprefix("jaxrock.") in TREES else node.module for n in names]
+            names = [n if n.removeprefix("jaxrock.") in FILES else node.module for n in names]
         else:
             continue
         found |= {name.removeprefix("jaxrock.") for name in names if name.startswith("jaxrock.")}
@@ -77,7 +82,10 @@ def imported(tree: ast.Module) -> set[str]:
     return found
 
 
-IMPORTS = {name: imported(tree) for name, tree in TREES.items()}
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    """Modules of the package that each file imports."""
+    return {name: imports_of(tree) for name, tree in trees().items()}
 
 
 def reached(graph: dict[str, set[str]], start: str) -> set[str]:
@@ -103,7 +111,7 @@ def lengths(*kinds: type) -> dict[str, int]:
     """Lines of code of every definition of these kinds."""
     return {
         f"{name}.{node.name}": code_lines(node, FILES[name].read_text().splitlines())
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for node in ast.walk(tree)
         if isinstance(node, kinds)
     }
@@ -139,26 +147,28 @@ def imported() -> dict:
 
 def test_the_table_names_every_package():
     assert not {name for name in BELOW if name in reached(BELOW, name)}
-    assert {room(name) for name in TREES} - BOTTOM == set(BELOW), "give the new package its place in BELOW"
+    assert {room(name) for name in FILES} - BOTTOM == set(BELOW), "give the new package its place in BELOW"
 
 
 def test_imports_go_downward():
     """Modules, and what they import that does not lie below them; of those at the bottom, that is not there, too."""
     upward = {}
-    for name in TREES:
+    for name in FILES:
         allowed = {room(name)} | reached(BELOW, room(name)) if room(name) in BELOW else set()
-        upward[name] = sorted(other for other in IMPORTS[name] - BOTTOM if room(other) not in allowed or name in BOTTOM)
+        upward[name] = sorted(
+            other for other in imports()[name] - BOTTOM if room(other) not in allowed or name in BOTTOM
+        )
     assert not {name: others for name, others in upward.items() if others}
 
 
 def test_no_cycles():
-    assert not [name for name in TREES if name in reached(IMPORTS, name)]
+    assert not [name for name in FILES if name in reached(imports(), name)]
 
 
 @pytest.mark.parametrize("name", [name for name, path in FILES.items() if path.stem == "__init__"])
 def test_packages_say_what_they_are_for(name):
     """In a few lines: what for, what it imports, where to start reading."""
-    said = ast.get_docstring(TREES[name])
+    said = ast.get_docstring(trees()[name])
     assert said
     if name not in ("__init__", "closed_form"):
         assert "Imports" in said or "imports" in said
@@ -175,30 +185,30 @@ def test_few_floors():
 
 
 def test_the_physics_imports_no_engine():
-    physics = [name for name in TREES if room(name) in ("models", "motions", "blocks", "numerics")]
-    led = {name: {room(other) for other in reached(IMPORTS, name)} & {"engines", "responses"} for name in physics}
+    physics = [name for name in FILES if room(name) in ("models", "motions", "blocks", "numerics")]
+    led = {name: {room(other) for other in reached(imports(), name)} & {"engines", "responses"} for name in physics}
     assert len(led) > 50 and not {name: rooms for name, rooms in led.items() if rooms}
 
 
 def test_machine_code_knows_no_blocks():
-    rooms = {room(other) for name in TREES if room(name) == "native" for other in reached(IMPORTS, name)}
+    rooms = {room(other) for name in FILES if room(name) == "native" for other in reached(imports(), name)}
     assert rooms <= {"native", "keeping", "numerics"} | BOTTOM
 
 
 def test_closed_forms_import_no_engine():
     """They judge the engines: nothing of the package but roots, divided differences, each other, and what compiles and
     differentiates any function."""
-    reached_rooms = {room(name) for name in reached(IMPORTS, "closed_form")}
+    reached_rooms = {room(name) for name in reached(imports(), "closed_form")}
     assert reached_rooms <= {"closed_form", "numerics", "transforms", "native", "keeping"} | BOTTOM
-    own = {name for name in TREES if room(name) == "closed_form"}
-    others = {other for name in own for other in IMPORTS[name]} - own
+    own = {name for name in FILES if room(name) == "closed_form"}
+    others = {other for name in own for other in imports()[name]} - own
     assert others <= BOTTOM | {"numerics.divided_differences", "numerics.roots", "transforms.elementwise"}
 
 
-@pytest.mark.parametrize("name", [name for name in TREES if name.startswith("closed_form.")])
+@pytest.mark.parametrize("name", [name for name in FILES if name.startswith("closed_form.")])
 def test_closed_forms_are_documented(name):
-    nodes = [node for node in TREES[name].body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
-    assert ast.get_docstring(TREES[name])
+    nodes = [node for node in trees()[name].body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+    assert ast.get_docstring(trees()[name])
     assert not [node.name for node in nodes if not node.name.startswith("_") and not ast.get_docstring(node)]
 
 
@@ -239,7 +249,7 @@ def exports() -> dict[str, tuple[str, str]]:
             node.module.removeprefix("jaxrock").removeprefix("."), alias.name
         )
         for space in ("__init__", *SPACES)
-        for node in TREES[space].body
+        for node in trees()[space].body
         if isinstance(node, ast.ImportFrom) and node.module.startswith("jaxrock") and node.names[0].name != "*"
         for alias in node.names
     }  # fmt: skip
@@ -255,9 +265,9 @@ def test_what_is_public_has_a_docstring():
     told = {}
     for name, (module, origin) in exports().items():
         home = f"{module}.{origin}".removeprefix(".")
-        definitions = [TREES[home]] if home in TREES else [
+        definitions = [trees()[home]] if home in FILES else [
             node
-            for node in TREES[module].body
+            for node in trees()[module].body
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == origin
             if "overload" not in map(ast.unparse, node.decorator_list)
         ]  # fmt: skip
@@ -267,7 +277,7 @@ def test_what_is_public_has_a_docstring():
 
 def functions_of(module, origin):
     """What a user may call of a public name: the function, or the methods of the class."""
-    for node in TREES.get(module, ast.Module([], [])).body:
+    for node in trees().get(module, ast.Module([], [])).body:
         if getattr(node, "name", None) == origin:
             inner = node.body if isinstance(node, ast.ClassDef) else [node]
             yield from (each for each in inner if isinstance(each, ast.FunctionDef))
@@ -303,7 +313,7 @@ def test_the_public_names_are_found():
 def test_a_namespace_offers_no_module_and_another_thing_by_one_name(space):
     """The one would hide the other."""
     own = {name.split(".")[1] for name in exports() if name.startswith(f"{space}.")}
-    modules = {name.split(".")[1] for name in TREES if name.startswith(f"{space}.")}
+    modules = {name.split(".")[1] for name in FILES if name.startswith(f"{space}.")}
     assert own & modules <= {"restitution", "intensity"}
 
 
@@ -414,13 +424,13 @@ def changed_within_functions(tree: ast.Module) -> set[str]:
 
 def test_what_threads_share_is_known():
     """Nothing else at the level of a module changes; `functools.cache` is safe, and what is there once has a lock."""
-    found = {f"{name}.{each}" for name, tree in TREES.items() for each in changed_within_functions(tree)}
+    found = {f"{name}.{each}" for name, tree in trees().items() for each in changed_within_functions(tree)}
     assert found == set(SHARED)
 
 
 def test_text_is_written_in_one_encoding():
     """In utf-8, which readers expect, and not in that of the place where it runs."""
-    for name, tree in TREES.items():
+    for name, tree in trees().items():
         for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
             word = getattr(call.func, "attr", getattr(call.func, "id", ""))
             modes = [each.value for each in call.args if isinstance(each, ast.Constant)] + [""]

@@ -93,17 +93,21 @@ def test_a_known_suite_stays_known_within_a_program():
 # --------------------------------------------------------------------------------------- verdicts
 
 DURATIONS = np.array([0.1, 0.3, 0.5, 0.8, 1.3])
-BLOCKS = rk.blocks.draw_blocks(rk.Block(0.2, 2.0, 0.9), 12, alpha=0.1, p=0.1, restitution=0.03, seed=4)
 PULSE_LEVELS = np.geomspace(0.1, 2.0, 16)
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}  # compiles in half the time
+
+
+@functools.cache
+def twelve():
+    return rk.blocks.draw_blocks(rk.Block(0.2, 2.0, 0.9), 12, alpha=0.1, p=0.1, restitution=0.03, seed=4)
 
 
 def test_every_verdict_under_rectangular_pulses():
     """Slender blocks topple above the safety wall in closed form, each above its own; PGV is PGA times duration."""
     motions = [rk.RectangularPulse(np.ones(5), DURATIONS)]
     levels = PULSE_LEVELS
-    found = rk.hazard.simulated_fragility(BLOCKS, motions, levels, **QUICK)
-    wall = np.asarray(BLOCKS.alpha) / np.asarray(WALL(np.asarray(BLOCKS.p) * DURATIONS[:, None], -np.inf))
+    found = rk.hazard.simulated_fragility(twelve(), motions, levels, **QUICK)
+    wall = np.asarray(twelve().alpha) / np.asarray(WALL(np.asarray(twelve().p) * DURATIONS[:, None], -np.inf))
     topples = levels[:, None] > wall[:, None, :]
     assert found.undecided == 0 and 0.3 < np.mean(topples) < 0.9
     np.testing.assert_array_equal(found.verdict, topples)
@@ -112,11 +116,11 @@ def test_every_verdict_under_rectangular_pulses():
     below, above = np.moveaxis(found.capacities, -1, 0)
     assert np.all((below < wall) & (wall < above))
     # By velocity the same blocks topple at level = wall g duration.
-    by_velocity = rk.hazard.simulated_fragility(BLOCKS, motions, levels, measure="PGV", **QUICK)
+    by_velocity = rk.hazard.simulated_fragility(twelve(), motions, levels, measure="PGV", **QUICK)
     speeds = wall * G * DURATIONS[:, None]
     np.testing.assert_array_equal(by_velocity.verdict, levels[:, None] > speeds[:, None, :])
     # And over both measures.
-    grid = rk.hazard.simulated_surface(BLOCKS, [rk.RectangularPulse], levels, DURATIONS, **QUICK)
+    grid = rk.hazard.simulated_surface(twelve(), [rk.RectangularPulse], levels, DURATIONS, **QUICK)
     np.testing.assert_array_equal(grid.verdict[0], np.swapaxes(topples, 0, 1))
     middle = grid.at(0.5)
     np.testing.assert_allclose(middle.probabilities, topples[2].mean(axis=1))
@@ -328,10 +332,10 @@ def test_motions_that_are_the_same():
     many = rk.motions.Suite([rk.SinePulse(np.array([0.3, 0.5]), 0.4), rk.SinePulse(0.5, 0.4)])
     assert repeated(many) == ("SinePulse 2", "SinePulse")
     with pytest.raises(ValueError, match="`motions` must hold each motion once, but 'a' and 'b' are the same"):
-        rk.hazard.simulated_fragility(BLOCKS, same, [0.1, 0.2])
+        rk.hazard.simulated_fragility(twelve(), same, [0.1, 0.2])
     pulses = rk.motions.Suite([rk.RectangularPulse(np.ones(5), np.append(DURATIONS[1:], DURATIONS[-1]))], list("cdeab"))
     with pytest.warns(UserWarning, match="Motions 'a' and 'b' are the same: what they do counts twice"):
-        rk.hazard.suite_outcomes(BLOCKS, pulses, PULSE_LEVELS, **QUICK)
+        rk.hazard.suite_outcomes(twelve(), pulses, PULSE_LEVELS, **QUICK)
 
 
 def test_intervals_hold_for_few_motions():
@@ -505,11 +509,11 @@ def test_motions_of_one_name_are_numbered():
             "deviation `alpha` must let all 1000 draws be blocks, but one is none .* Lower it",
         ),
         (
-            lambda: rk.hazard.simulated_surface(BLOCKS, [rk.ExponentialPulse], [0.1, 0.2], [0.1, 0.2]),
+            lambda: rk.hazard.simulated_surface(twelve(), [rk.ExponentialPulse], [0.1, 0.2], [0.1, 0.2]),
             "`pulses` must make motions of amplitude and period, but .*ExponentialPulse.* does not: missing .*'shape'",
         ),
         (
-            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], facing="back"),
+            lambda: rk.hazard.simulated_fragility(twelve(), [RECORD], [0.1, 0.2], facing="back"),
             "`facing` must be",
         ),
         (lambda: rk.motions.Suite([]), "`motions` must hold at least one motion"),
@@ -524,19 +528,19 @@ def test_motions_of_one_name_are_numbered():
             lambda: rk.motions.Suite([rk.Record([0.3], 0.01, "one")]),
             "`motions` must move the ground, but 'one' does not",
         ),
-        (lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2]), "`levels` must hold at least two levels"),
+        (lambda: rk.hazard.simulated_fragility(twelve(), [RECORD], [0.2]), "`levels` must hold at least two levels"),
         (
-            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.2, 0.1]),
+            lambda: rk.hazard.simulated_fragility(twelve(), [RECORD], [0.2, 0.1]),
             "`levels` must be positive and finite, and rise",
         ),
         (
-            lambda: rk.hazard.simulated_fragility(BLOCKS, [RECORD], [0.1, 0.2], measure="SA"),
+            lambda: rk.hazard.simulated_fragility(twelve(), [RECORD], [0.1, 0.2], measure="SA"),
             "`measure` must be one of 'PGA'",
         ),
         (lambda: rk.blocks.draw_blocks(rk.Block(0.2, 2.0), 0), "`draws` must be a whole number from 1"),
         (lambda: rk.blocks.draw_blocks(rk.Block(0.2, 2.0), 9, p=-1.0), "`p` must be 0 or more"),
         (
-            lambda: rk.hazard.simulated_surface(BLOCKS, [], [0.1, 0.2], [0.1, 0.2]),
+            lambda: rk.hazard.simulated_surface(twelve(), [], [0.1, 0.2], [0.1, 0.2]),
             "`pulses` must hold at least one pulse",
         ),
         (lambda: table(np.zeros((1, 2, 1))).counts("middle"), "`bound` must be one of 'lower', 'upper'"),

@@ -1,7 +1,6 @@
 """Results as tables of xarray and pandas: names, units, a status in words; of results that are made by hand."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,8 +11,8 @@ from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 pytest.importorskip("xarray")
 pytest.importorskip("pandas")
 
-ONE = jnp.asarray(1.0)
-STATUS = jax.tree.map(lambda *x: jnp.stack(x), rk.Status.successful, rk.Status.undecided, rk.Status.not_finite)
+ONE = np.asarray(1.0)
+STATUS = jax.tree.map(lambda *x: np.stack(x), rk.Status.successful, rk.Status.undecided, rk.Status.not_finite)
 RECORD = rk.Record([0.1, 0.2, -0.3], 0.5)
 
 
@@ -25,106 +24,106 @@ def made(kind, **fields):
     return result
 
 
-_SLOPES = made(Slopes, value=ONE, derivative=jnp.ones(2), elasticity=jnp.ones(2), reach=ONE, status=SlopeStatus.useful)
+_SLOPES = made(Slopes, value=ONE, derivative=np.ones(2), elasticity=np.ones(2), reach=ONE, status=SlopeStatus.useful)
 SENSITIVITY = made(
-    rk.studies.Sensitivity, names=("alpha", "p"), values=jnp.array([0.2, 2.5]), max_rotation=_SLOPES,
+    rk.studies.Sensitivity, names=("alpha", "p"), values=np.array([0.2, 2.5]), max_rotation=_SLOPES,
     max_velocity=_SLOPES, margin=_SLOPES, valid=ONE, condition=ONE, graze_distance=ONE, boundary_distance=ONE,
     outcome=made(rk.responses.Outcome, status=rk.Status.successful),
 )  # fmt: skip
 
 TABLES = {
     "spectrum": made(
-        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.arange(3.0),
-        max_velocity=jnp.ones(3), impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool),
-        margin=jnp.ones(3), status=STATUS, intensity=None,
+        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), max_rotation=np.arange(3.0),
+        max_velocity=np.ones(3), impact_count=np.arange(3), overturned=np.zeros(3, bool),
+        margin=np.ones(3), status=STATUS, intensity=None,
         parameters={},
     ),
     "self-similar spectrum": made(
-        rk.studies.Spectrum, abscissa=jnp.array([1.0, 2.0, 3.0]), max_rotation=jnp.ones((2, 1, 3)),
-        max_velocity=jnp.ones((2, 1, 3)), impact_count=jnp.ones((2, 1, 3)), overturned=jnp.zeros((2, 1, 3), bool),
-        margin=jnp.ones((2, 1, 3)), status=jax.tree.map(lambda x: jnp.tile(x, (2, 1, 1)), STATUS),
-        intensity=jnp.array([1.5]), parameters={"shape": jnp.array([0.0, 1.0])},
+        rk.studies.Spectrum, abscissa=np.array([1.0, 2.0, 3.0]), max_rotation=np.ones((2, 1, 3)),
+        max_velocity=np.ones((2, 1, 3)), impact_count=np.ones((2, 1, 3)), overturned=np.zeros((2, 1, 3), bool),
+        margin=np.ones((2, 1, 3)), status=jax.tree.map(lambda x: np.tile(x, (2, 1, 1)), STATUS),
+        intensity=np.array([1.5]), parameters={"shape": np.array([0.0, 1.0])},
     ),
     "map": made(
-        rk.studies.OverturningMap, frequency_ratio=jnp.array([1.0, 2.0, 3.0]), intensity=jnp.array([2.0]),
-        state=jnp.ones((1, 3)), max_rotation=jnp.ones((1, 3)), impact_count=jnp.ones((1, 3)), margin=jnp.ones((1, 3)),
+        rk.studies.OverturningMap, frequency_ratio=np.array([1.0, 2.0, 3.0]), intensity=np.array([2.0]),
+        state=np.ones((1, 3)), max_rotation=np.ones((1, 3)), impact_count=np.ones((1, 3)), margin=np.ones((1, 3)),
         status=jax.tree.map(lambda x: x[None], STATUS), parameters={},
     ),
     "critical amplitudes": made(
-        rk.studies.Critical, count=jnp.array([2]), value=jnp.ones((1, 2)), intensity=jnp.ones((1, 2)),
-        rising=jnp.ones((1, 2)), impacts=jnp.ones((1, 2)), balanced=jnp.ones((1, 2)), derivative=jnp.ones((1, 2, 1)),
-        complete=jnp.array([True]), from_the_least=jnp.array([False]), names=("alpha",),
+        rk.studies.Critical, count=np.array([2]), value=np.ones((1, 2)), intensity=np.ones((1, 2)),
+        rising=np.ones((1, 2)), impacts=np.ones((1, 2)), balanced=np.ones((1, 2)), derivative=np.ones((1, 2, 1)),
+        complete=np.array([True]), from_the_least=np.array([False]), names=("alpha",),
     ),
     "fragility intervals": rk.hazard.fragility_intervals([0.2, 0.3, 0.4, 0.5], [0, 1, 0, 1]),
     "estimate": made(
-        rk.inverse.Estimate, names=("amplitude", "period"), values=jnp.array([0.3, 0.8]), interval=jnp.ones((2, 2)),
-        open=jnp.zeros((2, 2), bool), log_likelihood=ONE, surprise=ONE, scatter=ONE,
+        rk.inverse.Estimate, names=("amplitude", "period"), values=np.array([0.3, 0.8]), interval=np.ones((2, 2)),
+        open=np.zeros((2, 2), bool), log_likelihood=ONE, surprise=ONE, scatter=ONE,
         status=rk.inverse.EstimateStatus.open_interval,
     ),
     "posterior": made(
-        rk.inverse.Posterior, names=("amplitude",), samples=jnp.ones((2, 3, 1)), log_density=jnp.ones((2, 3)),
+        rk.inverse.Posterior, names=("amplitude",), samples=np.ones((2, 3, 1)), log_density=np.ones((2, 3)),
         status=rk.inverse.PosteriorStatus.not_converged,
     ),
     "region": made(
-        rk.inverse.FeasibleRegion, names=("amplitude", "period"), values=(jnp.ones(2), jnp.ones(3)),
-        log_likelihood=jnp.ones((2, 3)), allowed=jnp.ones((2, 3), bool),
+        rk.inverse.FeasibleRegion, names=("amplitude", "period"), values=(np.ones(2), np.ones(3)),
+        log_likelihood=np.ones((2, 3)), allowed=np.ones((2, 3), bool),
     ),
     "unexceeded": made(
-        rk.inverse.Unexceeded, durations=jnp.ones(3), amplitude=jnp.ones(3), by_rock=jnp.ones((2, 3)),
-        weakest=jnp.ones(3), complete=jnp.ones(3, bool),
+        rk.inverse.Unexceeded, durations=np.ones(3), amplitude=np.ones(3), by_rock=np.ones((2, 3)),
+        weakest=np.ones(3), complete=np.ones(3, bool),
     ),
     "found record": made(
         rk.inverse.FoundRecord, record=RECORD, start=RECORD, change=ONE, scaling=ONE,
         status=rk.inverse.RecordStatus.useless_slopes,
     ),
     "outcomes": made(
-        rk.responses.Outcome, max_rotation=jnp.ones(3), max_velocity=jnp.ones(3), time_of_max=jnp.ones(3),
-        impact_count=jnp.arange(3), overturned=jnp.zeros(3, bool), margin=jnp.ones(3),
-        differentiable=jnp.ones(3, bool), clearance=jnp.ones(3), error=jnp.ones(3), status=STATUS,
+        rk.responses.Outcome, max_rotation=np.ones(3), max_velocity=np.ones(3), time_of_max=np.ones(3),
+        impact_count=np.arange(3), overturned=np.zeros(3, bool), margin=np.ones(3),
+        differentiable=np.ones(3, bool), clearance=np.ones(3), error=np.ones(3), status=STATUS,
     ),
     "outcome of a column": made(
         rk.responses.FlexibleOutcome, max_rotation=ONE, max_displacement=ONE, max_bending=ONE, impact_count=ONE,
         overturned=ONE, margin=ONE, energy=ONE, status=rk.Status.successful,
     ),
     "history": made(
-        rk.responses.Response, time=jnp.arange(4.0), rotation=jnp.zeros(4), velocity=jnp.ones(4)
+        rk.responses.Response, time=np.arange(4.0), rotation=np.zeros(4), velocity=np.ones(4)
     ),
     "history of a column": made(
-        rk.responses.FlexibleResponse, time=jnp.ones((2, 4)), rotation=jnp.zeros((2, 4)),
-        displacement=jnp.ones((2, 4)), bending=jnp.ones((2, 4)),
+        rk.responses.FlexibleResponse, time=np.ones((2, 4)), rotation=np.zeros((2, 4)),
+        displacement=np.ones((2, 4)), bending=np.ones((2, 4)),
     ),
     "contact": made(
-        rk.responses.Contact, time=jnp.arange(4.0), horizontal=jnp.ones(4), normal=jnp.ones(4), friction=jnp.ones(4)
+        rk.responses.Contact, time=np.arange(4.0), horizontal=np.ones(4), normal=np.ones(4), friction=np.ones(4)
     ),
     "sensitivity": SENSITIVITY,
     "sensitivities": made(
-        rk.studies.SensitivityMap, uplift_strength=jnp.ones(2), pulse_duration=jnp.ones(3),
-        sensitivity=jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *jnp.shape(x))), SENSITIVITY),
+        rk.studies.SensitivityMap, uplift_strength=np.ones(2), pulse_duration=np.ones(3),
+        sensitivity=jax.tree.map(lambda x: np.broadcast_to(x, (2, 3, *np.shape(x))), SENSITIVITY),
     ),
     "suite": made(
-        rk.hazard.SuiteOutcomes, suite=rk.motions.Suite([RECORD, 2 * RECORD], ["one", "two"]), facing=(1, -1),
+        rk.hazard.SuiteOutcomes, suite=made(rk.motions.Suite, names=("one", "two")), facing=(1, -1),
         scale=np.array([1.0, 2.0, 3.0]), verdict=np.zeros((2, 3, 2, 4), np.int8), rotation=np.ones((2, 3, 2, 4)),
         margin=np.ones((2, 3, 2, 4)),
     ),
     "simulated fragility": made(
-        rk.hazard.SimulatedFragility, levels=jnp.array([0.1, 0.2]), verdict=np.ones((3, 2, 5), np.int8),
-        peak_acceleration=jnp.ones(3), peak_velocity=jnp.ones(3), names=("a", "b", "c"), measure="PGA",
+        rk.hazard.SimulatedFragility, levels=np.array([0.1, 0.2]), verdict=np.ones((3, 2, 5), np.int8),
+        peak_acceleration=np.ones(3), peak_velocity=np.ones(3), names=("a", "b", "c"), measure="PGA",
     ),
     "azimuths": made(
         rk.studies.AzimuthOutcomes, azimuth=np.arange(3.0), scale=np.array([1.0, 2.0]),
         verdict=np.zeros((3, 2), np.int8), rotation=np.ones((3, 2)), margin=np.ones((3, 2)),
     ),
     "fragility": made(
-        rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=jnp.eye(2),
+        rk.hazard.FragilityFit, fragility=rk.hazard.LogNormalFragility(0.3, 0.4), covariance=np.eye(2),
         log_likelihood=ONE, highest_survived=ONE, lowest_toppled=ONE, p_value=ONE,
         status=rk.hazard.FitStatus.separable,
     ),
     "probit": made(
-        rk.hazard.ProbitFit, names=("PGA", "PGV"), intercept=ONE, slopes=jnp.ones(2), covariance=jnp.eye(3),
-        p_values=jnp.ones(2), log_likelihood=ONE, status=rk.hazard.FitStatus.successful,
+        rk.hazard.ProbitFit, names=("PGA", "PGV"), intercept=ONE, slopes=np.ones(2), covariance=np.eye(3),
+        p_values=np.ones(2), log_likelihood=ONE, status=rk.hazard.FitStatus.successful,
     ),
     "calibration": made(
-        rk.inverse.BlockCalibration, values={"alpha": ONE, "alpha_sd": ONE}, covariance=jnp.eye(2), log_likelihood=ONE,
+        rk.inverse.BlockCalibration, values={"alpha": ONE, "alpha_sd": ONE}, covariance=np.eye(2), log_likelihood=ONE,
         status=rk.inverse.CalibrationStatus.at_an_end,
     ),
     "history fit": made(
