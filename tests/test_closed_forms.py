@@ -615,11 +615,8 @@ def test_a_triangle_has_the_slope_by_shape_of_its_neighbours():
 
 def test_arrays_of_any_shape_are_of_a_few_programs():
     """Each of their elements is that of the array of all; a new length, for which there is room, compiles nothing."""
-    times, rotation = (
-        np.linspace(0.1, 1.4, 32),
-        functools.partial(single_lobe.rotation, uplift_strength=0.4, pulse_duration=1.5),
-    )
-    of_all, of_eight = (np.asarray(rotation(times[:count], shape=0.7)) for count in (32, 8))
+    strengths, uplift = np.linspace(0.1, 0.9, 32), single_lobe.uplift_time
+    of_all, of_eight = (np.asarray(uplift(strengths[:count], shape=0.7)) for count in (32, 8))
     np.testing.assert_allclose(of_eight, of_all[:8], rtol=1e-15)
     programs = []
     listen = lambda name, *_, **__: programs.append(name)
@@ -627,15 +624,15 @@ def test_arrays_of_any_shape_are_of_a_few_programs():
     try:
         for shape in ((1,), (3,), (2, 4), (31,), (4, 1, 5)):
             count = math.prod(shape)
-            found = rotation(times[:count].reshape(shape), shape=np.full(shape[-1:], 0.7))
+            found = uplift(strengths[:count].reshape(shape), shape=np.full(shape[-1:], 0.7))
             assert found.shape == shape and isinstance(found, jax.Array)
             np.testing.assert_array_equal(np.asarray(found).ravel(), (of_eight if count <= 8 else of_all)[:count])
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert not [name for name in programs if name.endswith("backend_compile_duration")]
-    longer = np.asarray(rotation(np.linspace(0.1, 1.4, 5001), shape=0.7))  # room for a few more
+    longer = np.asarray(uplift(np.linspace(0.1, 0.9, 5001), shape=0.7))  # room for a few more
     assert longer.shape == (5001,)
     assert longer[[0, -1]] == pytest.approx(of_all[[0, -1]], rel=1e-15)
-    assert rotation(np.zeros((0, 3)), shape=0.7).shape == (0, 3)
-    here = jax.device_put(times[:5], jax.devices("cpu")[1])  # stays where its user has put it
-    assert rotation(here, shape=0.7).devices() == {jax.devices("cpu")[1]}
+    assert uplift(np.zeros((0, 3)), shape=0.7).shape == (0, 3)
+    here = jax.device_put(strengths[:5], jax.devices("cpu")[1])  # stays where its user has put it
+    assert uplift(here, shape=0.7).devices() == {jax.devices("cpu")[1]}
