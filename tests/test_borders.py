@@ -167,7 +167,7 @@ def test_where_impacts_give_way_to_none_without_a_gap(monkeypatch):
         assert (lower.impacts, upper.impacts) == (1, 0)
 
 
-@pytest.mark.parametrize("change", [{"scene": None}, {"parameters": {"shape": jnp.zeros(2)}}])
+@pytest.mark.parametrize("change", [{"scene": None}, {"parameters": {"shape": jax.device_put(np.zeros(2))}}])
 def test_maps_that_have_no_borders(surface, change):
     with pytest.raises(ValueError, match="Argument `result` must be a map of two axes"):
         rk.studies.overturning_borders(dataclasses.replace(surface, **change))
@@ -252,11 +252,11 @@ def test_curves_reach_their_tips(with_curves):
 
 
 def test_isolated_survivors_of_a_spectrum_are_seen():
-    peaks = jnp.array([[np.inf, 0.7, np.inf, np.inf, 0.5, 0.4]])
-    spectrum = rk.studies.Spectrum(
-        abscissa=jnp.arange(6.0), max_rotation=peaks, max_velocity=peaks, impact_count=jnp.zeros((1, 6), int),
-        overturned=jnp.isinf(peaks), margin=-peaks, status=rk.Status.successful, intensity=jnp.array([2.0]),
-    )  # fmt: skip
+    peaks = np.array([[np.inf, 0.7, np.inf, np.inf, 0.5, 0.4]])
+    told = {"abscissa": np.arange(6.0), "max_rotation": peaks, "max_velocity": peaks, "margin": -peaks,
+            "impact_count": np.zeros((1, 6), int), "overturned": np.isinf(peaks),
+            "intensity": np.array([2.0])}  # fmt: skip
+    spectrum = rk.studies.Spectrum(**jax.device_put(told), status=rk.Status.successful)
     axis, _ = rk.plot.spectrum(spectrum)
     dots = [line.get_xydata().tolist() for line in axis.lines if line.get_marker() == "."]
     assert dots == [[[1.0, 0.7]]]

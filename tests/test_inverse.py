@@ -61,7 +61,8 @@ def verdicts():
     """Shares of 1,000 possible scenes in which each rock stands: from the verdict alone, at four motions."""
     seen, rng = rocks(["survived"] * 12, restitution_sd=0.03), np.random.default_rng(0)
     e = rng.normal(size=(4, 1000, 12))
-    sd = np.stack([seen.alpha_sd / seen.alpha, seen.p_sd / seen.p, seen.restitution_sd])[:, None]
+    of_each = (seen.alpha_sd, seen.alpha), (seen.p_sd, seen.p), (seen.restitution_sd, 1.0)
+    sd = np.stack([np.asarray(sd) / np.asarray(x) for sd, x in of_each])[:, None]
     alpha, p, restitution = (np.ravel(x) for x in rocks_at(seen, jnp.asarray(e[1:] * sd)))
     motions = [(0.15, 0.4), (0.25, 0.8), (0.35, 0.8), (0.5, 1.6)]
     size, length = np.array(motions).T[..., None]
@@ -176,7 +177,7 @@ def test_slopes_that_were_not_computed_are_refused(what):
 def test_slopes_by_the_scatter(scatter):
     """Of margins that are straight: P = Phi(ln(critical/amplitude)/scatter), and its slope."""
     critical, strength = np.log([0.22, 0.27, 0.36, 0.4] * 3), np.log(0.3)
-    (found, _), (slopes, _) = stands(scatter, critical, strength)
+    (found, _), (slopes, _) = map(np.asarray, stands(scatter, critical, strength))
     z = (critical - strength) / scatter
     np.testing.assert_allclose(np.exp(found), scipy.stats.norm.cdf(z), atol=1e-3)
     np.testing.assert_allclose(np.exp(found) * slopes, -z / scatter * scipy.stats.norm.pdf(z), rtol=0.015)
@@ -246,7 +247,7 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, starts=4)
     lists = {name: np.geomspace(float(x.low), float(x.high), 256) for name, x in UNKNOWNS.items()}
     assert logs_at(seen, **{name: x[::8] for name, x in lists.items()}).max() <= float(found.log_likelihood) + 1e-6
-    ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, found.interval)}
+    ends = {name: [float(x) for x in interval] for name, interval in zip(found.names, np.asarray(found.interval))}
     below = 2 * (float(found.log_likelihood) - logs_at(seen, **lists | {"amplitude": ends["amplitude"]}).max(axis=1))
     ratios = [
         below,
@@ -254,7 +255,7 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
     ]
     for ratio, is_open in zip(np.ravel(ratios), np.ravel(found.open)):
         assert ratio < 3.84 + 0.01 if is_open else abs(ratio - 3.84) < 0.3
-    assert np.sum(found.open) < 4
+    assert np.sum(np.asarray(found.open)) < 4
     assert all(low <= TRUTH[name] <= high for name, (low, high) in ends.items())
 
 
@@ -306,7 +307,8 @@ def test_samples_need_good_arguments(name):
 def test_survivors_bound_from_above_only():
     found = rk.inverse.estimate_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, starts=8)
     assert found.status == rk.inverse.EstimateStatus.open_interval
-    assert found.open[0, 0] and not found.open[0, 1] and found.open[1].all()
+    is_open = np.asarray(found.open)
+    assert is_open[0, 0] and not is_open[0, 1] and is_open[1].all()
     assert "do not bound amplitude from below" in " ".join(found.remarks)
 
 
@@ -333,7 +335,7 @@ def test_a_rotation_that_no_motion_makes_is_named():
     unknowns = {"amplitude": rk.inverse.Unknown(0.05, 0.06), "period": rk.inverse.Unknown(0.2, 0.3)}
     seen = rocks(["survived"] * 11 + ["rotation"], rotation=0.3, rotation_sd=0.001)
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns, 0.05, starts=1)
-    assert found.status == rk.inverse.EstimateStatus.contradictory and found.probability[11] > 0.9
+    assert found.status == rk.inverse.EstimateStatus.contradictory and float(found.probability[11]) > 0.9
     assert "rock 12 (its rotation is off by 300.0 standard deviations)" in found.remarks[0]
     assert np.isinf(found.consistent_scatter) and "no scatter up to ten times as large" in found.remarks[1]
 
@@ -424,18 +426,20 @@ def test_regions_agree_with_verdicts():
     sure = (lost.all(axis=2) | ~lost.any(axis=2)).all(axis=-1)
     as_seen = (lost[:, :, 10] == (np.asarray(seen.seen) == 1)).all(axis=-1)
     assert (sure & as_seen).sum() >= 3 and (sure & ~as_seen).sum() > 100
-    assert np.min(found.log_likelihood[sure & as_seen]) > 12 * np.log(0.99) - 0.02
-    assert np.max(found.log_likelihood[sure & ~as_seen]) < np.log(0.05)
-    assert not found.allowed[sure & ~as_seen].any()
+    height, allowed = np.asarray(found.log_likelihood), np.asarray(found.allowed)
+    assert np.min(height[sure & as_seen]) > 12 * np.log(0.99) - 0.02
+    assert np.max(height[sure & ~as_seen]) < np.log(0.05)
+    assert not allowed[sure & ~as_seen].any()
 
 
 def test_up_to_the_unexceeded_motion_all_that_stand_stand():
     seen, durations = rocks(WORDS), np.array([0.02, 0.3, 0.5, 0.8, 1.2, 2.0])  # as many as below: one program
     found = rk.inverse.unexceeded_motion(seen, rk.SinePulse, durations, progress=False)
-    assert np.isinf(found.amplitude[0]) and found.weakest[0] == -1 and found.complete.all()
-    wall, weakest = np.asarray(found.amplitude[1:]), np.asarray(found.weakest[1:])
+    amplitude, weakest, complete = map(np.asarray, (found.amplitude, found.weakest, found.complete))
+    assert np.isinf(amplitude[0]) and weakest[0] == -1 and complete.all()
+    wall, weakest = amplitude[1:], weakest[1:]
     assert (weakest >= 6).all()  # those that toppled do not count
-    known = {"alpha": seen.alpha[6:], "p": seen.p[6:], "restitution": seen.restitution[6:]}
+    known = {name: np.asarray(getattr(seen, name))[6:] for name in ("alpha", "p", "restitution")}
     below = wall[:, None] * np.append(np.linspace(0.2, 0.999, 100), 1 - 1e-9)
     assert not overturned(amplitude=below[..., None], period=durations[1:, None, None], **known).any()
     above = overturned(amplitude=wall[:, None] * (1 + 1e-9), period=durations[1:, None], **known)

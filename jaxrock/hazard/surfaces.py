@@ -80,7 +80,7 @@ class SurfaceFragility(eqx.Module):
         return lognormal(acceleration, median, self.dispersion)
 
     def _median(self, ratio):
-        return self.median * positive("ratio", ratio) ** self.exponent
+        return _power(self.median, positive("ratio", ratio), self.exponent)
 
     def at(self, ratio: ArrayLike) -> LogNormalFragility:
         """The fragility in peak acceleration of motions of one PGV/PGA [s]."""
@@ -90,11 +90,17 @@ class SurfaceFragility(eqx.Module):
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
         probability, median = inner_share("probability", probability), self._median(ratio)
         check_shapes(probability=probability, ratio=median)
-        return _contour(median, self.dispersion, probability)
+        return _reached(probability, median, self.dispersion)
 
 
 @one_program
-def _contour(median, dispersion, probability):
+def _power(factor, ratio, exponent):
+    return factor * ratio**exponent
+
+
+@one_program
+def _reached(probability, median, dispersion):
+    """Where a lognormal distribution has a probability."""
     return median * jnp.exp(dispersion * jax.scipy.special.ndtri(probability))
 
 

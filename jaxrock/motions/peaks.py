@@ -80,14 +80,14 @@ def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
     Of few pieces all have as many; of many those that are no straight line have as many as their curves ask for.
     """
     lengths, scales = motion.lengths, motion.scales
-    if lengths.size <= _FEW:
-        counts, total = jnp.full(lengths.size, _PARTS), _PARTS * lengths.size
-    elif scales is None:
-        counts, total = jnp.full(lengths.size, 1), lengths.size
-    else:
-        room, wanted = _PARTS * _FEW, _PER_SCALE * lengths / scales
-        counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
-        total = lengths.size + room  # those that are left over lie at the end, without a length
+    if lengths.size <= _FEW or scales is None:
+        count = _PARTS if lengths.size <= _FEW else 1
+        piece, within = (jax.lax.broadcasted_iota(jnp.int32, (lengths.size, count), axis).ravel() for axis in (0, 1))
+        step = lengths[piece] / count
+        return piece, jnp.minimum(within * step, lengths[piece]), step
+    room, wanted = _PARTS * _FEW, _PER_SCALE * lengths / scales
+    counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
+    total = lengths.size + room  # those that are left over lie at the end, without a length
     piece = jnp.repeat(jnp.arange(lengths.size), counts, total_repeat_length=total)
     within = jnp.arange(total) - (jnp.cumsum(counts) - counts)[piece]
     step = lengths[piece] / counts[piece]
