@@ -144,10 +144,7 @@ def test_whole_numbers_are_numbers(kind):
         block = eqx.tree_at(lambda block: block.p, BLOCK, jnp.asarray(2, kind))
         own = Ramps(jnp.asarray(0.1), signed, jnp.asarray(1, kind), jnp.asarray(1, kind))
         other = eqx.tree_at(lambda motion: motion.samples, record(), signed)
-        found = [
-            rk.outcome(block, motion, rk.Linear(), engine=rk.Series(order=4))
-            for motion in (own, other, 0.1 * rk.Record(signed, 0.25))
-        ]
+        found = [rk.outcome(block, motion, **QUICK) for motion in (own, other, 0.1 * rk.Record(signed, 0.25))]
         return [(each.max_rotation, each.margin, each.impact_count) for each in found]
 
     np.testing.assert_allclose(answer(kind), answer(float), rtol=1e-14)
