@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -145,7 +146,7 @@ FEW = [a_global, an_array_in_place, another_equinox_module]  # of functions that
 # Entry points: each takes a function that `use`s a size, and gives what asks for a result.
 
 BLOCK, PULSE = rk.Block(0.2, 2.0), rk.SinePulse(0.28, 1.2)
-ENGINE = rk.Diffrax(rtol=1e-4)
+ENGINE = rk.Diffrax(diffrax.Bosh3(), rtol=1e-4)  # of few stages
 SHORT = {"model": rk.Linear(), "engine": rk.Series(order=6), "progress": False}  # compiles in half the time
 
 

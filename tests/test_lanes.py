@@ -71,19 +71,29 @@ def test_more_axes(fast):
         function = over
         for axis in axes:
             function = jax.vmap(function, in_axes=axis)
-        return jax.jit(function)
+        return function
 
-    expected = x * samples[1].sum()
-    np.testing.assert_array_equal(nested((0, None), (0, None))(x, samples[1]), expected)
-    np.testing.assert_array_equal(nested((0, None), (1, None))(x, samples[1]), expected.T)
-    np.testing.assert_array_equal(nested((0, None), (None, 0))(x[0], samples), samples.sum(1)[:, None] * x[0])
-    np.testing.assert_array_equal(nested((None, 0), (0, None))(x[0], samples), x[0][:, None] * samples.sum(1))
-    np.testing.assert_array_equal(over(x[1, 2], samples[3]), x[1, 2] * samples[3].sum())
-    shape = 2, 3, 4
-    three = jax.vmap(jax.vmap(jax.vmap(over, (0, None)), (None, 0)), (0, None))
-    numbers = np.arange(8.0).reshape(2, 4) % 7
-    found = jax.jit(three)(numbers, samples[:3])
-    np.testing.assert_array_equal(found, np.broadcast_to(numbers[:, None] * samples[:3].sum(1)[:, None], shape))
+    @jax.jit
+    def found(x, samples, numbers):
+        return [
+            nested((0, None), (0, None))(x, samples[1]),
+            nested((0, None), (1, None))(x, samples[1]),
+            nested((0, None), (None, 0))(x[0], samples),
+            nested((None, 0), (0, None))(x[0], samples),
+            nested((0, None), (None, 0), (0, None))(numbers, samples[:3]),
+        ]
+
+    numbers, sums = np.arange(8.0).reshape(2, 4) % 7, samples.sum(1)
+    expected = [
+        x * sums[1],
+        x.T * sums[1],
+        sums[:, None] * x[0],
+        x[0][:, None] * sums,
+        numbers[:, None] * sums[:3, None],
+    ]
+    for one, other in zip(found(x, samples, numbers), expected, strict=True):
+        np.testing.assert_array_equal(one, other, strict=True)
+    np.testing.assert_array_equal(over(x[1, 2], samples[3]), x[1, 2] * sums[3])
 
 
 def test_a_jacobian_is_traced_where_it_is_compiled():

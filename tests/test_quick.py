@@ -56,8 +56,9 @@ def scenes(count, seed=1):
 
 def under(pulse, model):
     def one(alpha, p, restitution, intensity, ratio):
-        block = rk.Block(alpha, p, restitution)
-        return rk.outcome(block, pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p)), model)
+        block, start = rk.Block(alpha, p, restitution), (0 * alpha, 0 * alpha)  # given, as on an edge: compiled once
+        motion = pulse(intensity * model.moments(block).threshold, 2 * jnp.pi / (ratio * p))
+        return rk.outcome(block, motion, model, initial=start)
 
     return one
 

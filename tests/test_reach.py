@@ -1,5 +1,6 @@
 """How far a block goes within a piece of a record: exactly in the linear model, beside the series, and what is told."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -17,8 +18,9 @@ SAMPLES = RNG.normal(0, 0.3, 40)
 COUNT = 400
 
 
-def reached(way, alpha, p, opening, velocity, side, dt):
-    """What is told of a piece, by one of the two ways, and where a block is at many times within it."""
+@functools.partial(jax.jit, static_argnums=0)
+def _reached(way, dt, *given):
+    """Compiled once for each way."""
 
     def one(alpha, p, opening, velocity, side, piece):
         motion = rk.Record(SAMPLES, dt)
@@ -33,8 +35,13 @@ def reached(way, alpha, p, opening, velocity, side, dt):
         speeds = jax.vmap(lambda t: _linear_speed(start, t))(times)
         return found._replace(start=start.speed), speeds
 
-    piece = RNG.integers(0, 38, COUNT).astype(np.int32)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(alpha, p, opening, velocity, side, piece))
+    return jax.vmap(one)(*given)
+
+
+def reached(way, *given):
+    """What is told of a piece, by one of the two ways, and where a block is at many times within it."""
+    *numbers, dt = given
+    return jax.device_get(_reached(way, dt, *numbers, RNG.integers(0, 38, COUNT).astype(np.int32)))
 
 
 def _linear_speed(start, t):

@@ -422,7 +422,7 @@ def test_the_plane_that_rocks_share():
 def test_forces_by_its_own_inertia_ratio():
     """A symmetric block that rolls has the one of its model, whatever its law of restitution knows."""
     block = rk.Block(0.2, 2.0, rk.restitution.Housner(0.7))
-    scene = Scene.of(block, SINE, rk.models.Rolling(0.1, inertia_ratio=0.6))
+    scene = jax.jit(Scene.of)(block, SINE, rk.models.Rolling(0.1, inertia_ratio=0.6))
     assert [float(_ratio_of(scene, block, given)) for given in (None, 0.6)] == [0.6, 0.6]
     with pytest.raises(ValueError, match="Argument `inertia_ratio` must be 0.6 as that of the `Rolling`, but is 0.75"):
         _ratio_of(scene, block, 0.75)

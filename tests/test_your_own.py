@@ -144,10 +144,7 @@ def test_whole_numbers_are_numbers(kind):
         block = eqx.tree_at(lambda block: block.p, BLOCK, jnp.asarray(2, kind))
         own = Ramps(jnp.asarray(0.1), signed, jnp.asarray(1, kind), jnp.asarray(1, kind))
         other = eqx.tree_at(lambda motion: motion.samples, record(), signed)
-        found = [
-            rk.outcome(block, motion, rk.Linear(), engine=rk.Series(order=4))
-            for motion in (own, other, 0.1 * rk.Record(signed, 0.25))
-        ]
+        found = [rk.outcome(block, motion, **QUICK) for motion in (own, other, 0.1 * rk.Record(signed, 0.25))]
         return [(each.max_rotation, each.margin, each.impact_count) for each in found]
 
     np.testing.assert_allclose(answer(kind), answer(float), rtol=1e-14)
@@ -536,6 +533,14 @@ HOUSNER = rk.models.Terms(sine=-np.cos(0.2), cosine=np.sin(0.2))
 RISING = rk.models.Terms(constant=0.99, sine=-np.cos(1.2), cosine=-np.sin(1.2))  # below zero from 0.23 to 0.51 only
 
 
+@eqx.filter_jit
+def _is_lost(model, ceiling, opening):
+    scene = Scene.of(BLOCK, rk.RectangularPulse(ceiling, 0.9), model)
+    engine = rk.Series() if model.is_series else rk.Diffrax()
+    state = initial_state(scene, opening, jnp.asarray(1e-3))
+    return escaped(engine.stepper(scene, None, history=False), state, Angle.of(state.opening))
+
+
 @pytest.mark.parametrize(
     "model, ceiling, opening, lost",
     [
@@ -552,15 +557,7 @@ RISING = rk.models.Terms(constant=0.99, sine=-np.cos(1.2), cosine=-np.sin(1.2)) 
 )
 def test_what_may_be_held_further_on_is_not_lost(model, ceiling, opening, lost):
     """Past its balance, where nothing holds the block, it is lost only where nothing does up to pi/2."""
-
-    @jax.jit
-    def found(opening):
-        scene = Scene.of(BLOCK, rk.RectangularPulse(ceiling, 0.9), model)
-        engine = rk.Series() if model.is_series else rk.Diffrax()
-        state = initial_state(scene, opening, jnp.asarray(1e-3))
-        return escaped(engine.stepper(scene, None, history=False), state, Angle.of(state.opening))
-
-    assert bool(found(jnp.asarray(opening))) == lost
+    assert bool(_is_lost(model, jnp.asarray(ceiling), jnp.asarray(opening))) == lost
 
 
 @pytest.mark.parametrize(

@@ -186,15 +186,16 @@ def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMo
     is_level = not has_vertical(one)
 
     def turned(way, duration):
-        made = motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
-        return made, jnp.abs(amplitude_of(made))
+        return motion(way, duration) if is_level else felt(motion(jnp.ones_like(way), duration), way)
 
-    like, _ = eqx.filter_eval_shape(turned, *first)
+    like = eqx.filter_eval_shape(turned, *first)
     axes = jax.tree.map(lambda own: None if own else 0, shared(like))
     try:
-        return jax.vmap(turned, out_axes=(axes, 0))(ways, duration)
+        made = jax.vmap(turned, out_axes=axes)(ways, duration)
     except ValueError as error:
         if "out_axes" not in str(error):
             raise
         said = "whose samples do not depend on amplitude and duration: scale it outside, `amplitude * rk.Record(...)`"
         raise ValueError(f"Argument `motion` must make a motion {said}.") from None
+    # One program of what would be dozens.
+    return made, jax.jit(jax.vmap(lambda each: jnp.abs(amplitude_of(each)), in_axes=(axes,)))(made)
