@@ -58,21 +58,7 @@ class Trajectory(eqx.Module):
         By NumPy where all is at hand: XLA would compile for longer than a whole history takes.
         """
         given = self.nodes, self.times, self.duration, time
-        known = is_at_hand(given)
-        xp, (nodes, times, duration, time) = (np, jax.tree.map(np.asarray, given)) if known else (jnp, given)
-        last = times.size - 1
-
-        def at(index):
-            if known:
-                return lambda x: x[index]
-            return lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-        index = xp.clip(xp.searchsorted(times, time, side="right") - 1, 0, last)
-        node = jax.tree.map(at(index), nodes)
-        elapsed = xp.where(time <= duration, time, duration) - at(index)(times)
-        following = xp.where(index < last, at(xp.minimum(index + 1, last))(times), xp.inf)
-        is_followed = node.done | xp.isfinite(following) | (elapsed <= 0)
-        return node, xp.where(is_followed, elapsed, xp.nan)
+        return _before(np, *jax.tree.map(np.asarray, given)) if is_at_hand(given) else _before(jnp, *given)
 
     def events(self, told: Callable) -> tuple:
         """Values at the nodes where something happened, in order; under jit filled up: infinite times, zeros beside
@@ -87,6 +73,23 @@ class Trajectory(eqx.Module):
             return found
         traced = is_traced(found)  # known events, of which something moves
         return tuple(value[: int(count)] if traced else placed(np.asarray(value)[: int(count)]) for value in found)
+
+
+def _before(xp: Any, nodes: PyTree, times: Any, duration: Any, time: Any) -> tuple[PyTree, Any]:
+    """The same by NumPy or JAX."""
+    last = times.size - 1
+
+    def at(index):
+        if xp is np:
+            return lambda x: x[index]
+        return lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    index = xp.clip(xp.searchsorted(times, time, side="right") - 1, 0, last)
+    node = jax.tree.map(at(index), nodes)
+    elapsed = xp.where(time <= duration, time, duration) - at(index)(times)
+    following = xp.where(index < last, at(xp.minimum(index + 1, last))(times), xp.inf)
+    is_followed = node.done | xp.isfinite(following) | (elapsed <= 0)
+    return node, xp.where(is_followed, elapsed, xp.nan)
 
 
 def at_times(

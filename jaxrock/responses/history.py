@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import Values, scalar, span, throwing
+from jaxrock._checks import Values, is_at_hand, scalar, span, throwing
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
@@ -317,7 +317,14 @@ def _end(given) -> Outcome:
 
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
+    return (_followed_on if is_at_hand((path, time)) else _in_one_program)(path, time)
+
+
+def _followed_on(path: Trajectory, time):
     return _after_nodes(path.stepper, *path.before(time.ravel()), path.duration, time.shape)
+
+
+_in_one_program = jax.jit(_followed_on)
 
 
 @functools.partial(jax.jit, static_argnames="shape")

@@ -21,7 +21,7 @@ from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
 from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.forward_mode import directions_of, in_rows
+from jaxrock.transforms.forward_mode import columns_of, directions_of, in_rows
 from jaxrock.transforms.scenes import AT_ONCE
 
 Scalar = Inexact[Array, ""]
@@ -78,13 +78,13 @@ class _Numbers(NamedTuple):
 class _Slopes(NamedTuple):
     """Derivatives of path and what is seen after a step.
 
-    - `columns`: of each of these, in directions of the path and of all numbers that move.
+    - `columns`: of each of these, in directions of the path and of all numbers that move: a list.
     - `kept`: of what is seen by itself; `passed`: of the later ones by the first.
     """
 
-    columns: Array
-    kept: Array
-    passed: Array
+    columns: list
+    kept: list
+    passed: list
 
 
 def end_on_tape(stepper: Stepper, state: State) -> State:
@@ -172,9 +172,19 @@ def _products(still: Stepper, node: State, told: Iterable) -> tuple:
     rows = in_rows(directions_of(leaves), AT_ONCE)
     found, kept, passed = jax.vmap(lambda *row: slopes((still, rest, moving, node, row)))(*rows)
     count = sum(x.size for x in leaves)
-    columns = jnp.moveaxis(found, 1, 0).reshape(found.shape[1], -1)[:, :count]
-    change = jnp.concatenate([jnp.zeros(0, columns.dtype), *(x.ravel() for x in jax.tree.leaves(changes))])
-    return columns[:, : len(_PATH)], kept[0], passed[0], (columns[:, len(_PATH) :] * change).sum(axis=1)
+    columns = [columns_of(node.local, each.reshape(-1)[:count], leaves) or [] for each in found]
+    by_path = jnp.array([each[: len(_PATH)] for each in columns])
+
+    def change(each):
+        pairs = zip(each[len(_PATH) :], jax.tree.leaves(changes), strict=True)
+        return sum((jnp.tensordot(column, d, axes=d.ndim) for column, d in pairs), start=jnp.zeros_like(node.local))
+
+    return (
+        by_path,
+        jnp.array([x[0] for x in kept]),
+        jnp.array([x[0] for x in passed]),
+        jnp.array([*map(change, columns)]),
+    )
 
 
 def _slopes(given_: tuple) -> _Slopes:
@@ -209,9 +219,8 @@ def _slopes(given_: tuple) -> _Slopes:
     later = jnp.array([name in _LATER for name in _SEEN])
     both = jnp.stack([~later, later]).astype(node.local.dtype)
     columns, seen_by = jax.vmap(by_seen, out_axes=(None, 0))(*both.T)
-    kept = jnp.stack([each[int(name in _LATER)] for name, each in zip(_SEEN, seen_by)])
-    passed = jnp.stack([each[0] for name, each in zip(_SEEN, seen_by) if name in _LATER])
-    return _Slopes(jnp.stack(columns), kept, passed)
+    kept = [each[int(name in _LATER)] for name, each in zip(_SEEN, seen_by)]
+    return _Slopes(columns, kept, [each[0] for name, each in zip(_SEEN, seen_by) if name in _LATER])
 
 
 def _path_of(node: State) -> list:
