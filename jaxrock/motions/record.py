@@ -122,7 +122,10 @@ class Record(Straight):
         # A single sample is a piece of no length: the ground never moves.
         if self.samples.shape[-1] == 1:
             return jnp.zeros(2, self.samples.dtype)
-        return of_each(lambda dt: dt * np.arange(self.samples.shape[-1], dtype=dt.dtype), self.dt)
+        count = self.samples.shape[-1]
+        if is_traced(self.dt):  # a list of numbers would stand in the program
+            return self.dt * jnp.arange(count)
+        return placed(np.asarray(self.dt) * np.arange(count, dtype=self.dt.dtype))
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
