@@ -1,7 +1,8 @@
 """Shapes in annotations of the package, checked on every call: of functions of modules, of methods, of fields.
 
-The hook of jaxtyping wraps every function, and those within functions anew whenever these are called: a twentieth of
-what all tests take. Here only what names shapes is wrapped, once, when its module is imported.
+The hook of jaxtyping wraps every function, and those within functions anew whenever these are called, which
+programs that are traced do thousands of times. Here only what names shapes is wrapped, once, when its module is
+imported; what is within functions is not checked.
 """
 
 import ast

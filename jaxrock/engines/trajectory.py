@@ -55,7 +55,7 @@ class Trajectory(eqx.Module):
     def before(self, time: Inexact[Array | np.ndarray, " n"]) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
         """The node before each time, and how long after it that is [s]; not a number where no step was left for that.
 
-        By NumPy where all is at hand: XLA would compile for longer than a whole history takes.
+        By NumPy where all is at hand: XLA would compile a program, which takes much longer than to look.
         """
         given = self.nodes, self.times, self.duration, time
         return _before(np, *jax.tree.map(np.asarray, given)) if is_at_hand(given) else _before(jnp, *given)
