@@ -35,6 +35,24 @@ def is_at_hand(tree: Any) -> bool:
     return not is_traced(leaves) and not any(getattr(leaf, "committed", False) for leaf in leaves)
 
 
+def by_numpy_or_one_program(**settings: Any) -> Callable[[Making], Making]:
+    """Decorate a function that looks things up by NumPy where all is at hand: elsewhere it is one program.
+
+    `settings`: of `jax.jit`.
+    """
+
+    def decorate(function: Making) -> Making:
+        compiled = jax.jit(function, **settings)
+
+        @functools.wraps(function)
+        def run(*args: Any) -> Any:
+            return function(*args) if is_at_hand(args) else compiled(*args)
+
+        return cast(Making, run)
+
+    return decorate
+
+
 def check_known(**values: Any) -> None:
     """Raise ValueError for what is traced, where NumPy takes over."""
     for name, value in values.items():

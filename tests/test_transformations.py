@@ -364,8 +364,8 @@ def test_steps_before_times_are_found_by_numpy_as_within_jit():
         known = np.asarray(path.times)
         known = known[np.isfinite(known) & (known <= path.duration)]
         times = np.concatenate([known, (known[1:] + known[:-1]) / 2, np.linspace(0, path.duration, 9)])
-        found = jax.tree.leaves(path.before(times))
-        within = jax.tree.leaves(jax.jit(lambda path, t: path.before(t))(path, times))
+        found = jax.tree.leaves(path.before(times, path.nodes))
+        within = jax.tree.leaves(jax.jit(lambda path, t: path.before(t, path.nodes))(path, times))
         assert all(isinstance(x, np.ndarray) for x in found) and np.isnan(found[-1]).any() != is_whole
         for one, other in zip(found, within, strict=True):
             np.testing.assert_array_equal(one, other)

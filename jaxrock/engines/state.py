@@ -1,6 +1,6 @@
 """The state of a lane: one block under one motion, on its way."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -49,6 +49,23 @@ class State(eqx.Module):
     done: Flag
     status: Status
     steps: Int[Array, ""]
+
+
+class Node(eqx.Module):
+    """What a block is followed on from within a step: a few fields of a `State`, of one or of many."""
+
+    piece: Int[Array, "..."]
+    local: Inexact[Array, "..."]
+    side: Inexact[Array, "..."]
+    opening: Inexact[Array, "..."]
+    velocity: Inexact[Array, "..."]
+    uplifting: Bool[Array, "..."]
+    done: Bool[Array, "..."]
+
+    @classmethod
+    def of(cls, state: "State | Node") -> "Node":
+        """Those of a state."""
+        return cls(*(getattr(state, field.name) for field in fields(cls)))
 
 
 ROUNDING = 4096  # units of rounding that peaks of one height may be apart

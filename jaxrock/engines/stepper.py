@@ -16,7 +16,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State
+from jaxrock.engines.state import Node, State
 from jaxrock.numerics.choice import where
 
 Scalar = Inexact[Array, ""]
@@ -87,7 +87,7 @@ class AbstractStepper(eqx.Module):
         """A state at the end of the motion, brought to the end of the free stage: peak, verdict and margin."""
 
     @abc.abstractmethod
-    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+    def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Opening angle [rad] and its velocity [rad/s], `elapsed` seconds after a node and before the next."""
 
     def on(self: Stepper, side: Scalar) -> Stepper:
@@ -96,7 +96,7 @@ class AbstractStepper(eqx.Module):
             return self
         return replace(self, scene=self.scene.on(side))  # type: ignore[call-arg]  # a field of all that are no base
 
-    def time(self, state: State) -> Scalar:
+    def time(self, state: State | Node) -> Scalar:
         """Time of a state [s]."""
         return self.scene.start(state.piece) + state.local
 

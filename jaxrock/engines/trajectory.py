@@ -52,12 +52,15 @@ class Trajectory(eqx.Module):
         shares = np.linspace(0, 1, samples).astype(self.duration.dtype)
         return placed(np.asarray(self.duration) * shares) if is_at_hand(self.duration) else self.duration * shares
 
-    def before(self, time: Inexact[Array | np.ndarray, " n"]) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
-        """The node before each time, and how long after it that is [s]; not a number where no step was left for that.
+    def before(
+        self, time: Inexact[Array | np.ndarray, " n"], nodes: PyTree
+    ) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
+        """What `nodes` (all, or what is read of them) tell of the one before each time, and how long after it that is
+        [s]; not a number where no step was left for that.
 
         By NumPy where all is at hand: XLA would compile a program, which takes much longer than to look.
         """
-        given = self.nodes, self.times, self.duration, time
+        given = nodes, self.nodes.done, self.times, self.duration, time
         return _before(np, *jax.tree.map(np.asarray, given)) if is_at_hand(given) else _before(jnp, *given)
 
     def events(self, told: Callable) -> tuple:
@@ -75,7 +78,7 @@ class Trajectory(eqx.Module):
         return tuple(value[: int(count)] if traced else placed(np.asarray(value)[: int(count)]) for value in found)
 
 
-def _before(xp: Any, nodes: PyTree, times: Any, duration: Any, time: Any) -> tuple[PyTree, Any]:
+def _before(xp: Any, nodes: PyTree, done: Any, times: Any, duration: Any, time: Any) -> tuple[PyTree, Any]:
     """The same by NumPy or JAX."""
     last = times.size - 1
 
@@ -85,11 +88,10 @@ def _before(xp: Any, nodes: PyTree, times: Any, duration: Any, time: Any) -> tup
         return lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
     index = xp.clip(xp.searchsorted(times, time, side="right") - 1, 0, last)
-    node = jax.tree.map(at(index), nodes)
     elapsed = xp.where(time <= duration, time, duration) - at(index)(times)
     following = xp.where(index < last, at(xp.minimum(index + 1, last))(times), xp.inf)
-    is_followed = node.done | xp.isfinite(following) | (elapsed <= 0)
-    return node, xp.where(is_followed, elapsed, xp.nan)
+    is_followed = at(index)(done) | xp.isfinite(following) | (elapsed <= 0)
+    return jax.tree.map(at(index), nodes), xp.where(is_followed, elapsed, xp.nan)
 
 
 def at_times(

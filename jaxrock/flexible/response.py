@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least
-from jaxrock._checks import Values, is_at_hand, scalar, span, throwing
+from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
@@ -248,16 +248,10 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
     return differentiable(run, derivatives="a few at once")((block, motion, stop))
 
 
+@by_numpy_or_one_program(static_argnums=2)
 def _at_times(path: Trajectory, time, what: str):
     """Outputs, displacements of the masses, or energies, at times."""
-    return (_followed_on if is_at_hand((path, time)) else _in_one_program)(path, time, what)
-
-
-def _followed_on(path: Trajectory, time, what: str):
-    return _after_nodes(path.stepper, *path.before(time.ravel()), path.duration, time.shape, what)
-
-
-_in_one_program = jax.jit(_followed_on, static_argnames="what")
+    return _after_nodes(path.stepper, *path.before(time.ravel(), path.nodes), path.duration, time.shape, what)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "what"))

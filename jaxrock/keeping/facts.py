@@ -86,6 +86,7 @@ def code() -> str:
     return _on_disk() + changes.changes()
 
 
+@functools.cache
 def version_of(name: str) -> str:
     """The version of a distribution, or that there is none."""
     try:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
-from jaxrock._checks import Values, is_at_hand, scalar, span, throwing
+from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
 from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State, initial_state, surpasses
+from jaxrock.engines.state import Node, State, initial_state, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
 from jaxrock.engines.trajectory import Trajectory, at_times, rows_of, states_of, times_of
@@ -315,16 +315,10 @@ def _end(given) -> Outcome:
     return conclude(*given)
 
 
+@by_numpy_or_one_program()
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    return (_followed_on if is_at_hand((path, time)) else _in_one_program)(path, time)
-
-
-def _followed_on(path: Trajectory, time):
-    return _after_nodes(path.stepper, *path.before(time.ravel()), path.duration, time.shape)
-
-
-_in_one_program = jax.jit(_followed_on)
+    return _after_nodes(path.stepper, *path.before(time.ravel(), Node.of(path.nodes)), path.duration, time.shape)
 
 
 @functools.partial(jax.jit, static_argnames="shape")
@@ -335,16 +329,16 @@ def _after_nodes(stepper: AbstractStepper, node, elapsed, duration, shape):
 def evaluation(stepper: AbstractStepper) -> Callable:
     """`at(node, elapsed)`: rotation [rad] and angular velocity [rad/s], so long after a node and before the next."""
     if stepper.engine.reverse:
-        return lambda node, elapsed: _at((stepper, node, elapsed))
+        return lambda node, elapsed: _at((stepper, Node.of(node), elapsed))
     stepper = _moving_in_evaluation(stepper)
     in_lanes = stepper.engine.in_lanes
     at = differentiable(
         _at, _at, None, "evaluation", lambda given: (given[2], given[2]), in_lanes, derivatives="by directions"
     )
 
-    def found(node, elapsed):
+    def found(node: Node | State, elapsed):
         moving = {name: getattr(node, name) for name in ("local", "opening", "velocity")}
-        return at((stepper, replace(jax.lax.stop_gradient(node), **moving), elapsed))
+        return at((stepper, replace(jax.lax.stop_gradient(Node.of(node)), **moving), elapsed))
 
     return found
 

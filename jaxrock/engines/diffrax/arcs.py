@@ -38,7 +38,7 @@ from jaxrock.engines.events import WATCHED, Events, landed
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State
+from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.models.equation import Angle
 from jaxrock.numerics.roots import carried
@@ -294,7 +294,7 @@ class ArcStepper(AbstractStepper):
         state, counted = self.engine.loop(lambda c: ~c[0].done & (c[0].steps < budget), step, carry, budget)
         return replace(state, impacts=jnp.where(state.overturned, state.impacts, counted))
 
-    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+    def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Solve again from the node."""
         scene = self.scene.on(node.side)
         arc = Arc.of(scene, node, Forcing.of(scene, node), self.history)

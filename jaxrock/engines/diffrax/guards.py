@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.engines.events import Events
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State
+from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
@@ -54,7 +54,7 @@ class Forcing(eqx.Module):
     p: Scalar
 
     @classmethod
-    def of(cls, scene: Scene, state: State) -> "Forcing":
+    def of(cls, scene: Scene, state: State | Node) -> "Forcing":
         """The forcing from a state on."""
         shaking, unit = scene.shaking(state.piece, state.local, POLICY.order)
         piece = jnp.minimum(state.piece, scene.pieces - 1)
@@ -117,7 +117,7 @@ class Arc(eqx.Module):
     flat: Flag  # whether a rotation of pi/2 ends it
 
     @classmethod
-    def of(cls, scene: Scene, start: State, forcing: Forcing, history: bool) -> "Arc":
+    def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "Arc":
         """The arc from a state on."""
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)

@@ -25,7 +25,7 @@ from jaxrock.engines.free_stage import FreeStage, Visit, free_stage
 from jaxrock.engines.impact import impact
 from jaxrock.engines.rest import wait
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import State, surpasses
+from jaxrock.engines.state import Node, State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
 from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
@@ -199,14 +199,14 @@ class TaylorStepper(AbstractStepper):
             status=Status.where(toss_up, Status.undecided, state.status),
         )
 
-    def evaluate(self, node: State, elapsed: Scalar) -> tuple[Scalar, Scalar]:
+    def evaluate(self, node: Node, elapsed: Scalar) -> tuple[Scalar, Scalar]:
         """Expand the series again about the node."""
         shaking, unit = self.shaking(node.piece, node.local)
         coefficients = expand(self.on(node.side).start(node, shaking, unit), self.order).opening
         opening, speed = jet(coefficients, elapsed / unit, 1)
         return opening, speed / unit
 
-    def start(self, state: State, shaking: Shaking, unit: Scalar) -> Start:
+    def start(self, state: State | Node, shaking: Shaking, unit: Scalar) -> Start:
         """Where a step starts, with time in `unit`."""
         stretch = jnp.ones_like(unit) if self.scene.scales is None else keep(self.scene.p * unit, state.local)
         moments: Any = self.scene.moments
