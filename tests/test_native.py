@@ -191,6 +191,12 @@ FUNCTIONS = {
     "arcsin": (jnp.arcsin, np.concatenate([np.linspace(-1, 1, 81), [1e-300, 1 - 1e-15, 1.1]])),
     "arctan": (jnp.arctan, np.concatenate([np.linspace(-3, 3, 81), [1e-300, -1e9, np.inf, -np.inf, np.nan]])),
     "tanh": (jnp.tanh, np.concatenate([np.linspace(-3, 3, 61), [1e-300, 1e-9, 40.0, -400.0, np.inf]])),
+    "sinh": (jnp.sinh, np.concatenate([np.linspace(-3, 3, 60), [1e-300, -1e-9, 19.9, 20.1, 709.9, -np.inf, np.nan]])),
+    "cosh": (jnp.cosh, np.concatenate([np.linspace(-3, 3, 61), [1e-300, 40.0, -300.0, 710.0, -np.inf, np.nan]])),
+    "log1p": (
+        jnp.log1p,
+        np.concatenate([np.linspace(-0.999, 3, 61), [1e-300, -1e-9, 1e300, -1.0, -1 + 1e-15, -2.0, np.inf, np.nan]]),
+    ),
     "arsinh": (
         jnp.arcsinh,
         np.concatenate([np.linspace(-3, 3, 81), [1e-300, 1e-9, -1e8, 2e9, 1e200, -np.inf, np.nan]]),
@@ -214,6 +220,12 @@ def test_functions(name):
     x, found = of_functions()[name]
     with np.errstate(all="ignore"):
         np.testing.assert_allclose(found, getattr(np, FUNCTIONS[name][0].__name__)(x), rtol=1e-15, atol=4e-16)
+
+
+def test_zeros_keep_their_signs():
+    zeros = np.array([0.0, -0.0])
+    for found in run(lambda leaves: [f(leaves[0]) for f in (jnp.sinh, jnp.log1p)], [zeros], [False]):
+        np.testing.assert_array_equal(np.signbit(found), [False, True])
 
 
 def test_angles_of_points():

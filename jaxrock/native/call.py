@@ -158,7 +158,10 @@ def ran(name: str, results: list, *arrays, aliases: dict | None = None) -> list:
 
 
 # What takes as long as many products: it is not done again whenever a lane takes the next scene.
-_DEAR = {"div", "sqrt", "rsqrt", "exp", "expm1", "log", "sin", "cos", "tan", "asin", "atan", "atan2", "tanh", "pow"}
+_DEAR = {
+    "div", "sqrt", "rsqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "atan", "atan2", "sinh",
+    "cosh", "tanh", "pow",
+}  # fmt: skip
 
 
 def _is_before_loops(equation) -> bool:
@@ -167,7 +170,8 @@ def _is_before_loops(equation) -> bool:
 
 
 def _is_large(variable) -> bool:
-    return math.prod(variable.aval.shape) > SMALL
+    shape = variable.aval.shape
+    return max(shape, default=0) > SMALL or math.prod(shape) > SMALL**2
 
 
 def threads(devices: int) -> int:

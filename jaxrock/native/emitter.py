@@ -16,8 +16,9 @@ from jax.extend.core import Literal
 from llvmlite import ir
 
 from jaxrock.native.arrays import OF_FEW, is_one_place
+from jaxrock.native.in_numpy import MOVES
 from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
-from jaxrock.native.operations import MOVES, OPERATIONS, SUMS, Unsupported
+from jaxrock.native.operations import OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
 _HOLDERS = {np.ndarray, Memory}  # of more numbers than one

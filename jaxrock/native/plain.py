@@ -18,7 +18,8 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
 from jaxrock._programs import programs_of
-from jaxrock.native.operations import KNOWN, MOVES, NOTHING, Unsupported
+from jaxrock.native.in_numpy import KNOWN, MOVES
+from jaxrock.native.operations import NOTHING, Unsupported
 from jaxrock.native.partition import needed_by
 
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "checkpoint", "remat2"}

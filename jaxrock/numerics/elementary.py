@@ -185,6 +185,14 @@ def exponential_less_one(x: Real) -> Real:
 
 
 @jax.jit
+def logarithm_of_one_and(x: Real) -> Real:
+    """log(1 + x), to a few units of rounding of the result, where 1 + x is a positive normal number."""
+    ratio = x / (2 + x)
+    near = 2 * ratio * _horner(_LOGARITHM, ratio * ratio)
+    return where((x > -0.29) & (x < 0.41), near, logarithm(1 + x))
+
+
+@jax.jit
 def tangent(x: Real) -> Real:
     """tan(x), to a few units of rounding."""
     sine, cosine = sine_cosine_of_any(x)
@@ -245,6 +253,23 @@ def hyperbolic_arcsine(x: Real) -> Real:
     value = where(size < 0.17, near, far)
     value = where(x < 0, -value, value)
     return where(x == x, value, jnp.nan)
+
+
+@jax.jit
+def hyperbolic_sine(x: Real) -> Real:
+    """sinh(x), to a few units of rounding."""
+    size = jnp.abs(x)
+    grown, half = exponential_less_one(jnp.minimum(size, 20.0)), exponential(size / 2)
+    # Beyond, sinh is half of the exponential, which may be too large where sinh is not.
+    value = where(size < 20, 0.5 * (grown + grown / (grown + 1)), 0.5 * half * half)
+    return where(x > 0, value, where(x < 0, -value, x))
+
+
+@jax.jit
+def hyperbolic_cosine(x: Real) -> Real:
+    """cosh(x), to a few units of rounding."""
+    half = exponential(jnp.abs(x) / 2)
+    return 0.5 * half * half + 0.5 / half / half
 
 
 @jax.jit

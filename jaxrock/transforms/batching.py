@@ -5,8 +5,8 @@ Which way `Lanes.__call__` takes:
     scenes                      machine code of our own             XLA, everywhere else
     ------                      -----------------------             --------------------
     one                         careful, its numbers in one lane    careful, without lanes
-    up to _FEW; or any number   careful, in lanes                   careful, in chunks of _LANES
-      without a quick pass
+    up to _FEW; or any number   careful, in lanes                   careful, in chunks of _LANES, or of _WIDE where
+      without a quick pass                                            lanes hardly wait for each other
     many, on a tape             -                                   one after the other
     more, with a quick pass     quick, in lanes; careful what it    quick, in chunks of _QUICK_LANES, which after
                                   postpones, collected; in            every round (if there are any) are made up
@@ -15,9 +15,9 @@ Which way `Lanes.__call__` takes:
 
 On accelerators XLA's chunks have _WIDE lanes. *Careful* is the function as it was given, *quick* a part of its
 `Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this process, where llvmlite is: not for what users
-export, nor for functions that do not ask for it (`in_lanes`: flexible columns, whole histories and closed forms do
-not), nor for programs of operations that `native` does not know. Whether a program is traced at all, or was kept, is
-told by `lowering`.
+export, nor for functions that do not ask for it (`in_lanes`: flexible columns and whole histories do not), nor for
+programs of operations that `native` does not know. Whether a program is traced at all, or was kept, is told by
+`lowering`.
 """
 
 import functools
@@ -45,7 +45,7 @@ except (ImportError, OSError):
 _LOG = logging.getLogger("jaxrock")
 _LANES, _QUICK_LANES = 64, 256  # of a chunk on CPUs; the quick version waits less for the slowest, so it takes more
 _NATIVE_LANES = 256  # of a chunk of the postponed in machine code, which leaves out what is not wanted
-_WIDE = 1 << 16  # on accelerators
+_WIDE = 1 << 16  # on accelerators, and of what lanes hardly wait for each other in
 _FEW = 64  # scenes for which it is not worth compiling the quick version
 _ENDLESS = jnp.iinfo(jnp.int32).max
 
@@ -168,7 +168,8 @@ class Lanes:
             return scenes.each(lambda tree: self.recipe(jax.tree.leaves(tree)), own)
 
         if not self._is_quick:
-            return self._chunked(function, scenes.own)
+            wait = self.recipe.refilled or not self.recipe.in_lanes  # for the slowest among them
+            return self._chunked(function, scenes.own, _LANES if wait else _WIDE)
         ready, begun = scenes.begin(passes.begin)
 
         def quickly(limit, own, states):

@@ -1,4 +1,4 @@
-"""Functions of arrays, element by element: compiled, and with derivatives that are programs of one element."""
+"""Functions of arrays, element by element: programs of one element at many, with derivatives."""
 
 import functools
 import inspect
@@ -9,7 +9,6 @@ from typing import Any, get_args, get_origin
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
 from jaxrock._checks import check_shapes, is_at_hand, placed
@@ -19,13 +18,19 @@ from jaxrock.transforms.differentiation import differentiable
 def elementwise(**checks: Callable) -> Callable:
     """Decorate a function of arrays that broadcast: its arguments are checked, by name, and it is compiled.
 
-    Its derivatives are those of one element, found as those of a scene are: in another session without tracing.
+    It is that of one element at many, with derivatives as those of a scene: in machine code, where that is, and in
+    another session without tracing.
     """
 
     def decorate(function: Callable) -> Callable:
         signature = inspect.signature(function)
-        compiled = jax.jit(lambda *values: function(*jnp.broadcast_arrays(*values)))
-        derived = _with_kept_derivatives(function, compiled)
+        one = differentiable(
+            lambda values: function(*values),
+            name=f"{function.__module__}.{function.__qualname__}",
+            results=_told_by(signature.return_annotation),
+            in_lanes=True,
+        )
+        compiled = jax.jit(functools.partial(_at_elements, one))
 
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
@@ -35,12 +40,22 @@ def elementwise(**checks: Callable) -> Callable:
             kind = jnp.result_type(*given.values())
             values = [x.astype(kind) for x in given.values()]
             if not is_at_hand(values) or any(x.size == 0 for x in values):
-                return derived(*values)
+                return compiled(*values)
             return _with_room(compiled, values)
 
         return checked_and_compiled
 
     return decorate
+
+
+def _at_elements(one: Callable, *values) -> Any:
+    """A function of one element at all."""
+    values = jnp.broadcast_arrays(*values)
+    shape = values[0].shape
+    if shape == ():
+        return one(values)
+    found = jax.vmap(lambda *values: one(values))(*(x.ravel() for x in values))
+    return jax.tree.map(lambda x: x.reshape(shape), found)
 
 
 _LEAST, _DOUBLED = 8, 4096  # elements for which there is room, and up to which room is doubled
@@ -60,41 +75,6 @@ def _with_room(function: Callable, values: list) -> Any:
         whole[size:] = whole[size - 1]  # elements like another: none takes longer
     found = function(*filled)
     return jax.tree.map(lambda x: placed(np.asarray(x)[:size].reshape(shape)), found)
-
-
-def _with_kept_derivatives(function: Callable, compiled: Callable) -> Callable:
-    one = differentiable(
-        lambda values: function(*values),
-        name=f"{function.__module__}.{function.__qualname__}",
-        results=_told_by(inspect.signature(function).return_annotation),
-    )
-
-    def at_elements(*values):
-        values = jnp.broadcast_arrays(*values)
-        shape = values[0].shape
-        if shape == ():
-            return one(values)
-        found = jax.vmap(lambda *values: one(values))(*(x.ravel() for x in values))
-        return jax.tree.map(lambda x: x.reshape(shape), found)
-
-    @jax.custom_jvp
-    def run(*values):
-        return compiled(*values)
-
-    @functools.partial(jax.jit, static_argnums=2)  # else each of its operations is a program of its own
-    def pushed(values, changes, moves):
-        def of_moving(*moving):
-            rest = iter(moving)
-            return at_elements(*(next(rest) if moved else x for x, moved in zip(values, moves)))
-
-        return jax.jvp(of_moving, [x for x, moved in zip(values, moves) if moved], changes)
-
-    @functools.partial(run.defjvp, symbolic_zeros=True)
-    def _(values, changes):
-        moves = tuple(not isinstance(change, SymbolicZero) for change in changes)
-        return pushed(values, [change for change, moved in zip(changes, moves) if moved], moves)
-
-    return run
 
 
 def _told_by(annotation: Any) -> Callable | None:
