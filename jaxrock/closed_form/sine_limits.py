@@ -1,5 +1,7 @@
 """Limits of overturning under one cycle of a sine, case by case; terms and conventions as in `sine_pulse`."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -8,7 +10,7 @@ from jaxrock.closed_form import _sine_formulas as formulas
 from jaxrock.closed_form._sine_formulas import Real, Result, elementwise_in_sine
 from jaxrock.numerics.roots import bracketed_root
 
-_GRID = 256  # samples that bracket a root of case 1.1
+_GRID = 256  # samples that may bracket a root of case 1.1, the topmost first
 
 
 @elementwise_in_sine
@@ -93,12 +95,22 @@ def approximate_during_pulse_limit(frequency_ratio: Real, restitution: Real) -> 
     return _topmost_root(excess, last, frequency_ratio, restitution)
 
 
-def _topmost_root(excess, last: Array, w: Array, e: Array) -> Array:
+def _topmost_root(excess: Callable, last: Array, w: Array, e: Array) -> Array:
     """The highest intensity up to `last` at which `excess` turns positive; inf if there is none."""
-    share = jnp.linspace(0, 1, _GRID + 1)[1:].reshape(-1, *[1] * last.ndim)
-    grid = 1 + (jax.lax.stop_gradient(last) - 1) * share**2
-    positive = excess(grid, *(jnp.broadcast_to(x, grid.shape) for x in (w, e))) > 0
-    turns = jnp.where(positive[1:] & ~positive[:-1], jnp.arange(_GRID - 1).reshape(share[1:].shape), -1)
-    index = jnp.max(turns, axis=0)[None]
-    lower, upper = (jnp.take_along_axis(grid, jnp.maximum(index, 0) + k, 0)[0] for k in (0, 1))
-    return jnp.where(index[0] >= 0, bracketed_root(excess, lower, upper, w, e), jnp.inf)
+    last, *still = jax.lax.stop_gradient((last, w, e))
+
+    def sample(number):
+        return 1 + (last - 1) * (number / _GRID) ** 2
+
+    def one_lower(carry):
+        number, _, below = carry
+        return number - 1, below, excess(sample(number - 2.0), *still) > 0
+
+    def goes_on(carry):
+        number, above, below = carry
+        return (number > 2) & ~(above & ~below)
+
+    none = jnp.zeros_like(last, bool)
+    number, above, below = jax.lax.while_loop(goes_on, one_lower, (last * 0 + _GRID + 2, none, none))
+    root = bracketed_root(excess, sample(number - 1), sample(number), w, e)
+    return jnp.where(above & ~below, root, jnp.inf)
