@@ -10,15 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int
 
 from jaxrock.numerics.roots import search_root
+from jaxrock.transforms.elementwise import elementwise
 
 Real = Float[Array, "..."]
+Given = Inexact[ArrayLike, "..."]
 
 _MOST_PIECES = 4096
-_PIECES = 16
-_LENGTH = 128  # of the lanes that are compiled
 
 
 class Lane(eqx.Module):
@@ -58,43 +58,19 @@ def uplift_phase(intensity: Real) -> Real:
     return jnp.arctan2(1.0, jnp.sqrt((intensity - 1) * (intensity + 1)))
 
 
-def follow(intensity: np.ndarray, ratio: float, restitution: float) -> Lane:
-    """The state at the end of the pulse; not `done` where the impacts were too many to follow.
-
-    Some blocks take thousands of arcs, most only a few: those that have arrived are put aside as one goes along.
-    """
-    # Not uplifted yet: at angle 0.
-    lanes = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(start, intensity))
-    waiting = np.arange(intensity.size)
-    for _ in range(_MOST_PIECES // _PIECES):
-        for some in np.split(waiting, range(_LENGTH, waiting.size, _LENGTH)):
-            index = np.resize(some, _LENGTH)  # repeated
-            part = jax.tree.map(lambda x, index=index: x[index], lanes)
-            part = _advance(part, intensity[index], np.full(_LENGTH, ratio), np.full(_LENGTH, restitution))
-            for whole, new in zip(jax.tree.leaves(lanes), jax.tree.leaves(part)):
-                whole[some] = np.asarray(new)[: some.size]
-        waiting = waiting[~lanes.done[waiting]]
-        if not waiting.size:
-            break
-    return lanes
-
-
-@jax.jit
-def _advance(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:
-    """Some pieces of an arc further, as long as a lane has any left."""
-    # The uplift is computed where it is compared, for a block is driven from there on to the last digit.
-    lane = jax.tree.map(lambda new, old: jnp.where(lane.angle == 0, new, old), start(intensity), lane)
+@elementwise(refilled=True)  # some blocks take thousands of arcs, most only a few
+def follow(intensity: Given, ratio: Given, restitution: Given) -> Lane:
+    """The state at the end of the pulse; not `done` where the impacts were too many to follow."""
 
     def going(carry):
         count, lane = carry
-        return (count < _PIECES) & ~jnp.all(lane.done)
+        return (count < _MOST_PIECES) & ~lane.done
 
     def step(carry):
         count, lane = carry
-        new = _next(lane, intensity, ratio, restitution)
-        return count + 1, jax.tree.map(lambda n, o: jnp.where(lane.done, o, n), new, lane)
+        return count + 1, _next(lane, intensity, ratio, restitution)
 
-    return jax.lax.while_loop(going, step, (0, lane))[1]
+    return jax.lax.while_loop(going, step, (0, start(intensity)))[1]
 
 
 def _next(lane: Lane, intensity: Real, ratio: Real, restitution: Real) -> Lane:

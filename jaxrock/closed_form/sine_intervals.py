@@ -3,6 +3,7 @@
 from typing import Annotated, Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -115,7 +116,7 @@ def _at(points: np.ndarray, ratio: float, restitution: float) -> tuple[np.ndarra
     """`growth` at the end of the pulse, and the impacts before overturning, at points of any shape."""
     if not points.size:
         return np.zeros(points.shape), np.zeros(points.shape, int)
-    end: Any = arcs.follow(points.ravel(), ratio, restitution)
+    end: Any = jax.tree.map(np.asarray, arcs.follow(points.ravel(), ratio, restitution))
     directly = end.opening + end.speed > 1
     return arcs.growth(end, restitution).reshape(points.shape), (end.impacts + ~directly).reshape(points.shape)
 

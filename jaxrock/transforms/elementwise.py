@@ -11,12 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxrock._checks import check_shapes, is_at_hand, placed
+from jaxrock._checks import as_real, check_shapes, is_at_hand, placed
 from jaxrock.transforms.differentiation import differentiable
 
 
-def elementwise(**checks: Callable) -> Callable:
+def elementwise(refilled: bool = False, **checks: Callable) -> Callable:
     """Decorate a function of arrays that broadcast: its arguments are checked, by name, and it is compiled.
+
+    `refilled`: whether in its one loop elements that are done make room for others (see `Recipe`).
 
     It is that of one element at many, with derivatives as those of a scene: in machine code, where that is, and in
     another session without tracing.
@@ -29,13 +31,14 @@ def elementwise(**checks: Callable) -> Callable:
             name=f"{function.__module__}.{function.__qualname__}",
             results=_told_by(signature.return_annotation),
             in_lanes=True,
+            refilled=refilled,
         )
         compiled = jax.jit(functools.partial(_at_elements, one))
 
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
             given = signature.bind(*args, **kwargs).arguments
-            given = {name: checks[name](name, value) for name, value in given.items()}
+            given = {name: checks.get(name, as_real)(name, value) for name, value in given.items()}
             check_shapes(**given)
             kind = jnp.result_type(*given.values())
             values = [x.astype(kind) for x in given.values()]
