@@ -372,3 +372,17 @@ def test_steps_before_times_are_found_by_numpy_as_within_jit():
         rows = times[: times.size // 2 * 2].reshape(2, -1)
         for one, other in zip(response(rows), jax.jit(lambda r, t: r(t))(response, rows), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_events_are_found_by_numpy_as_within_jit():
+    """To the bit: impacts and turning points, of rest too, and where steps were too few."""
+    names, by_jit = ("impact_times", "impact_velocities", "peak_times", "peak_rotations"), None
+    for amplitude, steps in ((0.3, None), (0.3, 6), (0.1, None)):
+        engine = rk.Series(order=6, max_steps=steps)
+        response = rk.simulate(BLOCK, rk.SinePulse(amplitude, 0.8), rk.Linear(), engine=engine, samples=5)
+        by_jit = by_jit or jax.jit(lambda r: [getattr(r, name) for name in names])
+        for name, filled in zip(names, map(np.asarray, by_jit(response)), strict=True):
+            found = np.asarray(getattr(response, name))
+            np.testing.assert_array_equal(found, filled[: found.size])
+            assert (filled[found.size :] == (np.inf if "times" in name else 0)).all()
+            assert steps or (found.size > 0) == (amplitude > 0.2)

@@ -67,15 +67,18 @@ class Trajectory(eqx.Module):
         """Values at the nodes where something happened, in order; under jit filled up: infinite times, zeros beside
         them.
 
-        `told(trajectory)`: of every node whether it did, what they are ordered by, and pairs of a value and what fills
-        it up.
+        `told(xp, trajectory)`: of every node, by NumPy or JAX, whether it did, what they are ordered by, and pairs of a
+        value and what fills it up.
         """
         self.check_single()
+        if is_at_hand(self):  # XLA would compile a program, which takes much longer than to look
+            happened, order, *values = told(np, jax.tree.map(np.asarray, self))
+            order = np.flatnonzero(happened)[np.argsort(order[happened], stable=True)]
+            return tuple(placed(np.asarray(value)[order]) for value, _ in values)
         found, count = _in_order(self, told)
         if is_traced(count):
             return found
-        traced = is_traced(found)  # known events, of which something moves
-        return tuple(value[: int(count)] if traced else placed(np.asarray(value)[: int(count)]) for value in found)
+        return tuple(value[: int(count)] for value in found)  # known events, of which something moves
 
 
 def _before(xp: Any, nodes: PyTree, done: Any, times: Any, duration: Any, time: Any) -> tuple[PyTree, Any]:
@@ -105,7 +108,7 @@ def at_times(
 
 @functools.partial(jax.jit, static_argnames="told")
 def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
-    happened, order, *values = told(path)
+    happened, order, *values = told(jnp, path)
     order = jnp.argsort(where(happened, order, jnp.inf), stable=True)
     found = []
     for value, filling in values:

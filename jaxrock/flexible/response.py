@@ -1,7 +1,7 @@
 """What a flexible block does under a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
 
 import functools
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -121,15 +121,21 @@ class FlexibleResponse(AbstractTable):
         return self.trajectory.events(_modes_of)[0]
 
 
-def _impacts_of(path: Trajectory) -> tuple:
-    return path.impacted, path.times, (path.times, jnp.inf)
+def _impacts_of(xp: Any, path: Trajectory) -> tuple:
+    return path.impacted, path.times, (path.times, xp.inf)
 
 
-def _modes_of(path: Trajectory) -> tuple:
-    q, v = jnp.split(path.nodes.motion[:, :-1], 2, axis=1)
-    energies = v**2 + path.stepper.numbers.squares * q**2
+def _modes_of(_, path: Trajectory) -> tuple:
+    return path.impacted, path.times, (_shares(path.nodes.motion, path.stepper.numbers.squares), 0.0)
+
+
+@jax.jit
+def _shares(motion: Scalar, squares: Scalar) -> Scalar:
+    """Of each mode in the energy at each step."""
+    q, v = jnp.split(motion[:, :-1], 2, axis=1)
+    energies = v**2 + squares * q**2
     total = energies.sum(1, keepdims=True)
-    return path.impacted, path.times, (energies / jnp.where(total > 0, total, 1.0), 0.0)
+    return energies / jnp.where(total > 0, total, 1.0)
 
 
 @arguments

@@ -164,18 +164,19 @@ class Response(AbstractTable):
 # What `Trajectory.events` takes.
 
 
-def _impacts_of(path: Trajectory) -> tuple:
+def _impacts_of(xp: Any, path: Trajectory) -> tuple:
     nodes = path.nodes
     velocities = nodes.impact_velocity * path.stepper.scene.p
-    return path.impacted, nodes.impact_time, (nodes.impact_time, jnp.inf), (velocities, 0.0)
+    return path.impacted, nodes.impact_time, (nodes.impact_time, xp.inf), (velocities, 0.0)
 
 
-def _peaks_of(path: Trajectory) -> tuple:
+def _peaks_of(xp: Any, path: Trajectory) -> tuple:
     nodes = path.nodes
-    turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & jnp.isfinite(path.times)
+    turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & xp.isfinite(path.times)
     # A step through a piece without a length leaves a block that turns where it is.
-    turned = turned.at[1:].set(turned[1:] & ~(turned[:-1] & (nodes.opening[1:] == nodes.opening[:-1])))
-    return turned, path.times, (path.times, jnp.inf), (nodes.side * nodes.opening, 0.0)
+    stays = turned[:-1] & (nodes.opening[1:] == nodes.opening[:-1])
+    turned = turned & ~xp.concatenate([turned[:1] & False, stays])
+    return turned, path.times, (path.times, xp.inf), (nodes.side * nodes.opening, 0.0)
 
 
 @overload
