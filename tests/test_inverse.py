@@ -333,10 +333,10 @@ def test_contradictions_have_no_intervals():
 def test_a_rotation_that_no_motion_makes_is_named():
     """Its rock is likely to stand, as it does; and no larger scatter would move it that far."""
     unknowns = {"amplitude": rk.inverse.Unknown(0.05, 0.06), "period": rk.inverse.Unknown(0.2, 0.3)}
-    seen = rocks(["survived"] * 11 + ["rotation"], rotation=0.3, rotation_sd=0.001)
+    seen = rocks(["survived"] * 3 + ["rotation"], ALPHA[-4:], P[-4:], rotation=0.3, rotation_sd=0.001)
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns, 0.05, starts=1)
-    assert found.status == rk.inverse.EstimateStatus.contradictory and float(found.probability[11]) > 0.9
-    assert "rock 12 (its rotation is off by 300.0 standard deviations)" in found.remarks[0]
+    assert found.status == rk.inverse.EstimateStatus.contradictory and float(found.probability[3]) > 0.9
+    assert "rock 4 (its rotation is off by 300.0 standard deviations)" in found.remarks[0]
     assert np.isinf(found.consistent_scatter) and "no scatter up to ten times as large" in found.remarks[1]
 
 

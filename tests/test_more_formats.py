@@ -624,9 +624,9 @@ def test_a_folder_is_no_file(path):
 
 
 @pytest.mark.parametrize("kind", ["AT2", "CSV", "V2", "V1"])
-def test_a_million_samples_in_seconds(tmp_path, kind):
-    """In one second on a quiet core; where lines are looked at one by one it takes twenty."""
-    count, again = 1_000_000, 100  # times the same, so that the text is soon written
+def test_long_records_in_a_moment(tmp_path, kind):
+    """A million samples in a second on a quiet core; where lines are looked at one by one it takes twenty."""
+    count, again = 250_000, 25  # times the same, so that the text is soon written
     some = np.round(np.random.default_rng(0).normal(0, 0.1, count // again), 7)
     heads = {
         "AT2": f"PEER\nA, B, C\nACCELERATION IN UNITS OF G\nNPTS= {count}, DT= .005 SEC\n",
@@ -645,7 +645,7 @@ def test_a_million_samples_in_seconds(tmp_path, kind):
     path.write_text(heads[kind] + "\n".join(lines) + "\n")
     begin = time.process_time()
     record = rk.read_record(path, **({"unit": "g"} if kind == "CSV" else {}))
-    assert time.process_time() - begin < 5
+    assert time.process_time() - begin < 1.25
     np.testing.assert_allclose(record.samples, np.tile(some, again), atol=1e-12)
 
 
