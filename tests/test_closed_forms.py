@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -636,3 +637,16 @@ def test_arrays_of_any_shape_are_of_a_few_programs():
     assert uplift(np.zeros((0, 3)), shape=0.7).shape == (0, 3)
     here = jax.device_put(strengths[:5], jax.devices("cpu")[1])  # stays where its user has put it
     assert uplift(here, shape=0.7).devices() == {jax.devices("cpu")[1]}
+
+
+@pytest.mark.parametrize("function, values", [
+    (sine_pulse.no_impact_limit, (2.0,)), (sine_pulse.impact_time, (2.0, 0.5)),
+    (sine_pulse.during_pulse_limit, (2.0, 0.9)), (sine_pulse.rotation, (0.5, 2.0, 0.5, 0.9)),
+    (single_lobe.safety_wall, (1.0, 0.5)), (single_lobe.uplift_time, (0.3, 0.5)),
+], ids=lambda x: getattr(x, "__name__", str(x)))  # fmt: skip
+def test_nothing_is_left_to_xla(function, values):
+    """All of an element is machine code, where llvmlite is; an operation it does not know would take all before it."""
+    pytest.importorskip("llvmlite")
+    text = jax.jit(jax.value_and_grad(function)).lower(*values).as_text()
+    assert "stablehlo.custom_call" in text
+    assert not re.findall(r"stablehlo\.(?:while|exponential|log|sine|cosine|power|atan)\w*", text)

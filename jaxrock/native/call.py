@@ -6,6 +6,7 @@ vector register, and then for the next few. XLA calls it as a foreign function.
 """
 
 import functools
+import logging
 import math
 import os
 from typing import NamedTuple
@@ -30,6 +31,8 @@ from jaxrock.native.partition import ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
 from jaxrock.native.unmarked import unmarked
+
+_LOG = logging.getLogger("jaxrock")
 
 
 class _Piece(NamedTuple):
@@ -61,6 +64,11 @@ class Plan:
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
         self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()
         self._once, self._each, rest = ahead(program, shared, is_known, _is_large)
+        before = self._each.program.jaxpr.eqns
+        if unknown := {equation.primitive.name for equation in before if not is_known(equation)}:
+            _LOG.debug(
+                "%d operations are done before by XLA: not known are %s", len(before), ", ".join(sorted(unknown))
+            )
         self._rest, own, self._pieces = rest.inputs, self._first_own(), []
         # Of what becomes machine code only names stay: programs take more memory than all else.
         for part in around_loop(rest) if refilled else [rest]:
