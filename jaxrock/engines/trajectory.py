@@ -53,10 +53,10 @@ class Trajectory(eqx.Module):
         return placed(np.asarray(self.duration) * shares) if is_at_hand(self.duration) else self.duration * shares
 
     def before(
-        self, time: Inexact[Array | np.ndarray, " n"], nodes: PyTree
+        self, time: Inexact[Array | np.ndarray, "..."], nodes: PyTree
     ) -> tuple[PyTree, Inexact[Array | np.ndarray, " n"]]:
-        """What `nodes` (all, or what is read of them) tell of the one before each time, and how long after it that is
-        [s]; not a number where no step was left for that.
+        """What `nodes` (all, or what is read of them) tell of the one before each time, in a row, and how long after it
+        that is [s]; not a number where no step was left for that.
 
         By NumPy where all is at hand: XLA would compile a program, which takes much longer than to look.
         """
@@ -90,6 +90,7 @@ def _before(xp: Any, nodes: PyTree, done: Any, times: Any, duration: Any, time: 
             return lambda x: x[index]
         return lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
+    time = xp.ravel(time)
     index = xp.clip(xp.searchsorted(times, time, side="right") - 1, 0, last)
     elapsed = xp.where(time <= duration, time, duration) - at(index)(times)
     following = xp.where(index < last, at(xp.minimum(index + 1, last))(times), xp.inf)

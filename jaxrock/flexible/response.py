@@ -257,7 +257,7 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
 @by_numpy_or_one_program(static_argnums=2)
 def _at_times(path: Trajectory, time, what: str):
     """Outputs, displacements of the masses, or energies, at times."""
-    return _after_nodes(path.stepper, *path.before(time.ravel(), path.nodes), path.duration, time.shape, what)
+    return _after_nodes(path.stepper, *path.before(time, path.nodes), path.duration, time.shape, what)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "what"))

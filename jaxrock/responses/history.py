@@ -319,7 +319,7 @@ def _end(given) -> Outcome:
 @by_numpy_or_one_program()
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    return _after_nodes(path.stepper, *path.before(time.ravel(), Node.of(path.nodes)), path.duration, time.shape)
+    return _after_nodes(path.stepper, *path.before(time, Node.of(path.nodes)), path.duration, time.shape)
 
 
 @functools.partial(jax.jit, static_argnames="shape")
