@@ -363,6 +363,17 @@ def intervals(ratio, e):
     return sine_pulse.overturning_intervals(ratio, e, points=128)
 
 
+def test_limits_during_the_pulse_are_ends_of_intervals(references):
+    """Of those in 200 bits; six have none."""
+    cases = references["linear_sine_intervals"]
+    ratio, e = (np.array([float(case[name]) for case in cases]) for name in ("frequency_ratio", "restitution"))
+    limits = np.asarray(sine_pulse.during_pulse_limit(ratio, e))
+    assert np.sum(np.isfinite(limits)) == len(cases) - 6
+    for limit, case in zip(limits, cases):
+        ends = np.array([float(lower) for lower, _ in case["ends"]])
+        assert np.isinf(limit) or np.min(np.abs(ends / limit - 1)) < 1e-13
+
+
 def test_sine_intervals_against_the_papers_numbers(references):
     for case in references["linear_sine_intervals"][::14]:  # the others: the test of the engine's intervals
         ratio, e = float(case["frequency_ratio"]), float(case["restitution"])

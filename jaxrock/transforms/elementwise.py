@@ -16,12 +16,11 @@ from jaxrock.transforms.differentiation import differentiable
 
 
 def elementwise(refilled: bool = False, **checks: Callable) -> Callable:
-    """Decorate a function of arrays that broadcast: its arguments are checked, by name, and it is compiled.
+    """Decorate a function of arrays that broadcast: it is that of one element at many, with derivatives as those of a
+    scene, in machine code where that is, and in another session without tracing.
 
-    `refilled`: whether in its one loop elements that are done make room for others (see `Recipe`).
-
-    It is that of one element at many, with derivatives as those of a scene: in machine code, where that is, and in
-    another session without tracing.
+    `refilled`: whether in its one loop elements that are done make room for others (see `Recipe`). `checks`: of
+    arguments by name; the others are numbers.
     """
 
     def decorate(function: Callable) -> Callable:
