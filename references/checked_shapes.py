@@ -6,6 +6,7 @@ imported; what is within functions is not checked.
 """
 
 import ast
+import functools
 import importlib.abc
 import importlib.machinery
 import sys
@@ -15,12 +16,24 @@ from collections.abc import Collection
 from beartype import beartype
 from jaxtyping import AbstractArray, jaxtyped
 
+_NAMES = jaxtyped("context")  # within it what is named in shapes is the same wherever it stands
+
 
 def checked(named):
     """A function, or a class with fields, and a check of the shapes that its annotations name."""
     if not any(map(_is_of_shapes, getattr(named, "__annotations__", {}).values())):
         return named
-    return jaxtyped(named, typechecker=beartype)
+    if isinstance(named, type):
+        return jaxtyped(named, typechecker=beartype)
+    function = beartype(named)
+
+    # What `jaxtyped` makes of a function checks its arguments twice.
+    @functools.wraps(named)
+    def called(*args, **kwargs):
+        with _NAMES:
+            return function(*args, **kwargs)
+
+    return called
 
 
 def _is_of_shapes(annotation) -> bool:
@@ -52,7 +65,7 @@ class _Loader(importlib.machinery.SourceFileLoader):
         return self.source_to_code(self.get_data(self.path), self.path)
 
     def source_to_code(self, data, path):
-        return super().source_to_code(ast.fix_missing_locations(_Decorating().visit(ast.parse(data))), path)
+        return super().source_to_code(_Decorating().visit(ast.parse(data)), path)
 
 
 class _Finder(importlib.abc.MetaPathFinder):

@@ -20,11 +20,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import jax
-import matplotlib
 import pytest
-
-from references.checked_shapes import check_shapes
+from _pytest.runner import pytest_runtest_protocol as protocol
 
 INNERMOST = {"polynomial", "expansion", "lookup", "elementary"}
 
@@ -38,35 +35,39 @@ def checked_modules():
             yield ".".join(["jaxrock", *path.relative_to(package).with_suffix("").parts])
 
 
-check_shapes(list(checked_modules()))
-
-# Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
-gc.set_threshold(1_000_000, 10, 10)
-
-if "XLA_FLAGS" not in os.environ:
-    importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
-    fewer = ("simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking")
-    flags = (
-        "--xla_backend_optimization_level=0",
-        "--xla_cpu_parallel_codegen_split_count=1",  # parts that are compiled side by side take longer in all
-        f"--xla_disable_hlo_passes={','.join(fewer)}",
-    )
-    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
-os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads than one wait at full speed
-
 # What one process has compiled all find again, after it was forgotten, too. What one has half written another may read:
 # JAX says so, which is no error here (see `filterwarnings`), and compiles it. The first one clears the place away.
 _PLACE = "JAXROCK_TESTS_COMPILED"
 if _PLACE not in os.environ:
     os.environ[_PLACE] = tempfile.mkdtemp(prefix="jaxrock-tests-")
     atexit.register(shutil.rmtree, os.environ[_PLACE], ignore_errors=True)
-jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", 2)
-matplotlib.use("Agg")
+os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads than one wait at full speed
+
+
+def pytest_configure(config):
+    """Get ready to run tests; what only deals them out to others needs nothing of that."""
+    if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
+        return
+    importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
+    # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
+    gc.set_threshold(1_000_000, 10, 10)
+    if "XLA_FLAGS" not in os.environ:
+        importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
+        fewer = ("simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking")
+        flags = (
+            "--xla_backend_optimization_level=0",
+            "--xla_cpu_parallel_codegen_split_count=1",  # parts that are compiled side by side take longer in all
+            f"--xla_disable_hlo_passes={','.join(fewer)}",
+        )
+        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
+    jax = importlib.import_module("jax")
+    jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", 2)
+    importlib.import_module("matplotlib").use("Agg")
 
 
 # Bytes that a worker holds before it forgets compiled programs, if it has grown by so many since it last did: after the
@@ -102,7 +103,7 @@ def pytest_runtest_teardown(item, nextitem):
     if not _has_many_maps() and _memory() <= most:
         return
     importlib.import_module("jaxrock.transforms.recipe").forget_programs()
-    jax.clear_caches()
+    importlib.import_module("jax").clear_caches()
     gc.collect()  # it is told to look seldom, and much waits for it
     gc.freeze()  # what is left stays for long
     if hasattr(_OF_C, "malloc_trim"):  # what is free is given back only so
@@ -110,8 +111,21 @@ def pytest_runtest_teardown(item, nextitem):
     _held[0] = _memory()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item, nextitem):
+    """As pytest does it, with room for the frames of all that a test calls."""
+    return importlib.import_module("jaxrock._undisturbed").with_room(protocol, item, nextitem)
+
+
 def pytest_collection_finish():
     """What all modules have made by now stays: the collector need not look at it again."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """At the end pytest looks for garbage five times, and Python twice: once is enough, for what is left stays."""
     gc.collect()
     gc.freeze()
 

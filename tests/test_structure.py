@@ -378,7 +378,7 @@ def test_unknown_names_raise():
 
 # What a module holds and changes while the program runs: every thread sees it. Why that is safe:
 SHARED = {
-    "_garbage._pauses": "under its lock",
+    "_undisturbed._pauses": "under its lock",
     "native.machine._registered": "under a lock",
     "numerics.compound._OPERATIONS": "changed at import only",
     "responses.arguments._usual": "the same value, whoever puts it there, by one call of C",

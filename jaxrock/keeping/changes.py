@@ -9,11 +9,14 @@ import sys
 import types
 import uuid
 from collections.abc import Mapping
+from itertools import repeat
+from operator import attrgetter, is_
 from typing import Any, NamedTuple
 
 _OWN = __name__.split(".")[0]
 _OTHERS = tuple(f"{_OWN}.{each}" for each in ("keeping", "sweeps", "plot", "command_line"))  # make no programs
 _PLAIN = (bool, int, float, str, bytes, type(None))
+_CODE = attrgetter("__code__")
 
 
 class _Space(NamedTuple):
@@ -23,19 +26,29 @@ class _Space(NamedTuple):
     names: Mapping[str, Any]  # now
     before: dict[str, Any]
     many: int  # how many names there were
-    codes: list[tuple[str, types.FunctionType, types.CodeType]]  # of its functions, and of those within what wraps them
+    functions: list[types.FunctionType]  # that it names, those within what wraps them, too
+    codes: list[types.CodeType]  # of these
 
     @classmethod
     def at(cls, of: str, names: Mapping[str, Any]) -> "_Space":
         before = {name: value for name, value in list(names.items()) if not name.startswith("__") or _function(value)}
-        functions = [(name, function) for name, value in before.items() if (function := _function(value)) is not None]
-        return cls(of, names, before, len(names), [(name, function, function.__code__) for name, function in functions])
+        functions = [function for value in before.values() if (function := _function(value)) is not None]
+        return cls(of, names, before, len(names), functions, list(map(_CODE, functions)))
+
+    def stays(self) -> bool:
+        """Whether nothing differs now. It is asked of ten thousand names whenever a program is called: within `map`."""
+        return (
+            len(self.names) == self.many
+            and all(map(is_, map(self.names.get, self.before, repeat(self)), self.before.values()))
+            and all(map(is_, map(_CODE, self.functions), self.codes))
+        )
 
     def changed(self) -> list[str]:
         """What differs now; a name that is new matters if it stands for a function, which may hide one of a base."""
         names, before = self.names, self.before
         found = [name for name, value in before.items() if names.get(name, self) is not value]
-        found += [name for name, function, code in self.codes if function.__code__ is not code]
+        patched = {x for x, code in zip(self.functions, self.codes) if x.__code__ is not code}
+        found += [name for name, value in before.items() if _function(value) in patched]
         if len(names) != self.many:
             found += [name for name in names.keys() - before.keys() if _function(names[name])]
         return [f"{self.of}.{name} {_digest(names.get(name, self))}" for name in found]
@@ -66,7 +79,7 @@ def changes() -> str:
             found.append(f"{name} {_digest(module)}")
         else:
             for space in known[1]:
-                found += space.changed()
+                found += [] if space.stays() else space.changed()
     if not found:
         return ""
     told = hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()

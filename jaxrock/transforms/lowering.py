@@ -25,7 +25,7 @@ from jax.extend.mlir.dialects import func
 from jax.interpreters import mlir
 
 from jaxrock._abstract import without_mesh
-from jaxrock._garbage import not_collected
+from jaxrock._undisturbed import undisturbed
 from jaxrock.keeping import facts, folder
 from jaxrock.transforms.batching import Lanes
 from jaxrock.transforms.recipe import Recipe
@@ -35,7 +35,7 @@ _LOG = logging.getLogger("jaxrock")
 _called: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar("called", default=None)
 
 
-@not_collected()
+@undisturbed
 def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool):
     """The rule of JAX for the primitive of `scenes`."""
     mesh = getattr(context.module_context.axis_context, "mesh", None)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from jaxrock._garbage import not_collected
+from jaxrock._undisturbed import undisturbed
 from jaxrock.keeping.facts import settings
 from jaxrock.keeping.folder import name_of
 from jaxrock.numerics.xla_cpu import are_marked, marking
@@ -114,10 +114,11 @@ class Recipe:
                 recipe._programs.clear()
         return found
 
+    @undisturbed
     def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
         # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
         # takes those that tell of the mesh of a `shard_map`, and those that do not, for different ones.
-        with not_collected(), jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             made = jax.make_jaxpr(lambda *x: function(self.structure.unflatten(x)), return_shape=True)
             program, shapes = made(*self.like)
         needed, _ = partial_eval.dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
