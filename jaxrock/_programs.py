@@ -5,5 +5,10 @@ from typing import Any
 
 def programs_of(equation: Any) -> list:
     """The programs within an operation, without their constants."""
-    values = [v for p in equation.params.values() for v in (p if isinstance(p, (tuple, list)) else (p,))]
-    return [p for p in (getattr(v, "jaxpr", v) for v in values) if hasattr(p, "eqns")]
+    found = []
+    for value in equation.params.values():
+        for each in value if isinstance(value, (tuple, list)) else (value,):
+            program = getattr(each, "jaxpr", each)
+            if hasattr(program, "eqns"):
+                found.append(program)
+    return found

@@ -1,21 +1,25 @@
 """A builder of LLVM's language that writes most instructions as text at once. Needs llvmlite.
 
-Most of a program is arithmetic, comparisons and choices. llvmlite keeps each instruction as an object with its
-operands, looks for a name that no other has, and writes it in the end.
+Most of a program is arithmetic, comparisons, choices, and numbers looked up. llvmlite keeps each instruction as an
+object with its operands, looks for a name that no other has, and writes it in the end.
 """
 
 from llvmlite import ir
 
 _SIGNS = {">": "gt", "<": "lt", "==": "eq", "!=": "ne", ">=": "ge", "<=": "le"}
+_EQUAL = {"==", "!="}
+_FLAG = ir.IntType(1)
+_FLAGS = {lanes: ir.VectorType(_FLAG, lanes) for lanes in (1, 2, 4, 8, 16, 32, 64)}
 
 
 class Line:
-    """The result of an instruction that is written already, as other instructions take it."""
+    """The result of an instruction that is written already, as other instructions take it; `depth`: in how many loops
+    it is made anew (see `emitter.remember`)."""
 
-    __slots__ = ("type", "_name", "_text")
+    __slots__ = ("type", "depth", "_name", "_text")
 
     def __init__(self, kind: ir.Type, name: str, text: str):
-        self.type, self._name, self._text = kind, name, f"{name} = {text}"
+        self.type, self.depth, self._name, self._text = kind, None, name, f"{name} = {text}"
 
     def get_reference(self) -> str:
         """Its name: `%v` and a number, as nothing else is called."""
@@ -27,7 +31,7 @@ class Line:
 
 def _of_two(instruction: str):
     def write(self, x, y, name: str = "", flags: tuple[str, ...] = ()):
-        return self.line(x.type, (instruction, *flags), x, y)
+        return self._operation(x.type, f"{instruction} {' '.join(flags)}" if flags else instruction, x, y)
 
     return write
 
@@ -40,15 +44,14 @@ class Builder(ir.IRBuilder):
         super().__init__(block)
         self._written = 0
 
-    def line(self, kind: ir.Type, words: tuple[str, ...], *operands) -> Line:
-        """An instruction of these words and operands, all of one type, whose result is of a `kind`.
+    def _operation(self, kind: ir.Type, words: str, x, y) -> Line:
+        """An instruction of these words and two operands of one type, whose result is of a `kind`.
 
-        **Raises:** ValueError for operands of several types.
+        **Raises:** ValueError for operands of two types.
         """
-        first = operands[0].type
-        if any(x.type != first for x in operands[1:]):
-            raise ValueError(f"Operands must be of one type, but are {[str(x.type) for x in operands]}.")
-        return self._add(kind, f"{' '.join(words)} {first} {', '.join(x.get_reference() for x in operands)}")
+        if x.type is not y.type and x.type != y.type:
+            raise ValueError(f"Operands must be of one type, but are {x.type} and {y.type}.")
+        return self._add(kind, f"{words} {x.type} {x.get_reference()}, {y.get_reference()}")
 
     def _add(self, kind: ir.Type, text: str) -> Line:
         self._written += 1
@@ -59,9 +62,22 @@ class Builder(ir.IRBuilder):
 
     fadd, fsub, fmul, fdiv = map(_of_two, ("fadd", "fsub", "fmul", "fdiv"))
     and_, or_, xor = map(_of_two, ("and", "or", "xor"))
+    add, sub, mul = map(_of_two, ("add", "sub", "mul"))
 
     def fneg(self, x, name: str = "", flags: tuple[str, ...] = ()):
-        return self.line(x.type, ("fneg", *flags), x)
+        return self._add(x.type, f"{' '.join(('fneg', *flags))} {x.type} {x.get_reference()}")
+
+    def extract_element(self, vector, index, name: str = ""):
+        kind = vector.type
+        return self._add(
+            kind.element, f"extractelement {kind} {vector.get_reference()}, {index.type} {index.get_reference()}"
+        )
+
+    def insert_element(self, vector, value, index, name: str = ""):
+        kind, operands = vector.type, (vector, value, index)
+        if kind.element != value.type:
+            raise ValueError(f"What is put into {kind} must be of its type, but is of {value.type}.")
+        return self._add(kind, f"insertelement {', '.join(f'{x.type} {x.get_reference()}' for x in operands)}")
 
     def select(self, which, x, y, name: str = "", flags: tuple[str, ...] = ()):
         if x.type != y.type:
@@ -69,17 +85,36 @@ class Builder(ir.IRBuilder):
         operands = ", ".join(f"{value.type} {value.get_reference()}" for value in (which, x, y))
         return self._add(x.type, f"{' '.join(('select', *flags))} {operands}")
 
+    def gep(self, ptr, indices, inbounds: bool = False, name: str = "", source_etype=None):
+        if len(indices) > 1 or inbounds or source_etype is not None:
+            return super().gep(ptr, indices, inbounds, name, source_etype)
+        kind, (index,) = ptr.type, indices
+        place = f"{index.type} {index.get_reference()}"
+        return self._add(kind, f"getelementptr {kind.pointee}, {kind} {ptr.get_reference()}, {place}")
+
+    def load(self, ptr, name: str = "", align: int | None = None, typ=None):
+        if typ is not None:
+            return super().load(ptr, name, align, typ)
+        kind = ptr.type
+        aligned = "" if align is None else f", align {align}"
+        return self._add(kind.pointee, f"load {kind.pointee}, {kind} {ptr.get_reference()}{aligned}")
+
     def fcmp_ordered(self, sign: str, x, y, name: str = "", flags: tuple[str, ...] = ()):
-        return self._compared("o", sign, x, y, flags)
+        return self._compared(" ".join(("fcmp", *flags)), "o", sign, x, y)
 
     def fcmp_unordered(self, sign: str, x, y, name: str = "", flags: tuple[str, ...] = ()):
-        return self._compared("u", sign, x, y, flags)
+        return self._compared(" ".join(("fcmp", *flags)), "u", sign, x, y)
 
-    def _compared(self, order: str, sign: str, x, y, flags: tuple[str, ...]):
-        kind = ir.IntType(1)
-        if isinstance(x.type, ir.VectorType):
-            kind = ir.VectorType(kind, x.type.count)
-        return self.line(kind, ("fcmp", *flags, order + _SIGNS[sign] if sign in _SIGNS else sign), x, y)
+    def icmp_signed(self, sign: str, x, y, name: str = ""):
+        return self._compared("icmp", "" if sign in _EQUAL else "s", sign, x, y)
+
+    def icmp_unsigned(self, sign: str, x, y, name: str = ""):
+        return self._compared("icmp", "" if sign in _EQUAL else "u", sign, x, y)
+
+    def _compared(self, words: str, order: str, sign: str, x, y):
+        kind = x.type
+        flags = _FLAGS[kind.count] if isinstance(kind, ir.VectorType) else _FLAG
+        return self._operation(flags, f"{words} {order + _SIGNS[sign] if sign in _SIGNS else sign}", x, y)
 
     def position_before(self, instruction):
         """Where that is the last of its block, as it is wherever this is asked for, it need not be looked for."""

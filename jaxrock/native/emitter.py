@@ -7,7 +7,7 @@ if no lane is in it. What no loop changes is computed before it.
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -35,9 +35,8 @@ class Emitter:
     def __init__(self, builder: ir.IRBuilder, lanes: int):
         self.b, self.lanes = builder, lanes
         self.before = []  # the blocks before the loops that are being written
-        self._depths = {}  # in how many of them a value is made anew, by the identity of the value
-        self._alive = []  # so that identities are not used again
         self._constants = {}  # by their text: each is written once
+        self._vectors = {}  # types, by that of a number
 
     # Types and small things
 
@@ -50,7 +49,9 @@ class Emitter:
 
     def vector(self, dtype) -> ir.VectorType:
         """LLVM's type of a number per lane."""
-        return ir.VectorType(self.kind(dtype), self.lanes)
+        if dtype not in self._vectors:
+            self._vectors[dtype] = ir.VectorType(self.kind(dtype), self.lanes)
+        return self._vectors[dtype]
 
     def constant(self, value, dtype):
         """One number for all lanes."""
@@ -116,16 +117,16 @@ class Emitter:
         for variable, value in zip(jaxpr.constvars, getattr(program, "consts", ())):
             values[variable] = self.known(value, variable.aval.dtype)
 
-        def read(atom):
-            return self.known(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+        def read(atoms):
+            return [self.known(x.val, x.aval.dtype) if isinstance(x, Literal) else values[x] for x in atoms]
 
         for equation in jaxpr.eqns:
-            inputs, operation = [read(x) for x in equation.invars], OPERATIONS.get(equation.primitive.name)
+            inputs, operation = read(equation.invars), OPERATIONS.get(equation.primitive.name)
             if operation is not None and not _HOLDERS.intersection(map(type, inputs)):
                 values[equation.outvars[0]] = self._number(operation, equation, inputs)
             else:
                 values.update(zip(equation.outvars, self._place(equation, inputs, active)))
-        return [read(x) for x in jaxpr.outvars]
+        return read(jaxpr.outvars)
 
     def known(self, value, dtype):
         """A number or an array that is known beforehand."""
@@ -138,10 +139,15 @@ class Emitter:
 
     def _number(self, operation: Callable, equation, inputs: list):
         """As `_place`, of single numbers, which most are: thousands in a program."""
-        depth = max([self._depths.get(id(x), 0) for x in inputs], default=0)
-        result = self._in_loops(depth, equation, lambda: operation(self, equation, *inputs))
-        if not any(result is x for x in inputs):
-            self.remember([result], depth)
+        depth = 0
+        for x in inputs:
+            depth = max(depth, getattr(x, "depth", None) or 0)
+        if depth == len(self.before):
+            result = operation(self, equation, *inputs)
+        else:
+            result = self._in_loops(depth, equation, lambda: operation(self, equation, *inputs))
+        if id(result) not in map(id, inputs):
+            remember((result,), depth)
         return result
 
     def _place(self, equation, inputs: list, active) -> list:
@@ -151,10 +157,10 @@ class Emitter:
             return self._apply(equation, inputs, active)
         if is_compound(name):
             return self.run(written(name, [x.aval for x in equation.invars], equation.params), inputs, active)
-        depth = max((_depth_of(x, self._depths) for x in inputs), default=0)
+        depth = max(map(_depth_of, inputs), default=0)
         results = self._in_loops(depth, equation, lambda: self._apply(equation, inputs, active))
         given = set(map(id, _loose(inputs)))  # what is passed on is not made here
-        self.remember([value for value in _loose(results) if id(value) not in given], depth)
+        remember([value for value in _loose(results) if id(value) not in given], depth)
         return results
 
     def _in_loops(self, depth: int, equation, write: Callable):
@@ -165,13 +171,6 @@ class Emitter:
             raise Unsupported(f"{equation.primitive.name} of what another loop makes")
         with self.b.goto_block(self.before[depth]):
             return write()
-
-    def remember(self, values: list, depth: int) -> None:
-        """That values are made anew in so many of the loops that are being written, at most: those at their end."""
-        for value in values:
-            if not isinstance(value, ir.Constant):  # which many share, and nothing makes
-                self._alive.append(value)
-                self._depths[id(value)] = min(depth, self._depths.get(id(value), depth))
 
     def _apply(self, equation, inputs: list, active) -> list:
         name, parameters = equation.primitive.name, equation.params
@@ -207,7 +206,7 @@ class Emitter:
         phis = [self.b.phi(x.type) for x in firsts]
         state = like(carry, phis)
         self.before.append(before)
-        self.remember(phis, len(self.before))
+        remember(phis, len(self.before))
         (going,) = self.run(parameters["cond_jaxpr"], [*of_cond, *state], active)
         going = self.b.and_(going, active)
         goes = self.any(going)
@@ -223,7 +222,7 @@ class Emitter:
         self.b.branch(head)
         self.b.position_at_end(after)
         self.before.pop()
-        self.remember(phis, len(self.before))  # they change no more
+        remember(phis, len(self.before))  # they change no more
         return state, going
 
     def _branch(self, branches, inputs: list, active) -> list:
@@ -257,17 +256,25 @@ class Emitter:
         for phi, new, old in zip(joined, chosen, others):
             phi.add_incoming(new, end)
             phi.add_incoming(old, before)
-        self.remember(joined, len(self.before))
+        remember(joined, len(self.before))
         return like(results, joined)
 
 
-def _depth_of(value, depths: dict) -> int:
-    """In how many loops a value is made anew; `depths`: of single vectors, by their identity."""
+def remember(values: Sequence, depth: int) -> None:
+    """That values are made anew in so many of the loops that are being written, at most: those at their end."""
+    for value in values:
+        if not isinstance(value, ir.Constant):  # which many share, and nothing makes
+            known = getattr(value, "depth", None)
+            value.depth = depth if known is None else min(depth, known)
+
+
+def _depth_of(value) -> int:
+    """In how many loops a value is made anew."""
     if isinstance(value, np.ndarray):
-        return max((_depth_of(x, depths) for x in value.flat), default=0)
+        return max(map(_depth_of, value.flat), default=0)
     if isinstance(value, Memory):
-        return max((_depth_of(x, depths) for x in value.starts or ()), default=0)
-    return depths.get(id(value), 0)
+        return max(map(_depth_of, value.starts or ()), default=0)
+    return getattr(value, "depth", None) or 0
 
 
 def _total(e: Emitter, equation, array: np.ndarray):
@@ -324,7 +331,7 @@ def is_known(equation) -> bool:
             return math.prod(shape) <= (SMALL if len(shape) == 1 else SMALL**2)
         if name in OF_FEW and name != "dynamic_slice":
             return is_one_place(equation) and all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
-        return name in OPERATIONS | MOVES | OF_FEW or is_compound(name)
+        return name in OPERATIONS or name in MOVES or name in OF_FEW or is_compound(name)
     programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
     return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
 

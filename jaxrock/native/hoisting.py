@@ -60,9 +60,11 @@ class _Around:
         return made, [names[v] for v in made]
 
 
-def _has_any(jaxpr, constant: set, is_left: Callable) -> bool:
-    """Whether there is anything to hoist."""
-    constant = constant | _same(jaxpr, constant)[1]
+def _has_any(jaxpr, constant: set, is_left: Callable, inside: bool = False) -> bool:
+    """Whether there is anything to hoist: of what is within a program, or of all, if it is `inside` another."""
+    same, constant = _same(jaxpr, constant)
+    if inside and any(map(is_left, same)):
+        return True
     for equation in jaxpr.eqns:
         inner = []
         if equation.primitive.name == "while":
@@ -71,7 +73,7 @@ def _has_any(jaxpr, constant: set, is_left: Callable) -> bool:
         if equation.primitive.name == "cond" and constant:
             branches = equation.params["branches"]
             inner = [(x.jaxpr, _variables(x, _places(equation, constant))) for x in branches]
-        if any(_to_hoist(x, same, is_left) or _has_any(x, same, is_left) for x, same in inner):
+        if any(_has_any(x, known, is_left, True) for x, known in inner):
             return True
     return False
 

@@ -13,7 +13,7 @@ from jax.extend.core import Literal
 from llvmlite import ir
 
 from jaxrock.native.builder import Builder
-from jaxrock.native.emitter import SMALL, Emitter, flat, like
+from jaxrock.native.emitter import SMALL, Emitter, flat, like, remember
 from jaxrock.native.lists import Memory, boxed, unboxed
 from jaxrock.native.operations import Unsupported
 
@@ -229,7 +229,7 @@ class Refilled:
 
     def _take(self, room):
         value = self.f.load(room, _I64(0))
-        self.e.remember([value], 1)
+        remember([value], 1)
         return value
 
     def _like(self, variable):
@@ -256,7 +256,7 @@ class Refilled:
     def _starts(self, take: Callable, size: int) -> list:
         scene = take(self.scene)
         starts = [self.b.mul(self.e.lane(scene, i), _I64(size)) for i in range(self.e.lanes)]
-        self.e.remember(starts, 1)
+        remember(starts, 1)
         return starts
 
     def _clear(self, lane) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from jaxrock.native.emitter import Emitter, flat, like
+from jaxrock.native.emitter import Emitter, flat, like, remember
 from jaxrock.native.kernels import Frame, Refilled
 from jaxrock.native.partition import part_of
 
@@ -201,7 +201,7 @@ class _Parted(Refilled):
 
         def take(room):
             value = f.load(room, first)
-            e.remember([value], 1)
+            remember([value], 1)
             return value
 
         active, waiting, consts = take(self.active), take(self.waiting), self._consts(take)
@@ -227,7 +227,7 @@ class _Parted(Refilled):
         phis, turns = [b.phi(x.type) for x in firsts], b.phi(_I64)
         state = like(carry, phis)
         e.before.append(before)
-        e.remember(phis, len(e.before))
+        remember(phis, len(e.before))
         of_condition, of_body = self._operands(consts, state)
         (going,) = e.run(self.equation.params["cond_jaxpr"], of_condition, active)
         going = b.and_(going, active)
@@ -307,7 +307,7 @@ class _Parted(Refilled):
 
         def take(room):
             value = f.as_flag(room, e.gather([b.load(b.gep(room, [slot])) for slot in froms]))
-            e.remember([value], 1)
+            remember([value], 1)
             return value
 
         consts, carry = self._consts(take), self._state(take)

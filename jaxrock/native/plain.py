@@ -45,16 +45,19 @@ def _traced(run: Callable, program: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(needed, traced.consts)
 
 
-def is_foreign(equation) -> bool:
+@functools.cache
+def is_foreign(primitive) -> bool:
     """Whether an operation is another library's, written in Python."""
-    rule = getattr(equation.primitive, "impl", None)
+    rule = getattr(primitive, "impl", None)
     module = getattr(getattr(rule, "func", rule), "__module__", None) or "jax"
     return module.partition(".")[0] not in ("jax", "jaxlib", "jaxrock")
 
 
 def has_foreign(jaxpr) -> bool:
     """Whether a program holds an operation of another library."""
-    return any(is_foreign(equation) or any(map(has_foreign, programs_of(equation))) for equation in jaxpr.eqns)
+    return any(
+        is_foreign(equation.primitive) or any(map(has_foreign, programs_of(equation))) for equation in jaxpr.eqns
+    )
 
 
 def _like(aval) -> jax.ShapeDtypeStruct:
@@ -112,7 +115,7 @@ class _Run:
         found = _computed(equation, given)
         if found is not None:
             return found
-        if is_foreign(equation):
+        if is_foreign(equation.primitive):
             return self.of(_written_out(equation), given)
         return self._bound(equation, given)
 

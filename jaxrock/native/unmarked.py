@@ -3,7 +3,7 @@
 One such operation may mark many values at once, of which some stay the same in a loop and others do not.
 """
 
-from collections.abc import Sequence
+from operator import is_
 from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal
@@ -28,8 +28,10 @@ def _without(jaxpr) -> Any:
         if equation.primitive.name in _MARKS:
             names.update(zip(equation.outvars, given))  # what tells of a mark comes after the value
         else:
-            inner = {key: _inside(value) for key, value in equation.params.items()}
-            equations.append(equation.replace(invars=given, params=inner))
+            inner = {key: new for key, old in equation.params.items() if (new := _inside(old)) is not old}
+            if inner or not all(map(is_, given, equation.invars)):
+                equation = equation.replace(invars=given, params=equation.params | inner)
+            equations.append(equation)
     return jaxpr.replace(eqns=equations, outvars=[read(x) for x in jaxpr.outvars])
 
 
@@ -39,6 +41,6 @@ def _inside(value: Any) -> Any:
         return unmarked(value)
     if hasattr(value, "eqns"):
         return _without(value)
-    if isinstance(value, Sequence) and any(isinstance(x, ClosedJaxpr) for x in value):
+    if isinstance(value, (tuple, list)) and any(isinstance(x, ClosedJaxpr) for x in value):
         return tuple(map(_inside, value))
     return value
