@@ -1,6 +1,9 @@
 """Recipes: those that are alike are one, what is made of them stays longer than their programs, and scenes that a
 quick program postpones to a careful one are collected, computed, and put back in their places."""
 
+import gc
+import threading
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,3 +113,48 @@ def test_their_derivatives_do_too():
     function = jax.vmap(jax.grad(lambda x: _one((x, 0.5))[0]))
     x = np.linspace(0, 2, 100)
     np.testing.assert_allclose(function(x), 2 * x, rtol=1e-15)
+
+
+def _deep(levels):
+    for _ in range(100):
+        _shallow()
+    if levels:
+        _deep(levels - 1)
+
+
+def _shallow():
+    pass
+
+
+def test_frames_have_room_while_a_recipe_is_traced():
+    """Else memory is asked for, and touched anew, at every call across the end of a piece: the system counts that."""
+    resource = pytest.importorskip("resource")
+    number = [jax.ShapeDtypeStruct((), float)]
+    found = []
+
+    def count(levels=300):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        _deep(levels)
+        found.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+
+    def traced(leaves):
+        count()
+        return leaves
+
+    def in_a_thread(run):  # whose frames begin in a small piece, unlike those of a test
+        thread = threading.Thread(target=run)
+        thread.start()
+        thread.join()
+
+    in_a_thread(count)
+    in_a_thread(lambda: Recipe(traced, jax.tree.structure(number), number).program)
+    bare, roomy = found
+    assert roomy < 50 < bare
+
+
+def test_the_collector_rests_while_a_recipe_is_traced():
+    number, found = [jax.ShapeDtypeStruct((), float)], []
+    recipe = Recipe(lambda leaves: found.append(gc.isenabled()) or leaves, jax.tree.structure(number), number)
+    before = gc.isenabled()
+    assert recipe.program is not None and found == [False]
+    assert gc.isenabled() == before
