@@ -47,7 +47,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads t
 
 def pytest_configure(config):
     """Get ready to run tests; what only deals them out to others needs nothing of that."""
-    if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
+    if config.getoption("tx", None) and config.getoption("dist") != "no" and not config.option.collectonly:
         return
     importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
     # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
@@ -113,7 +113,8 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item, nextitem):
-    """As pytest does it, with room for the frames of all that a test calls."""
+    """As pytest does it, with room for the frames of all that a test calls. Plugins that run tests in another way
+    (again, if they fail) are not asked."""
     return importlib.import_module("jaxrock._undisturbed").with_room(protocol, item, nextitem)
 
 

@@ -911,6 +911,17 @@ def test_a_record_of_one_sample_beside_a_longer_one(caplog):
     assert "left to XLA" not in caplog.text
 
 
+WHOLE = ir.IntType(64)
+
+
+def in_memory(b, x, **settings):
+    """Where a value is put."""
+    rooms = b.alloca(x.type, 4)
+    place = b.gep(rooms, [WHOLE(2)], **settings)
+    b.store(x, place)
+    return place
+
+
 # Name: instructions of real numbers x and y, whole numbers m and n, flags f and g.
 INSTRUCTIONS = {
     "sum": lambda b, x, y, m, n, f, g: b.fadd(x, y, flags=("contract",)),
@@ -926,7 +937,15 @@ INSTRUCTIONS = {
     "other": lambda b, x, y, m, n, f, g: b.fcmp_unordered("!=", x, y),
     "no number": lambda b, x, y, m, n, f, g: b.fcmp_unordered("uno", x, x),
     "known": lambda b, x, y, m, n, f, g: b.fcmp_ordered("ord", x, y, flags=("nnan",)),
-    "beside llvmlite's": lambda b, x, y, m, n, f, g: b.icmp_signed("<", b.neg(b.xor(m, n)), b.add(b.or_(m, n), m)),
+    "whole sum": lambda b, x, y, m, n, f, g: b.add(m, n, flags=("nsw",)),
+    "whole difference": lambda b, x, y, m, n, f, g: b.sub(m, n),
+    "whole product": lambda b, x, y, m, n, f, g: b.mul(m, ir.Constant(m.type, 3 if m.type == WHOLE else [3] * 8)),
+    "whole less": lambda b, x, y, m, n, f, g: b.icmp_signed("<", b.neg(m), n),
+    "as if above 0": lambda b, x, y, m, n, f, g: b.icmp_unsigned(">=", m, n),
+    "same": lambda b, x, y, m, n, f, g: b.and_(b.icmp_signed("==", m, n), b.icmp_unsigned("!=", f, g)),
+    "beside llvmlite's": lambda b, x, y, m, n, f, g: b.add(b.shl(b.xor(m, n), m), b.ashr(b.or_(m, n), n)),
+    "in memory": lambda b, x, y, m, n, f, g: b.load(in_memory(b, x), align=1),
+    "in a structure": lambda b, x, y, m, n, f, g: b.load(in_memory(b, x, inbounds=True)),
 }
 
 
@@ -955,12 +974,23 @@ def test_instructions_are_those_of_llvmlite(write, lanes):
     assert written_by(Builder, write, lanes) == written_by(ir.IRBuilder, write, lanes)
 
 
-@pytest.mark.parametrize("name", ["fmul", "select", "fcmp_ordered"])
+def test_lanes_are_those_of_llvmlite():
+    def exchanged(b, x, y, m, n, f, g):
+        return b.insert_element(x, b.extract_element(y, ir.IntType(32)(1)), ir.IntType(32)(2))
+
+    assert written_by(Builder, exchanged, 8) == written_by(ir.IRBuilder, exchanged, 8)
+    with pytest.raises(ValueError, match="must be of its type, but is of i64"):
+        written_by(Builder, lambda b, x, y, m, n, f, g: b.insert_element(x, WHOLE(1), WHOLE(0)), 8)
+    with pytest.raises(KeyError):
+        written_by(Builder, lambda b, x, y, m, n, f, g: b.icmp_signed("ord", m, n), 8)
+
+
+@pytest.mark.parametrize("name", ["fmul", "mul", "select", "fcmp_ordered", "icmp_signed"])
 def test_operands_are_of_one_type(name):
     """As llvmlite, and not only when LLVM reads it: that would leave the program to XLA."""
     kinds = [ir.IntType(1), ir.DoubleType(), ir.FloatType()]
     function = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), kinds), "f")
     flag, x, y = function.args
-    more = {"fmul": (), "select": (flag,), "fcmp_ordered": ("<",)}[name]
+    more = {"fmul": (), "mul": (), "select": (flag,)}.get(name, ("<",))
     with pytest.raises(ValueError, match="must be of one type, but are"):
         getattr(Builder(function.append_basic_block()), name)(*more, x, y)

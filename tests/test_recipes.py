@@ -129,13 +129,14 @@ def _shallow():
 def test_frames_have_room_while_a_recipe_is_traced():
     """Else memory is asked for, and touched anew, at every call across the end of a piece: the system counts that."""
     resource = pytest.importorskip("resource")
+    whose = getattr(resource, "RUSAGE_THREAD", resource.RUSAGE_SELF)
     number = [jax.ShapeDtypeStruct((), float)]
     found = []
 
     def count(levels=300):
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        before = resource.getrusage(whose).ru_minflt
         _deep(levels)
-        found.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+        found.append(resource.getrusage(whose).ru_minflt - before)
 
     def traced(leaves):
         count()
@@ -149,7 +150,9 @@ def test_frames_have_room_while_a_recipe_is_traced():
     in_a_thread(count)
     in_a_thread(lambda: Recipe(traced, jax.tree.structure(number), number).program)
     bare, roomy = found
-    assert roomy < 50 < bare
+    assert roomy < 50
+    if bare < 50:
+        pytest.skip("this Python keeps a piece that it has left (gh-142183)")
 
 
 def test_the_collector_rests_while_a_recipe_is_traced():

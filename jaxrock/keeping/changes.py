@@ -26,14 +26,16 @@ class _Space(NamedTuple):
     names: Mapping[str, Any]  # now
     before: dict[str, Any]
     many: int  # how many names there were
-    functions: list[types.FunctionType]  # that it names, those within what wraps them, too
+    named: list[str]  # names of functions, and of what wraps them
+    functions: list[types.FunctionType]  # these
     codes: list[types.CodeType]  # of these
 
     @classmethod
     def at(cls, of: str, names: Mapping[str, Any]) -> "_Space":
         before = {name: value for name, value in list(names.items()) if not name.startswith("__") or _function(value)}
-        functions = [function for value in before.values() if (function := _function(value)) is not None]
-        return cls(of, names, before, len(names), functions, list(map(_CODE, functions)))
+        found = {name: function for name, value in before.items() if (function := _function(value)) is not None}
+        functions = list(found.values())
+        return cls(of, names, before, len(names), list(found), functions, list(map(_CODE, functions)))
 
     def stays(self) -> bool:
         """Whether nothing differs now. It is asked of ten thousand names whenever a program is called: within `map`."""
@@ -47,8 +49,8 @@ class _Space(NamedTuple):
         """What differs now; a name that is new matters if it stands for a function, which may hide one of a base."""
         names, before = self.names, self.before
         found = [name for name, value in before.items() if names.get(name, self) is not value]
-        patched = {x for x, code in zip(self.functions, self.codes) if x.__code__ is not code}
-        found += [name for name, value in before.items() if _function(value) in patched]
+        functions = zip(self.named, self.functions, self.codes)
+        found += [name for name, function, code in functions if function.__code__ is not code]
         if len(names) != self.many:
             found += [name for name in names.keys() - before.keys() if _function(names[name])]
         return [f"{self.of}.{name} {_digest(names.get(name, self))}" for name in found]

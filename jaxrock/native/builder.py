@@ -4,12 +4,14 @@ Most of a program is arithmetic, comparisons, choices, and numbers looked up. ll
 object with its operands, looks for a name that no other has, and writes it in the end.
 """
 
+import functools
+
 from llvmlite import ir
 
 _SIGNS = {">": "gt", "<": "lt", "==": "eq", "!=": "ne", ">=": "ge", "<=": "le"}
 _EQUAL = {"==", "!="}
 _FLAG = ir.IntType(1)
-_FLAGS = {lanes: ir.VectorType(_FLAG, lanes) for lanes in (1, 2, 4, 8, 16, 32, 64)}
+_flags = functools.cache(functools.partial(ir.VectorType, _FLAG))  # for so many lanes
 
 
 class Line:
@@ -100,21 +102,20 @@ class Builder(ir.IRBuilder):
         return self._add(kind.pointee, f"load {kind.pointee}, {kind} {ptr.get_reference()}{aligned}")
 
     def fcmp_ordered(self, sign: str, x, y, name: str = "", flags: tuple[str, ...] = ()):
-        return self._compared(" ".join(("fcmp", *flags)), "o", sign, x, y)
+        return self._compared(("fcmp", *flags), "o" + _SIGNS[sign] if sign in _SIGNS else sign, x, y)
 
     def fcmp_unordered(self, sign: str, x, y, name: str = "", flags: tuple[str, ...] = ()):
-        return self._compared(" ".join(("fcmp", *flags)), "u", sign, x, y)
+        return self._compared(("fcmp", *flags), "u" + _SIGNS[sign] if sign in _SIGNS else sign, x, y)
 
     def icmp_signed(self, sign: str, x, y, name: str = ""):
-        return self._compared("icmp", "" if sign in _EQUAL else "s", sign, x, y)
+        return self._compared(("icmp",), ("" if sign in _EQUAL else "s") + _SIGNS[sign], x, y)
 
     def icmp_unsigned(self, sign: str, x, y, name: str = ""):
-        return self._compared("icmp", "" if sign in _EQUAL else "u", sign, x, y)
+        return self._compared(("icmp",), ("" if sign in _EQUAL else "u") + _SIGNS[sign], x, y)
 
-    def _compared(self, words: str, order: str, sign: str, x, y):
-        kind = x.type
-        flags = _FLAGS[kind.count] if isinstance(kind, ir.VectorType) else _FLAG
-        return self._operation(flags, f"{words} {order + _SIGNS[sign] if sign in _SIGNS else sign}", x, y)
+    def _compared(self, words: tuple[str, ...], sign: str, x, y):
+        kind = _FLAG if not isinstance(x.type, ir.VectorType) else _flags(x.type.count)
+        return self._operation(kind, " ".join((*words, sign)), x, y)
 
     def position_before(self, instruction):
         """Where that is the last of its block, as it is wherever this is asked for, it need not be looked for."""
