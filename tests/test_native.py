@@ -911,13 +911,13 @@ def test_a_record_of_one_sample_beside_a_longer_one(caplog):
     assert "left to XLA" not in caplog.text
 
 
-WHOLE = ir.IntType(64)
+_I64 = ir.IntType(64)
 
 
 def in_memory(b, x, **settings):
     """Where a value is put."""
     rooms = b.alloca(x.type, 4)
-    place = b.gep(rooms, [WHOLE(2)], **settings)
+    place = b.gep(rooms, [_I64(2)], **settings)
     b.store(x, place)
     return place
 
@@ -939,7 +939,7 @@ INSTRUCTIONS = {
     "known": lambda b, x, y, m, n, f, g: b.fcmp_ordered("ord", x, y, flags=("nnan",)),
     "whole sum": lambda b, x, y, m, n, f, g: b.add(m, n, flags=("nsw",)),
     "whole difference": lambda b, x, y, m, n, f, g: b.sub(m, n),
-    "whole product": lambda b, x, y, m, n, f, g: b.mul(m, ir.Constant(m.type, 3 if m.type == WHOLE else [3] * 8)),
+    "whole product": lambda b, x, y, m, n, f, g: b.mul(m, ir.Constant(m.type, 3 if m.type == _I64 else [3] * 8)),
     "whole less": lambda b, x, y, m, n, f, g: b.icmp_signed("<", b.neg(m), n),
     "as if above 0": lambda b, x, y, m, n, f, g: b.icmp_unsigned(">=", m, n),
     "same": lambda b, x, y, m, n, f, g: b.and_(b.icmp_signed("==", m, n), b.icmp_unsigned("!=", f, g)),
@@ -980,7 +980,7 @@ def test_lanes_are_those_of_llvmlite():
 
     assert written_by(Builder, exchanged, 8) == written_by(ir.IRBuilder, exchanged, 8)
     with pytest.raises(ValueError, match="must be of its type, but is of i64"):
-        written_by(Builder, lambda b, x, y, m, n, f, g: b.insert_element(x, WHOLE(1), WHOLE(0)), 8)
+        written_by(Builder, lambda b, x, y, m, n, f, g: b.insert_element(x, _I64(1), _I64(0)), 8)
     with pytest.raises(KeyError):
         written_by(Builder, lambda b, x, y, m, n, f, g: b.icmp_signed("ord", m, n), 8)
 
