@@ -1,4 +1,4 @@
-"""What Python does by the way, kept away where programs are traced: it takes a third of the time, and more."""
+"""What Python does by the way, kept away where programs are traced: its collector, and memory for its frames."""
 
 import contextlib
 import functools
@@ -51,7 +51,7 @@ def with_room(function, /, *args, **kwargs):
     return across the end of a piece (until 2026, gh-142183). Where a loop stands next to one, that is done at every
     turn, ten thousand times before a first answer. A frame that asks for much gets a piece with as much room again; it
     asks by the size of its own stack, of which nothing is touched, so that the room takes no memory before it is used.
-    Within another that has less left it gets a piece of its own.
+    Within another that has less left it gets a piece of its own. What it is worth: `benchmarks/frames.py`.
     """
     return function(*args, **kwargs)
 

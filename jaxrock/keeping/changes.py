@@ -38,7 +38,7 @@ class _Space(NamedTuple):
         return cls(of, names, before, len(names), list(found), functions, list(map(_CODE, functions)))
 
     def stays(self) -> bool:
-        """Whether nothing differs now. It is asked of ten thousand names whenever a program is called: within `map`."""
+        """Whether nothing differs now. It is asked of ten thousand names where a scene is traced, so by `map` alone."""
         return (
             len(self.names) == self.many
             and all(map(is_, map(self.names.get, self.before, repeat(self)), self.before.values()))

@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
+from jaxrock._programs import programs_of
 from jaxrock.native.arrays import OF_FEW, is_one_place
 from jaxrock.native.in_numpy import MOVES
 from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
@@ -332,9 +333,4 @@ def is_known(equation) -> bool:
         if name in OF_FEW and name != "dynamic_slice":
             return is_one_place(equation) and all(math.prod(x.aval.shape) <= SMALL**2 for x in equation.invars)
         return name in OPERATIONS or name in MOVES or name in OF_FEW or is_compound(name)
-    programs = [getattr(p, "jaxpr", p) for value in equation.params.values() for p in _listed(value)]
-    return all(is_known(inner) for program in programs for inner in getattr(program, "eqns", ()))
-
-
-def _listed(value) -> tuple | list:
-    return value if isinstance(value, (tuple, list)) else (value,)
+    return all(is_known(inner) for program in programs_of(equation) for inner in program.eqns)
