@@ -121,14 +121,17 @@ def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
 _STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
 
 
-def states_of(stepper: Any, state: PyTree, budget: int) -> tuple[PyTree, PyTree]:
-    """Follow a block to the end, or for so many steps: the last state, and every state by its number of steps; after
-    the last it may stand again, or zeros."""
+def states_of(
+    stepper: Any, state: PyTree, budget: int | Int[Array, ""], room: int | None = None
+) -> tuple[PyTree, PyTree]:
+    """Follow a block to the end, or until it has taken so many steps: the last state, and every state by the number of
+    steps from the first; after the last it may stand again, or zeros. `room`: for so many steps, if not the budget."""
     engine = stepper.engine
     if not engine.in_lanes:
         return followed(stepper.advance, state, budget, engine.loop)
     many = differentiable(_stride_of, name="stride", results=_rows, in_lanes=True, derivatives="in a direction")
-    return _in_strides(lambda s: many((stepper, s, jnp.int32(budget))), state, budget, engine.loop, _STRIDE)
+    most = -(-(budget if room is None else room) // _STRIDE)
+    return _in_strides(lambda s: many((stepper, s, jnp.int32(budget))), state, budget, engine.loop, _STRIDE, most)
 
 
 def _stride_of(given) -> tuple[PyTree, PyTree]:
@@ -152,12 +155,12 @@ def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> t
 
     `loop(unfinished, step, carry, budget)` repeats.
     """
-    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, 1)
+    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, 1, budget)
 
 
-def _in_strides(stride: Callable, state: PyTree, budget: int, loop: Callable, length: int) -> tuple[PyTree, PyTree]:
-    most = -(-budget // length)
-
+def _in_strides(
+    stride: Callable, state: PyTree, budget: int | Int[Array, ""], loop: Callable, length: int, most: int
+) -> tuple[PyTree, PyTree]:
     def step(carry):
         turn, state, nodes = carry
         state, rows = stride(state)

@@ -164,7 +164,10 @@ class TaylorStepper(AbstractStepper):
         start = visits, state.opening, state.velocity, moving, state.peak
         if self.taped:
             # In reverse mode what is not taken (roots of zero) would spoil what is.
-            stage = differentiable(lambda start: free_stage(*start, falls_flat=scene.falls_flat))(start)
+            name = "free stage, to pi/2" if scene.falls_flat else "free stage"
+            stage = differentiable(
+                lambda start: free_stage(*start, falls_flat=scene.falls_flat), name=name, in_lanes=True
+            )(start)
         else:
             none = FreeStage.none(state.opening)
             stage = jax.lax.cond(moving, lambda: free_stage(*start, falls_flat=scene.falls_flat), lambda: none)

@@ -5,7 +5,6 @@ after it, by where it was, by what the step is told of the ground, and by the nu
 computed for many steps at once; changes go from step to step by products with them, and such a chain transposes.
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
 from jaxrock.transforms.differentiation import differentiable
-from jaxrock.transforms.forward_mode import columns_of, directions_of, in_rows
+from jaxrock.transforms.forward_mode import directions_of, in_rows
 from jaxrock.transforms.scenes import AT_ONCE
 
 Scalar = Inexact[Array, ""]
@@ -88,25 +87,33 @@ class _Slopes(NamedTuple):
 
 
 def end_on_tape(stepper: Stepper, state: State) -> State:
-    """Follow a block: the last state, as that of `on_tape`."""
+    """Follow a block: the last state, as that of `on_tape`.
+
+    Steps of outcomes may be many more than those of histories: room for all would take most blocks ten times as long
+    as all else. They are followed as often as it takes, with room for a history at a time.
+    """
     engine, scene = stepper.engine, stepper.scene
     most, usual = (engine.budget(scene, history) for history in (False, True))
-    last, _ = on_tape(stepper, state, min(usual, most))
     if most <= usual:
-        return last
-    # Steps of outcomes may be many more than those of histories: room for so many would take most blocks ten times as
-    # long as all else.
-    longer = jax.checkpoint(lambda stepper, state: on_tape(stepper, state, most)[0])
-    return jax.lax.cond(last.done, lambda: last, lambda: longer(stepper, state))
+        return on_tape(stepper, state, most)[0]
+
+    def further(state, limit):
+        followed = jax.checkpoint(lambda stepper, state: on_tape(stepper, state, limit, usual)[0])
+        return jax.lax.cond(state.done, lambda: state, lambda: followed(stepper, state)), None
+
+    return jax.lax.scan(further, state, jnp.minimum(usual * (1 + jnp.arange(-(-most // usual))), most))[0]
 
 
-def on_tape(stepper: Stepper, state: State, budget: int) -> tuple[State, State]:
+def on_tape(
+    stepper: Stepper, state: State, budget: int | Int[Array, ""], room: int | None = None
+) -> tuple[State, State]:
     """Follow a block: the last state, and those before every step, as `states_of` tells them; with derivatives of which
     reverse mode takes the product with very many numbers."""
     still, start = fixed((replace(stepper, taped=False), state))
-    last, nodes = fixed(states_of(still, start, budget))
+    stretches = -(-(budget if room is None else room) // _TOGETHER)
+    last, nodes = fixed(states_of(still, start, budget, stretches * _TOGETHER))
     ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
-    by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps
+    by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps - start.steps
     ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
     return _with_reals(last, ends), _with_reals(nodes, starts)
 
@@ -121,37 +128,40 @@ def _with_reals(states: State, reals: list) -> State:
 
 def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
     """Changes of the last state, and of those before every step: along the steps, by products with their slopes."""
-    (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
+    (_, reals), (_, (numbers, ground), still, nodes, steps), (first, told, *_) = values, by, changes
     first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
-    moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, d_told)
-    rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, d_told)
-    directions = jax.tree.map(lambda d: None if is_zero(d) else d, d_told, is_leaf=is_zero)
-    # Of what a step is told: the numbers that all share, and what is told of the ground there.
-    shared, own = zip(moving, rest, directions)
+    numbers, by_numbers = _parted(numbers, told[0], ())
+    ground, by_ground = _parted(ground, told[1], nodes.steps.shape)
+    nodes = _with_reals(nodes, reals)
+    starts = jnp.arange(0, nodes.steps.size - 1, _TOGETHER)
 
     @jax.checkpoint
     def stretch(change, rows):
-        number, node, own = rows
+        start, by_ground = rows
 
         def go(change):
-            products = jax.vmap(lambda node, own: _products(still, node, zip(shared, own)))(node, own)
-            return jax.lax.scan(_one, change, (number < steps, *products))
+            # (As rows of the loop all of them would be copied first.)
+            here = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, _TOGETHER), (nodes, ground))
+            products = jax.vmap(lambda node, ground, by: _products(still, node, numbers, ground, by_numbers, by))
+            going = start + jnp.arange(_TOGETHER) < steps
+            return jax.lax.scan(_one, change, (going, *products(*here, by_ground)))
 
         def wait(change):
             return change, jnp.broadcast_to(change, (_TOGETHER, *change.shape))
 
-        return jax.lax.cond(number[0] < steps, go, wait, change)
+        return jax.lax.cond(start < steps, go, wait, change)
 
-    rows = jnp.arange(nodes.steps.size), _with_reals(nodes, reals), own
-    last, found = jax.lax.scan(stretch, first, jax.tree.map(_in_stretches, rows))
-    return list(last), list(found.reshape(-1, first.size)[: nodes.steps.size].T)
+    by_ground = by_ground[:-1].reshape(starts.size, _TOGETHER, -1)
+    last, found = jax.lax.scan(stretch, first, (starts, by_ground))
+    return list(last), list(jnp.concatenate([found.reshape(-1, first.size), last[None]]).T)
 
 
-def _in_stretches(x: Array) -> Array:
-    """Rows of many steps, the last again and again where there is room for more."""
-    stretches = -(-x.shape[0] // _TOGETHER)
-    more = jnp.broadcast_to(x[-1:], (stretches * _TOGETHER - x.shape[0], *x.shape[1:]))
-    return jnp.concatenate([x, more]).reshape(stretches, _TOGETHER, *x.shape[1:])
+def _parted(told: Any, changes: Any, axes: tuple) -> tuple[tuple, Array]:
+    """What moves of what steps are told, and the rest; and the changes of the former in a row, behind `axes`."""
+    moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, changes)
+    rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, changes)
+    rows = [d.reshape(*axes, -1) for d in jax.tree.leaves(changes, is_leaf=is_zero) if not is_zero(d)]
+    return (moving, rest), jnp.concatenate([jnp.zeros((*axes, 0)), *rows], axis=-1)
 
 
 def _one(change: Array, step: tuple) -> tuple[Array, Array]:
@@ -164,27 +174,17 @@ def _one(change: Array, step: tuple) -> tuple[Array, Array]:
     return jnp.where(going, after, change), change
 
 
-def _products(still: Stepper, node: State, told: Iterable) -> tuple:
+def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array) -> tuple:
     """Of a step: slopes by the path, of what is seen by itself, and the change by all else that moves."""
-    moving, rest, changes = told
+    moving, rest = zip(numbers, ground)
     leaves = [*_path_of(node), *jax.tree.leaves(moving)]
     slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
     rows = in_rows(directions_of(leaves), AT_ONCE)
     found, kept, passed = jax.vmap(lambda *row: slopes((still, rest, moving, node, row)))(*rows)
-    count = sum(x.size for x in leaves)
-    columns = [columns_of(node.local, each.reshape(-1)[:count], leaves) or [] for each in found]
-    by_path = jnp.array([each[: len(_PATH)] for each in columns])
-
-    def change(each):
-        pairs = zip(each[len(_PATH) :], jax.tree.leaves(changes), strict=True)
-        return sum((jnp.tensordot(column, d, axes=d.ndim) for column, d in pairs), start=jnp.zeros_like(node.local))
-
-    return (
-        by_path,
-        jnp.array([x[0] for x in kept]),
-        jnp.array([x[0] for x in passed]),
-        jnp.array([*map(change, columns)]),
-    )
+    columns = jnp.stack(found).reshape(len(found), -1)[:, : sum(x.size for x in leaves)]
+    by_path, by_told = columns[:, : len(_PATH)], columns[:, len(_PATH) :]
+    change = (by_told * jnp.concatenate([by_numbers, by_ground])).sum(axis=1)
+    return by_path, jnp.stack(kept)[:, 0], jnp.stack(passed)[:, 0], change
 
 
 def _slopes(given_: tuple) -> _Slopes:
