@@ -14,8 +14,8 @@ from jaxrock.transforms.recipe import Recipe
 
 
 def value_and_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
-    """The recipe of (value, Jacobian): for every leaf of the value the derivatives by the leaves that move (a list of
-    arrays, the leaf's shape behind), None for integers."""
+    """The recipe of (value, Jacobian): for every leaf of the value its derivatives by all numbers of the leaves that
+    move, in a leading axis; None for integers."""
     return recipe.derivative(moves, _with_jacobian)
 
 
@@ -36,8 +36,6 @@ def pulled_back(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
 
 
 def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
-    moving = _moving(recipe.like, moves)
-
     def both(leaves):
         directions = directions_of(_moving(leaves, moves))
         if len(directions[0]) == 1:  # arrays of one number would be for nothing
@@ -45,13 +43,12 @@ def _with_jacobian(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
             tangents = [x[None] for x in tangents]
         else:
             value, tangents = pushed(recipe.program, leaves, moves, directions, len(directions[0]))
-        columns = [columns_of(*pair, moving) for pair in zip(value, tangents, strict=True)]
+        columns = [d if _is_real(x) else None for x, d in zip(value, tangents, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(recipe.results), value), columns
 
-    def shapes(out):
-        return [jax.ShapeDtypeStruct((*out.shape, *leaf.shape), out.dtype) for leaf in moving]
-
-    return _made(recipe, moves, both, recipe.like, "jacobian", _with_each(recipe.results, shapes))
+    count = sum(math.prod(leaf.shape) for leaf in _moving(recipe.like, moves))
+    results = _with_each(recipe.results, lambda out: jax.ShapeDtypeStruct((count, *out.shape), out.dtype))
+    return _made(recipe, moves, both, recipe.like, "jacobian", results)
 
 
 def _with_change(recipe: Recipe, moves: tuple[bool, ...]) -> Recipe:
@@ -152,11 +149,3 @@ def in_rows(directions: Sequence, most: int) -> list:
 
     return [cut(x) for x in directions]
 
-
-def columns_of(out: Any, column: Any, moving: Sequence) -> list | None:
-    """Derivatives of a leaf of the value by the moving leaves, in their shapes; `column`: in all directions."""
-    if not _is_real(out):
-        return None
-    cuts = np.cumsum([math.prod(leaf.shape) for leaf in moving])[:-1]
-    parts = jnp.split(column, cuts, axis=0)
-    return [jnp.moveaxis(p, 0, -1).reshape(*out.shape, *leaf.shape) for p, leaf in zip(parts, moving)]

@@ -16,7 +16,6 @@ from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import summed_like, typed_like
 from jaxrock.transforms.forward_mode import (
-    columns_of,
     directions_of,
     in_rows,
     pulled_back,
@@ -135,17 +134,18 @@ def _pushed(leaves, changes, *, recipe, own, size):
     else:
         value, jacobian = _jacobian_at_once(leaves, moves, recipe, own, size)
 
-    def contracted(columns, *moving):
-        return sum(jnp.tensordot(column, d, axes=d.ndim) for column, d in zip(columns, moving))
+    def contracted(jacobian, *moving):
+        change = jnp.concatenate([d.ravel() for d in moving])
 
-    def moved(x, columns):
-        if columns is None:
-            return _unmoved(x)
-        if size is None:
-            return contracted(columns, *moving)
-        return jax.vmap(contracted, in_axes=(0, *axes))(columns, *moving)
+        def along(columns):
+            each = change.reshape(-1, *[1] * (columns.ndim - 1)).astype(columns.dtype)
+            return (columns * each).sum(axis=0)
 
-    return value, [moved(*each) for each in zip(value, jacobian)]
+        return jax.tree.map(along, jacobian)
+
+    if size is not None:
+        contracted = jax.vmap(contracted, in_axes=(0, *axes))
+    return value, [_unmoved(x) if d is None else d for x, d in zip(value, contracted(jacobian, *moving), strict=True)]
 
 
 def _pushed_in_a_direction(leaves, moves, moving, recipe, own, size):
@@ -180,8 +180,8 @@ def _jacobian_by_directions(leaves, moves, recipe, own, size):
         value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
         return jax.tree.leaves(value), changes
 
-    value, changes = jax.vmap(one, out_axes=(None, 0))(*directions_of(moving))
-    return value, [None if d is None else columns_of(x, d, moving) for x, d in zip(value, changes, strict=True)]
+    value, changes = jax.vmap(one, out_axes=(None, 0 if size is None else 1))(*directions_of(moving))
+    return value, changes
 
 
 def _jacobian_in_rows(leaves, moves, recipe, own, size):
@@ -195,17 +195,15 @@ def _jacobian_in_rows(leaves, moves, recipe, own, size):
         value, changes = jax.tree.unflatten(jax.tree.structure(both.results), found)
         return jax.tree.leaves(value), changes
 
-    value, changes = jax.vmap(one, out_axes=(None, 0))(*rows)
+    axes = () if size is None else (size,)
+    value, changes = jax.vmap(one, out_axes=(None, len(axes)))(*rows)
     count = sum(math.prod(x.shape) for x in moving)
 
-    def column(x, d):
-        if d is None:
-            return None
-        if size is not None:  # directions before scenes
-            d = jnp.moveaxis(d, 1, 2)
-        return columns_of(x, d.reshape(-1, *d.shape[2:])[:count], moving)
+    def column(d):
+        whole = d.reshape(*axes, -1, *d.shape[len(axes) + 2 :])
+        return whole[:, :count] if axes else whole[:count]
 
-    return value, [column(*each) for each in zip(value, changes, strict=True)]
+    return value, [None if d is None else column(d) for d in changes]
 
 
 ad.primitive_jvps[scenes_p] = _pushed

@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact, Int
 
 from jaxrock.engines.scene import Here
 from jaxrock.engines.state import State
-from jaxrock.engines.trajectory import states_of
+from jaxrock.engines.trajectory import rows_of, states_of
 from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
@@ -115,7 +115,10 @@ def on_tape(
     ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
     by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps - start.steps
     ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
-    return _with_reals(last, ends), _with_reals(nodes, starts)
+    nodes = _with_reals(nodes, starts)
+    if room is None:  # no more of them than without a tape
+        nodes = jax.tree.map(lambda x: x[: rows_of(stepper.engine, budget)], nodes)
+    return _with_reals(last, ends), nodes
 
 
 def _reals(states: State) -> list:
