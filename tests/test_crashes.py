@@ -180,9 +180,9 @@ def test_files_that_nobody_saved_are_refused(tmp_path, ending):
         rk.studies.Grid.load(path)
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(240, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [30, pytest.param(120, marks=pytest.mark.slow)])
 def test_damaged_at_random(count):
-    """By kept seeds: stores and saved grids, of outcomes; the long one has 144 stores, and had 504 by hand."""
+    """By kept seeds: stores and saved grids, of outcomes; the long one has 72 stores, and had 504 by hand."""
     found = damage.attack(count)
     assert sum(often for (*_, what), often in found.items() if what.startswith("loaded")) == count
 
@@ -386,9 +386,12 @@ def test_an_interrupted_save_leaves_nothing(tmp_path, grid, ending):
 
 
 @pytest.mark.slow  # fast: `test_a_killed_job_goes_on`, and a sweep of outcomes that is interrupted, above
-@pytest.mark.parametrize("number, count, block", [(2, 2, 400), (40, 4, 100)])
+@pytest.mark.parametrize("number, count, block", [(2, 2, 400), (16, 4, 100)])
 def test_killed_at_random(number, count, block):
-    """Processes that share a job, and others that know nothing of each other: every file is as if undisturbed."""
+    """Processes that share a job, and others that know nothing of each other: every file is as if undisturbed.
+
+    By hand 200 were killed.
+    """
     found = kills.attack(number, seed=3, count=count, block=block)
     assert found["kills"] >= number and found["stores compared"] > 0
 
@@ -445,7 +448,7 @@ def test_threads_at_once_answer_as_one_alone(tmp_path):
 
 @pytest.mark.slow
 def test_processes_and_threads_at_once_answer_as_one_alone():
-    found = threads.attack(60.0)
+    found = threads.attack(40.0)
     assert not found["wrong"] and min(found["asked"].values()) > 1 and sum(found["asked"].values()) > 64
 
 

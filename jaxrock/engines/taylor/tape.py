@@ -133,8 +133,8 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
     """Changes of the last state, and of those before every step: along the steps, by products with their slopes."""
     (_, reals), (_, (numbers, ground), still, nodes, steps), (first, told, *_) = values, by, changes
     first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
-    numbers, by_numbers = _parted(numbers, told[0], ())
-    ground, by_ground = _parted(ground, told[1], nodes.steps.shape)
+    numbers, by_numbers = _parted(numbers, told[0], jnp.zeros(0, first.dtype))
+    ground, by_ground = _parted(ground, told[1], jnp.zeros((nodes.steps.size, 0), first.dtype))
     nodes = _with_reals(nodes, reals)
     starts = jnp.arange(0, nodes.steps.size - 1, _TOGETHER)
 
@@ -159,12 +159,12 @@ def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
     return list(last), list(jnp.concatenate([found.reshape(-1, first.size), last[None]]).T)
 
 
-def _parted(told: Any, changes: Any, axes: tuple) -> tuple[tuple, Array]:
-    """What moves of what steps are told, and the rest; and the changes of the former in a row, behind `axes`."""
+def _parted(told: Any, changes: Any, none: Array) -> tuple[tuple, Array]:
+    """What moves of what steps are told, and the rest; and the changes of the former in a row, behind `none`."""
     moving = jax.tree.map(lambda x, d: None if is_zero(d) else x, told, changes)
     rest = jax.tree.map(lambda x, d: x if is_zero(d) else None, told, changes)
-    rows = [d.reshape(*axes, -1) for d in jax.tree.leaves(changes, is_leaf=is_zero) if not is_zero(d)]
-    return (moving, rest), jnp.concatenate([jnp.zeros((*axes, 0)), *rows], axis=-1)
+    known = [d for d in jax.tree.leaves(changes, is_leaf=is_zero) if not is_zero(d)]
+    return (moving, rest), jnp.concatenate([none, *(d.reshape(*none.shape[:-1], -1) for d in known)], axis=-1)
 
 
 def _one(change: Array, step: tuple) -> tuple[Array, Array]:
