@@ -20,6 +20,7 @@ from jaxrock.numerics.given import given
 from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.pushforward import pushed
 
 RNG = np.random.default_rng(7)
 NUMBERS = RNG.uniform(0.1, 1.2, 12)
@@ -128,6 +129,16 @@ def test_it_changes_as_what_it_consists_of(operation, settings, count):
             np.testing.assert_allclose(each, here, rtol=2e-14, atol=1e-14)
         np.testing.assert_allclose(rows[which], np.stack([here, there], axis=1), rtol=2e-14, atol=1e-14)
     np.testing.assert_allclose(second, judge(*numbers)[1], rtol=1e-12, atol=1e-12)
+
+
+@each
+def test_in_single_precision_after_double(operation, settings, count):
+    """Integers are longer there: what was written for one is not taken for the other."""
+    numbers = [np.float32(x) for x in numbers_for(count)]
+    for double in (True, False):
+        with jax.enable_x64(double):
+            program = jax.make_jaxpr(lambda *x: operation(*x, **settings))(*numbers)
+            jax.make_jaxpr(lambda *x, of=program: pushed(of, x, [True] * count, x, None))(*numbers)
 
 
 @each

@@ -17,6 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
+from jaxrock._precision import setting
 from jaxrock._programs import programs_of
 from jaxrock.native.in_numpy import KNOWN, MOVES
 from jaxrock.native.operations import NOTHING, Unsupported
@@ -309,7 +310,7 @@ def _chosen(name: str, parameters: dict, given: list) -> list | None:
 
 
 @functools.lru_cache(maxsize=256)
-def _expanded(primitive, parameters: tuple, shapes: tuple) -> ClosedJaxpr:
+def _expanded(primitive, parameters: tuple, shapes: tuple, double: bool) -> ClosedJaxpr:  # integers follow the precision
     like = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
 
     def run(*given):
@@ -323,6 +324,6 @@ def _written_out(equation) -> ClosedJaxpr:
     """What an operation of another library does, in operations of JAX."""
     shapes = tuple((x.aval.shape, x.aval.dtype) for x in equation.invars)
     try:
-        return _expanded(equation.primitive, tuple(equation.params.items()), shapes)
+        return _expanded(equation.primitive, tuple(equation.params.items()), shapes, setting("jax_enable_x64"))
     except Exception as error:  # it does not consist of operations of JAX
         raise Unsupported(f"operation {equation.primitive.name}") from error

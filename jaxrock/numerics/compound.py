@@ -5,7 +5,7 @@ more, and not three times as many. XLA, and machine code of our own, get what it
 """
 
 import functools
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like
+from jaxrock._precision import setting
 from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 
@@ -115,12 +116,16 @@ def of_all(change, value):
 
 def written(name: str, operands: list, settings: dict) -> ClosedJaxpr:
     """What an operation consists of, for such operands, as a program."""
-    kinds = tuple((x.shape, x.dtype) for x in operands)
-    return _program(name, kinds, tuple(settings.items()))
+    return _program(name, *_kept_by(operands, settings))
+
+
+def _kept_by(operands: Sequence, settings: dict) -> tuple[tuple, tuple, bool]:
+    """What tells a program of an operation: kinds of operands, settings, and the precision, which integers follow."""
+    return tuple((x.shape, x.dtype) for x in operands), tuple(settings.items()), setting("jax_enable_x64")
 
 
 @functools.lru_cache(maxsize=4096)
-def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...]) -> ClosedJaxpr:
+def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...], double: bool) -> ClosedJaxpr:
     like = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
     # It is kept: outside of any mesh, and for any compiler.
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())), marking(True):
@@ -128,14 +133,13 @@ def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...]
 
 
 @functools.lru_cache(maxsize=4096)
-def _called(name: str, kinds: tuple, settings: tuple) -> Callable:
+def _called(name: str, kinds: tuple, settings: tuple, double: bool) -> Callable:
     """The same as a function of its own, which is lowered once in a module."""
-    return jax.jit(jaxpr_as_fun(_program(name, kinds, settings)))
+    return jax.jit(jaxpr_as_fun(_program(name, kinds, settings, double)))
 
 
 def _lowered(name: str, context, *operands, **settings):
-    kinds = tuple((x.shape, x.dtype) for x in context.avals_in)
-    return mlir.lower_fun(_called(name, kinds, tuple(settings.items())))(context, *operands)
+    return mlir.lower_fun(_called(name, *_kept_by(context.avals_in, settings)))(context, *operands)
 
 
 def _batched(primitive: Primitive, operands, axes, **settings) -> tuple[list, list]:
