@@ -310,8 +310,8 @@ def _chosen(name: str, parameters: dict, given: list) -> list | None:
 
 
 @functools.lru_cache(maxsize=256)
-def _expanded(primitive, parameters: tuple, shapes: tuple, double: bool) -> ClosedJaxpr:  # integers follow the precision
-    like = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
+def _expanded(primitive, parameters: tuple, shapes: tuple, double: bool) -> ClosedJaxpr:
+    like = [jax.ShapeDtypeStruct(*shape) for shape in shapes]  # integers follow the precision
 
     def run(*given):
         found = primitive.impl(*given, **dict(parameters))

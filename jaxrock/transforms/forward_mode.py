@@ -148,4 +148,3 @@ def in_rows(directions: Sequence, most: int) -> list:
         return jnp.pad(x, [(0, rows * width - count), *[(0, 0)] * (x.ndim - 1)]).reshape(rows, width, *x.shape[1:])
 
     return [cut(x) for x in directions]
-
