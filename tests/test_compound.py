@@ -244,15 +244,19 @@ def operations_of(jaxpr):
     return sum(map(operations_of, inner), here)
 
 
-def recipe_in(jaxpr):
-    """The recipe that a program asks for."""
+def recipes_in(jaxpr):
+    """The recipes that a program asks for."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "scenes":
-            return equation.params["recipe"]
+            yield equation.params["recipe"]
         for value in equation.params.values():
-            if hasattr(value, "jaxpr") and (found := recipe_in(value.jaxpr)) is not None:
-                return found
-    return None
+            if hasattr(value, "jaxpr"):
+                yield from recipes_in(value.jaxpr)
+
+
+def recipe_in(jaxpr):
+    """The first of them."""
+    return next(recipes_in(jaxpr))
 
 
 def test_a_function_of_traced_numbers_keeps_its_kind_of_derivatives():
@@ -301,6 +305,17 @@ def test_programs_of_derivatives_of_histories_are_small(motion):
         history = operations_of(recipe_in(asked.jaxpr).program.jaxpr)
     assert history["scenes"] >= 2  # a step, the end
     assert (operations_of(asked.jaxpr) + history).total() <= 2500
+
+
+def test_programs_of_slopes_by_all_samples_are_small():
+    """Nor the slopes of a step, nor the free stage; and what follows a block stands there once, however long it is."""
+    record = rk.example_record()
+    margin = jax.grad(lambda samples: rk.outcome(rk.Block(0.2, 2.0), rk.Record(samples, record.dt)).margin)
+    _, pulled_back = recipes_in(jax.make_jaxpr(margin)(record.samples).jaxpr)
+    with marking(False):
+        found = operations_of(pulled_back.program.jaxpr)
+    assert found["scenes"] == 4  # steps, once more where slopes are wanted; slopes; the end
+    assert found.total() <= 1300
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
