@@ -121,17 +121,15 @@ def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
 _STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
 
 
-def states_of(
-    stepper: Any, state: PyTree, budget: int | Int[Array, ""], room: int | None = None
-) -> tuple[PyTree, PyTree]:
-    """Follow a block to the end, or until it has taken so many steps: the last state, and every state by the number of
-    steps from the first; after the last it may stand again, or zeros. `room`: for so many steps, if not the budget."""
-    engine = stepper.engine
+def states_of(stepper: Any, state: PyTree, room: int, limit: int | Int[Array, ""] | None = None) -> tuple:
+    """Follow a block to the end, or until it has taken `limit` steps in all: the last state, and every state by the
+    number of steps from the first; after the last it may stand again, or zeros. There is room for so many steps, which
+    are the limit if none is told."""
+    engine, limit = stepper.engine, room if limit is None else limit
     if not engine.in_lanes:
-        return followed(stepper.advance, state, budget, engine.loop)
+        return _in_strides(lambda s: _stride(stepper.advance, s, limit, 1), state, limit, engine.loop, room)
     many = differentiable(_stride_of, name="stride", results=_rows, in_lanes=True, derivatives="in a direction")
-    most = -(-(budget if room is None else room) // _STRIDE)
-    return _in_strides(lambda s: many((stepper, s, jnp.int32(budget))), state, budget, engine.loop, _STRIDE, most)
+    return _in_strides(lambda s: many((stepper, s, jnp.int32(limit))), state, limit, engine.loop, room, _STRIDE)
 
 
 def _stride_of(given) -> tuple[PyTree, PyTree]:
@@ -155,12 +153,14 @@ def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> t
 
     `loop(unfinished, step, carry, budget)` repeats.
     """
-    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, 1, budget)
+    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, budget)
 
 
 def _in_strides(
-    stride: Callable, state: PyTree, budget: int | Int[Array, ""], loop: Callable, length: int, most: int
+    stride: Callable, state: PyTree, limit: int | Int[Array, ""], loop: Callable, room: int, length: int = 1
 ) -> tuple[PyTree, PyTree]:
+    most = -(-room // length)
+
     def step(carry):
         turn, state, nodes = carry
         state, rows = stride(state)
@@ -173,7 +173,7 @@ def _in_strides(
     # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
     # wait, and keep their last state once more.
     _, state, nodes = loop(
-        lambda carry: unvmap_any(_unfinished(carry[1], budget)), step, (jnp.int32(0), state, nodes), most
+        lambda carry: unvmap_any(_unfinished(carry[1], limit)), step, (jnp.int32(0), state, nodes), most
     )
     return state, nodes
 

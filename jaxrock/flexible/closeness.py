@@ -5,12 +5,14 @@ left are vibrations. Where the ground rests the sign of what grows is the verdic
 distance is sqrt(2 (g^2 + d^2)); a rigid base that turns back at theta has come as near as balance - theta.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Array, Bool, Inexact, Int
 
 from jaxrock.flexible.phases import Arc, Phase
-from jaxrock.numerics.roots import carried
+from jaxrock.numerics.roots import implicit
 
 Scalar = Inexact[Array, ""]
 _HALVINGS = 40  # of a step, in which the distance is least
@@ -22,43 +24,55 @@ def mirrored(rocking: Phase) -> tuple[Int[Array, ""], Int[Array, ""]]:
     return grows, jnp.argmin(jnp.abs(rocking.rates + rocking.rates[grows]))
 
 
+class _Near(NamedTuple):
+    """A step near the balance; `modes`: the mirrored ones."""
+
+    path: Arc
+    modes: Int[Array, " two"]
+    side: Scalar
+    balance: Scalar
+
+    def parts(self, x: Scalar) -> Inexact[Array, " two"]:
+        """What grows and what decays [rad]."""
+        return self.side * self.path.mode_amplitudes(x).real[self.modes]
+
+    def distance(self, parts: Inexact[Array, "... two"]) -> Inexact[Array, "..."]:
+        """Squared, over that of the block at rest."""
+        return 2 * (parts**2).sum(axis=-1) / self.balance**2
+
+    def slope(self, x: Scalar) -> Scalar:
+        """How fast the distance grows."""
+        return jax.jvp(lambda x: self.distance(self.parts(x)), (x,), (jnp.ones_like(x),))[1]
+
+
+def _to_nearest(told: tuple[_Near, Bool[Array, ""]], x: Scalar) -> Scalar:
+    """How far it is to where the distance is least, if that is inside."""
+    near, inside = told
+    value, bend = jax.jvp(near.slope, (x,), (jnp.ones_like(x),))
+    inside = inside & (bend > 0)
+    return jnp.where(inside, value / jnp.where(inside, bend, 1.0), 0.0)
+
+
 def approached(path: Arc, side: Scalar, balance: Scalar, end: Scalar, before: tuple[Scalar, Scalar]) -> tuple:
     """Closeness, and closeness since the balance was last crossed outward, after the step `path` up to x = `end`."""
     closeness, beyond = before
-    modes = mirrored(path.phase)
-
-    def parts(x):
-        amplitudes = side * path.mode_amplitudes(x).real
-        return tuple(amplitudes[k] for k in modes)
-
-    def distance(x):
-        outward, inward = parts(x)
-        return 2 * (outward**2 + inward**2) / balance**2
-
-    def slope(x):
-        return jax.jvp(distance, (x,), (jnp.ones_like(x),))[1]
-
+    near = _Near(path, jnp.stack(mirrored(path.phase)), side, balance)
     still = jax.lax.stop_gradient(end)
 
     def halve(_, bracket):
         low, high = bracket
         middle = (low + high) / 2
-        falls = slope(middle) < 0
+        falls = near.slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
     # Least where it ceases to fall, a place that moves, which second derivatives feel; not where it only rises.
     low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (0 * still, still))
-    place = jax.lax.stop_gradient((low + high) / 2)
-
-    def left(x):
-        value, bend = jax.jvp(slope, (x,), (jnp.ones_like(x),))
-        inside = (low > 0) & (high < still) & (bend > 0)
-        return jnp.where(inside, value / jnp.where(inside, bend, 1.0), 0.0)
-
-    place = carried(place, left, 1)
+    inside = (low > 0) & (high < still)
+    place = implicit(_to_nearest, jax.lax.stop_gradient((low + high) / 2), (near, inside))
     rocking = side != 0
-    least = jnp.where(rocking, jnp.minimum(distance(place), distance(end)), jnp.inf)
-    was, now = (sum(parts(x)) > 0 for x in (0 * still, end))
+    parts = jax.vmap(near.parts)(jnp.stack([0 * still, place, end]))
+    least = jnp.where(rocking, jnp.min(near.distance(parts[1:])), jnp.inf)
+    was, _, now = parts.sum(axis=1) > 0
     beyond = jnp.where(rocking & now, jnp.where(was, jnp.minimum(beyond, least), least), jnp.inf)
     return jnp.minimum(closeness, least), beyond
 

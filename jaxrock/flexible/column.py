@@ -18,6 +18,7 @@ from jaxtyping import Array, Inexact
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.flexible.phases import Numbers
+from jaxrock.numerics.roots import implicit
 
 Scalar = Inexact[Array, ""]
 Modal = Inexact[Array, " modes"]
@@ -118,19 +119,20 @@ class Column(eqx.Module):
         straight = jnp.append(numbers.rotation, 1.0) * numbers.balance
         if not self.p_delta:
             return straight[:-1], straight[-1]
-        one, none = jnp.ones(()), jnp.zeros_like(numbers.rotation)
-
-        def lack(column, x):
-            numbers, q, rotation = column.numbers, x[:-1], x[-1]
-            elastic = column.elastic(q, none, rotation, 0 * rotation)
-            weighed = (elastic - column.remaining_force(q, none, none, 0 * rotation)) / numbers.squares
-            moment = jnp.sum(numbers.rotation * elastic) - column.spring(rotation, one)
-            return jnp.append(weighed, moment / numbers.spring_rate)
-
-        def better(column, x):
-            return x - jnp.linalg.solve(jax.jacfwd(lambda x: lack(column, x))(x), lack(column, x))
-
         held, x = jax.lax.stop_gradient((self, straight))
-        x = jax.lax.fori_loop(0, 12, lambda _, x: better(held, x), x)
-        x = better(self, better(self, x))  # two more give it its derivatives
+        x = jax.lax.fori_loop(0, 14, lambda _, x: x - _to_saddle(held, x), x)
+        x = implicit(_to_saddle, x, self)
         return x[:-1], x[-1]
+
+    def lack(self, x: Inexact[Array, " unknowns"]) -> Inexact[Array, " unknowns"]:
+        """What modal displacements and a rotation lack to be in balance, as displacements and a rotation."""
+        numbers, q, rotation, none = self.numbers, x[:-1], x[-1], jnp.zeros_like(x[:-1])
+        elastic = self.elastic(q, none, rotation, 0 * rotation)
+        weighed = (elastic - self.remaining_force(q, none, none, 0 * rotation)) / numbers.squares
+        moment = jnp.sum(numbers.rotation * elastic) - self.spring(rotation, jnp.ones_like(rotation))
+        return jnp.append(weighed, moment / numbers.spring_rate)
+
+
+def _to_saddle(column: Column, x: Inexact[Array, " unknowns"]) -> Inexact[Array, " unknowns"]:
+    lack, slopes = jax.vmap(lambda d: jax.jvp(column.lack, (x,), (d,)), out_axes=(None, 1))(jnp.eye(x.size))
+    return jnp.linalg.solve(slopes, lack)

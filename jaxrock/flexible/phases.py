@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Complex, Inexact
 from jaxrock.blocks.cantilever import unit_column
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.numerics.exponential_sums import Curve, powers
+from jaxrock.numerics.roots import implicit
 from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, ""]
@@ -231,12 +232,13 @@ def _rocking_rates(numbers: Numbers) -> Complex[Array, " rates"]:
     relaxing = (easier > 1) & (rates.real == jnp.min(rates.real))
     rates = jnp.where(relaxing, -stiffness / jnp.sum(held.rotation**2 * held.damping), rates)
 
-    def better(numbers, rates):
-        value, slope = _characteristic(numbers, rates)
-        return rates - value / slope
+    rates = jax.lax.fori_loop(0, 6, lambda _, rates: rates - _to_rates(held, rates), rates)
+    return implicit(_to_rates, rates, numbers)
 
-    rates = jax.lax.fori_loop(0, 4, lambda _, rates: better(held, rates), rates)
-    return better(numbers, better(numbers, rates))
+
+def _to_rates(numbers: Numbers, rates: Complex[Array, " rates"]) -> Complex[Array, " rates"]:
+    value, slope = _characteristic(numbers, rates)
+    return value / slope
 
 
 def _ratio(numbers: Numbers) -> Scalar:

@@ -213,19 +213,26 @@ def nonlinear_arc(
     n = tangents.numbers.rotation.size
     force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)
 
-    def round_(number, carry):
-        force, shift, before, change = carry
-        found, modes = step.remainder(*step.arc(force, shift), shift)
-        moved = jnp.max(jnp.abs(modes - before))
-        following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
-        # Where rounding is all that is left, stiff modes let it grow again.
-        better = (number < 3) | (moved < change)
-        return tuple(jnp.where(better, new, old) for new, old in zip(following, carry))
+    def followed(carry):
+        """Where forces and shift lead: modes and what is beside the linear phase there."""
+        (force, shift, *_), _ = carry
+        amplitudes, coefficients = step.arc(force, shift)
+        return amplitudes, coefficients, *step.remainder(amplitudes, coefficients, shift)
 
-    start = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.asarray(jnp.inf)
-    force, shift, _, change = jax.lax.fori_loop(0, _ROUNDS, round_, start)
-    amplitudes, coefficients = step.arc(force, shift)
-    found, _ = step.remainder(amplitudes, coefficients, shift)
+    def round_(number, carry):
+        held, _ = carry
+        led = *_, found, modes = followed(carry)
+        moved = jnp.max(jnp.abs(modes - held[2]))
+        following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
+        # The last round only looks. Where rounding is all that is left, stiff modes let it grow again.
+        better = (number < _ROUNDS) & ((number < 3) | (moved < held[3]))
+        return tuple(jnp.where(better, new, old) for new, old in zip(following, held)), led
+
+    held = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.asarray(jnp.inf)
+    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(followed, (held, None)))
+    (_, shift, _, change), (amplitudes, coefficients, found, _) = jax.lax.fori_loop(
+        0, _ROUNDS + 1, round_, (held, nothing)
+    )
     turned = step.shift(found)
     locked = jnp.where(side == 0, found.locked_moment, 0.0)
     outputs = jnp.stack([turned, found.displacement, found.bending - turned, locked], 1)

@@ -20,8 +20,9 @@ from jaxrock.flexible.phases import Arc, Numbers, Phase, arc, locked_phase, rock
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.numerics.exponential_sums import Curve, first_exit, highest, powers
 from jaxrock.numerics.polynomial import step_length
-from jaxrock.numerics.roots import carried
+from jaxrock.numerics.roots import implicit
 from jaxrock.status import Status
+from jaxrock.transforms.differentiation import with_derivatives_of
 
 Scalar = Inexact[Array, "..."]
 _ORDER = 16  # of the motion's Taylor series
@@ -174,15 +175,15 @@ class FlexibleScene(eqx.Module):
         scale = jax.lax.stop_gradient(jnp.where(quiet, jnp.inf, jnp.inf if scales is None else scales[inner]))
         room = jnp.where(left > 0, left, jax.lax.stop_gradient(lasts))
         unit = jnp.where(jnp.isfinite(scale), scale, jnp.where(jnp.isfinite(room) & (room > 0), room, 1.0))
-        load = [jnp.where(quiet, 0.0, u) for u in self.ground.series(inner, state.local, unit, _ORDER)]
+        load = jnp.where(quiet, 0.0, jnp.stack(self.ground.series(inner, state.local, unit, _ORDER)))
         # Where nothing of a piece is left, an arc as long as any: of a longer one large terms cancel even at its start.
         cap = jnp.minimum(jnp.where(left > 0, left, unit), self.longest(state)) / unit
         if len(load) > 4:
             size = jnp.finfo(left.dtype).eps / 4 * jnp.max(self.ground.bounds)
-            cap = step_length(jax.lax.stop_gradient(load), jax.lax.stop_gradient(size), cap)
+            cap = step_length(list(jax.lax.stop_gradient(load)), jax.lax.stop_gradient(size), cap)
         length, whole = cap * unit, cap * unit >= left
         share = jnp.where(whole, remaining / length, 1.0)
-        return jnp.stack(load) * powers(length / unit, len(load)), length, share, whole
+        return load * powers(length / unit, len(load)), length, share, whole
 
     def advance(self, state: FlexibleState) -> FlexibleState:
         """One step: to an event, to the end of a piece, or as far as the motion's series holds."""
@@ -203,20 +204,13 @@ class FlexibleScene(eqx.Module):
         )
         low, high = jnp.where(rocking, 0.0, -limit), jnp.where(rocking, jnp.pi / 2, limit)
         x, below, above = first_exit(watched, low, high, share)
-        value, slope = watched.jet(x)
-        # Two steps of Newton's method give the time of the event its derivatives, the first and the second.
-        miss = value - jnp.where(below, low, high)
+        level = jnp.where(below, low, high)
+        value, slope, _ = jax.lax.stop_gradient(watched.jet(x))
         hit = (below | above) & (slope != 0) & (x > 0)
         at_end = ~(below | above) & (x >= jax.lax.stop_gradient(share))
-        x = jnp.where(hit, x - miss / jnp.where(hit, slope, 1.0), jnp.where(at_end, share, x))
-
-        def left(x):
-            value, slope = watched.jet(x)
-            return (value - jnp.where(below, low, high)) / jnp.where(hit, slope, 1.0)
-
-        x = jnp.where(hit, carried(x, left, 1), x)
-        moved = watched.jet(x)[1]
-        slope = jax.lax.stop_gradient(slope - moved) + moved  # as it was found, with the derivatives of where it ends
+        nearer = x - jax.lax.stop_gradient(value - level) / jnp.where(hit, slope, 1.0)
+        x = jnp.where(hit, implicit(_to_level, nearer, (watched, level)), jnp.where(at_end, share, x))
+        slope = with_derivatives_of(slope, watched.jet(x)[1])  # as it was found, with those of where the step ends
         motion = path.state(x)
         maxima, certain = _maxima(rows, state.maxima, x)
         status = Status.where(certain, state.status, Status.solver_failed)
@@ -330,6 +324,13 @@ class FlexibleScene(eqx.Module):
         beyond = jnp.where(outward + inward > 0, jnp.minimum(state.closeness_beyond, ahead), ahead)
         fallen = jnp.where(state.fallen, state.closeness_beyond, beyond)
         return jnp.where(gone, -fallen, jnp.minimum(state.closeness, ahead))
+
+
+def _to_level(told: tuple[Curve, Scalar], x: Scalar) -> Scalar:
+    """How far it is to where a curve crosses a level."""
+    curve, level = told
+    value, slope, _ = curve.jet(x)
+    return (value - level) / jnp.where(slope == 0, 1.0, slope)
 
 
 def _maxima(rows, maxima, x):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Inexact
 
-from jaxrock.numerics.roots import carried
+from jaxrock.numerics.roots import implicit
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -19,15 +19,15 @@ _MOST_STRIDES = 10_000
 
 
 def powers(base: Inexact[ArrayLike, "..."], count: int) -> Inexact[Array, "count ..."]:
-    """Powers 0 to count - 1 (at most 24), along a new first axis."""
+    """Powers 0 to count - 1, along a new first axis."""
     base = jnp.asarray(base)
-    square, one = base * base, jnp.ones_like(base)
-    fifth = square * square * base
-    tenth = fifth * fifth
-    # As products of two short tables: a table made of itself makes XLA write code without end.
-    low = jnp.stack([one, base, square, square * base, square * square])
-    high = jnp.stack([one, fifth, tenth, tenth * fifth, tenth * tenth])
-    return (high[:, None] * low).reshape(25, *base.shape)[:count]
+    exponent = np.arange(count).reshape(-1, *[1] * base.ndim)
+    found = jnp.ones((count, *base.shape), base.dtype)
+    # By squares, each where its bit is set: one loop for XLA, which makes one of each table that is put together.
+    for bit in range((count - 1).bit_length()):
+        found = found * jnp.where(exponent >> bit & 1 == 1, base, 1)
+        base = base * base
+    return found
 
 
 def _derivatives(count: int) -> np.ndarray:
@@ -44,13 +44,12 @@ class Curve(eqx.Module):
     coefficients: Inexact[Array, "*rows terms"]
     errors: Inexact[Array, "*rows modes"]  # what rounding may have changed in each mode at 0
 
-    def jet(self, x: Scalar) -> tuple[Scalar, Scalar]:
-        """Value and slope."""
-        terms = self.amplitudes * jnp.exp(self.rates * x)
-        value, slope = (_derivatives(self.coefficients.size)[:2] @ self.coefficients) @ powers(
-            x, self.coefficients.size
-        )
-        return value + terms.real.sum(), slope + (self.rates * terms).real.sum()
+    def jet(self, x: Scalar) -> Inexact[Array, "three"]:
+        """Value, slope and curvature."""
+        count = self.coefficients.size
+        waves = self.amplitudes * jnp.exp(self.rates * x) * powers(self.rates, 3)
+        smooth = jnp.asarray(_derivatives(count)[:3]) @ self.coefficients
+        return smooth @ powers(x, count) + waves.real.sum(axis=1)
 
     def ceiling(self) -> Scalar:
         """A bound of the size on [0, 1]."""
@@ -201,16 +200,17 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
     x, _, least, place, _ = jax.lax.while_loop(
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
-    at_end = ~nowhere & (still.jet(last)[0] >= least)
-
-    def bend(curve, x):
-        return jax.jvp(lambda x: curve.jet(x)[1], (x,), (jnp.ones_like(x),))[1]
-
     # The top moves, too, which second derivatives feel.
-    is_top = (place > 0) & ~at_end & (bend(still, place) < 0)
-    moving = carried(place, lambda x: curve.jet(x)[1] / jnp.where(is_top, bend(curve, x), 1.0))
-    place = jnp.where(at_end, end, jnp.where(is_top, moving, place))
-    return jnp.where(place >= 0, curve.jet(place)[0], best), x >= last
+    top = jnp.where(place > 0, implicit(_to_top, place, curve), 0.0)
+    of_end, of_top = jax.vmap(curve.jet)(jnp.stack([end, top]))[:, 0]
+    at_end = ~nowhere & (of_end >= least)
+    return jnp.where(at_end, of_end, jnp.where(place >= 0, of_top, best)), x >= last
+
+
+def _to_top(curve: Curve, x: Scalar) -> Scalar:
+    """How far it is to the top of a curve; none where it only rises or falls."""
+    _, slope, bend = curve.jet(x)
+    return jnp.where(bend < 0, slope / jnp.where(bend < 0, bend, 1.0), 0.0)
 
 
 def _top_of_steady(curve: Curve, end: Scalar) -> Scalar:
@@ -224,8 +224,9 @@ def _top_of_steady(curve: Curve, end: Scalar) -> Scalar:
         return waves @ jnp.exp(rates * x) + smooth @ powers(x, count)
 
     x = end * np.linspace(0, 1, 9)
-    x = x[jnp.argmax(jax.vmap(jet)(x)[:, 0])]
-    for _ in range(4):
+
+    def nearer(_, x):
         _, slope, curvature = jet(x)
-        x = jnp.clip(x - jnp.where(curvature < 0, slope / curvature, 0.0), 0.0, end)
-    return x
+        return jnp.clip(x - jnp.where(curvature < 0, slope / curvature, 0.0), 0.0, end)
+
+    return jax.lax.fori_loop(0, 4, nearer, x[jnp.argmax(jax.vmap(jet)(x)[:, 0])])

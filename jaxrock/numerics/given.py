@@ -29,7 +29,11 @@ class _Rule(NamedTuple):
         return self.function(*self.settings, values, by, changes)
 
     def __repr__(self) -> str:
-        return f"{self.function.__module__}.{self.function.__qualname__}{self.settings}"
+        return f"{_printed(self.function)}({', '.join(map(_printed, self.settings))})"
+
+
+def _printed(x: Any) -> str:
+    return f"{x.__module__}.{x.__qualname__}" if hasattr(x, "__qualname__") else repr(x)
 
 
 def given(rule: Callable, values: Tree, by: Any, *settings: Any) -> Tree:
@@ -53,6 +57,19 @@ def _flat(tree: Any) -> tuple[list, Any]:
 def is_zero(change: Any) -> bool:
     """Whether a change is zero whatever the numbers are."""
     return isinstance(change, SymbolicZero)
+
+
+def along(function: Callable, by: Any, changes: Any) -> Any:
+    """How `function(by)` changes along `changes`, as rules are given them."""
+    leaves, structure = _flat(by)
+    told = structure.flatten_up_to(changes)
+    moving = [(x, d) for x, d in zip(leaves, told) if not is_zero(d)]
+
+    def of_moving(*own):
+        rest = iter(own)
+        return function(structure.unflatten([x if is_zero(d) else next(rest) for x, d in zip(leaves, told)]))
+
+    return jax.jvp(of_moving, [x for x, _ in moving], [d for _, d in moving])[1]
 
 
 def _moved(leaves, changes, *, rule, structures):

@@ -2,11 +2,15 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
+from jaxrock.numerics.given import along, given
+
+Tree = TypeVar("Tree")
 Real = Inexact[Array, "..."]
 _MOST_STEPS = 100
 
@@ -44,6 +48,20 @@ def carried(x: Real, step: Callable, times: int = 2) -> Real:
         left = step(x)
         x = x - (left - jax.lax.stop_gradient(left))
     return x
+
+
+def implicit(step: Callable, x: Tree, by: Any) -> Tree:
+    """`x`, a root that was found without derivatives, with those of every order of the implicit function.
+
+    `step(by, x)`, a function of a module: how far the root is by Newton's method. Without derivatives it is computed by
+    nobody.
+    """
+    return given(_by_newton, x, by, step)
+
+
+def _by_newton(step: Callable, x: Tree, by: Any, changes: Any) -> Tree:
+    # At a root the step's slope by x is one.
+    return jax.tree.map(jnp.negative, along(lambda by: step(by, x), by, changes))
 
 
 def search_root(function: Callable, a: Real, b: Real) -> Real:

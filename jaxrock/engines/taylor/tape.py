@@ -98,27 +98,23 @@ def end_on_tape(stepper: Stepper, state: State) -> State:
         return on_tape(stepper, state, most)[0]
 
     def further(state, limit):
-        followed = jax.checkpoint(lambda stepper, state: on_tape(stepper, state, limit, usual)[0])
+        followed = jax.checkpoint(lambda stepper, state: on_tape(stepper, state, usual, limit)[0])
         return jax.lax.cond(state.done, lambda: state, lambda: followed(stepper, state)), None
 
     return jax.lax.scan(further, state, jnp.minimum(usual * (1 + jnp.arange(-(-most // usual))), most))[0]
 
 
-def on_tape(
-    stepper: Stepper, state: State, budget: int | Int[Array, ""], room: int | None = None
-) -> tuple[State, State]:
+def on_tape(stepper: Stepper, state: State, room: int, limit: Int[Array, ""] | None = None) -> tuple[State, State]:
     """Follow a block: the last state, and those before every step, as `states_of` tells them; with derivatives of which
     reverse mode takes the product with very many numbers."""
     still, start = fixed((replace(stepper, taped=False), state))
-    stretches = -(-(budget if room is None else room) // _TOGETHER)
-    last, nodes = fixed(states_of(still, start, budget, stretches * _TOGETHER))
+    stretches = -(-room // _TOGETHER)
+    last, nodes = fixed(states_of(still, start, stretches * _TOGETHER, room if limit is None else limit))
     ground = jax.vmap(lambda piece, local: _Ground.of(stepper, piece, local))(nodes.piece, nodes.local)
     by = _reals(state), (_Numbers.of(stepper), ground), still, nodes, last.steps - start.steps
     ends, starts = given(_changes, (_reals(last), _reals(nodes)), by)
-    nodes = _with_reals(nodes, starts)
-    if room is None:  # no more of them than without a tape
-        nodes = jax.tree.map(lambda x: x[: rows_of(stepper.engine, budget)], nodes)
-    return _with_reals(last, ends), nodes
+    rows = rows_of(stepper.engine, room)  # no more than without a tape
+    return _with_reals(last, ends), jax.tree.map(lambda x: x[:rows], _with_reals(nodes, starts))
 
 
 def _reals(states: State) -> list:
