@@ -15,8 +15,10 @@ import jaxrock as rk
 from jaxrock.engines import free_stage
 from jaxrock.numerics import compound, elementary, polynomial as polynomials
 from jaxrock.numerics.choice import where
+from jaxrock.numerics.exponential_sums import powers
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given
+from jaxrock.numerics.roots import implicit
 from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 from jaxrock.transforms.differentiation import differentiable
@@ -229,6 +231,41 @@ def test_given_values_in_a_scan(checkpoint):
     np.testing.assert_allclose(each, 56 * x**6, rtol=1e-14)
     np.testing.assert_allclose(of_sum, np.diag(56 * x**6), rtol=1e-14)
     np.testing.assert_array_equal(shared, np.full(4, x[0] ** 2))
+
+
+ASKED = []
+
+
+def to_cube_root(cube, x):
+    ASKED.append(x)
+    return (x**3 - cube) / (3 * x**2)
+
+
+def test_a_root_moves_as_the_implicit_function_does():
+    """To third derivatives, in both modes and in lanes; without them nobody computes how far it is."""
+
+    def root(cube):
+        return implicit(to_cube_root, jax.lax.stop_gradient(jnp.cbrt(cube)), cube)
+
+    ASKED.clear()
+    jax.jit(root)(8.0)
+    assert not ASKED
+    nested = jax.grad(root), jax.grad(jax.grad(root)), jax.jacfwd(jax.grad(jax.jacfwd(root)))
+    cubes = np.array([0.5, 8.0, 30.0])
+    for order, derivative in enumerate(nested, 1):
+        exact = np.prod(1 / 3 - np.arange(order)) * cubes ** (1 / 3 - order)
+        np.testing.assert_allclose(jax.jit(jax.vmap(derivative))(cubes), exact, rtol=1e-13)
+    assert ASKED
+
+
+@pytest.mark.parametrize("count", [1, 16, 21])
+def test_powers(count):
+    """Beside NumPy's, of numbers in lanes, complex ones too; and their slopes."""
+    base = np.array([0.0, -0.7, 1.3]) + 1j * np.array([0.0, 0.4, 0.0])
+    exponents = np.arange(count)
+    np.testing.assert_allclose(powers(base, count), base ** exponents[:, None], rtol=1e-14)
+    slopes = jax.jacfwd(lambda x: powers(x, count))(1.3)
+    np.testing.assert_allclose(slopes, exponents * 1.3 ** (exponents - 1.0), rtol=1e-14)
 
 
 def operations_of(jaxpr):

@@ -41,8 +41,9 @@ def _bracketed_root_jvp(function, primals, tangents):
 def carried(x: Real, step: Callable, times: int = 2) -> Real:
     """`x`, a root that was found without derivatives, with those of the implicit function.
 
-    `step(x)`: how far the root is by Newton's method, with derivatives. The root itself does not move; each time
-    doubles the order to which derivatives are exact: the first after one, the second and third after two.
+    `step(x)`, which may hold what is traced (otherwise see `implicit`): how far the root is by Newton's method, with
+    derivatives. The root itself does not move; each time doubles the order to which derivatives are exact: the first
+    after one, the second and third after two.
     """
     for _ in range(times):
         left = step(x)
