@@ -151,6 +151,28 @@ QUESTIONS = {
     "critical": ("`critical_amplitudes`", "answer = rk.critical_amplitudes(block, pulse, progress=False)", None, None),
     "sensitivity": ("`sensitivity`", "answer = rk.studies.sensitivity(block, pulse)", None, None),
     "diffrax": ("Diffrax engine, `outcome`", "answer = rk.outcome(block, pulse, engine=rk.Diffrax())", 5.0, 1.0),
+    "column": (
+        "flexible column, `outcome`",
+        "answer = rk.outcome(rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, 6), rk.SinePulse(0.5, 1.6))",
+        None, None,
+    ),
+    "column_history": (
+        "its history",
+        "answer = rk.simulate(rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, 6), rk.SinePulse(0.5, 1.6))",
+        None, None,
+    ),
+    "column_grad": (
+        "its gradient by one number",
+        "column = rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, 6)\n"
+        "answer = jax.grad(lambda a: rk.outcome(column, rk.SinePulse(a, 1.6)).max_rotation)(0.5)",
+        None, None,
+    ),
+    "column_law": (
+        "with finite rotations, P-Delta and a plastic base, `outcome`",
+        "law = dict(base='plastic', rotations='finite', p_delta=True)\n"
+        "answer = rk.outcome(rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, 6, **law), rk.SinePulse(0.5, 1.6))",
+        None, None,
+    ),
     "closed": (
         "gradient of a closed form",
         "from jaxrock.closed_form import sine_pulse\n"
