@@ -85,7 +85,7 @@ def test_what_notebooks_call_there_is(path):
     assert found
 
 
-FEWER = {"points": 24, "starts": 3, "repetitions": 4}
+FEWER = {"points": 24, "starts": 3, "repetitions": 4, "levels": 5}
 
 
 def with_fewer_points(notebook):
