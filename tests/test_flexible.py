@@ -439,9 +439,9 @@ def test_neighbours_answer_alike():
 
 
 @pytest.mark.slow
-def test_a_thousand_blocks_at_once():
+def test_hundreds_of_blocks_at_once():
     """One call, with the answers of single calls; reverse mode agrees with forward mode."""
-    moduli = jnp.linspace(10e9, 60e9, 1000)
+    moduli = jnp.linspace(10e9, 60e9, 200)
 
     def peak(E):
         return rk.responses.outcome_flexible(
@@ -450,7 +450,7 @@ def test_a_thousand_blocks_at_once():
 
     found = jax.jit(jax.vmap(peak))(moduli)
     assert (found.status == rk.Status.successful).all()
-    for i in (0, 500, 999):
+    for i in (0, 100, 199):
         assert found.max_rotation[i] == pytest.approx(float(peak(moduli[i]).max_rotation), rel=1e-12)
     forward = jax.jacfwd(lambda E: peak(E).max_rotation)(30e9)
     assert jax.grad(lambda E: peak(E).max_rotation)(30e9) == pytest.approx(float(forward), rel=1e-12)
