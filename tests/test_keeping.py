@@ -1,5 +1,6 @@
 """What is kept between sessions: found again, refused when it is damaged, made anew when anything changed."""
 
+import gc
 import logging
 import os
 import subprocess
@@ -17,7 +18,7 @@ import jaxrock as rk
 from jaxrock._arguments import path_of
 from jaxrock.command_line.main import main
 from jaxrock.engines import scene
-from jaxrock.keeping import facts, folder
+from jaxrock.keeping import changes, facts, folder
 from jaxrock.sweeps.store import local
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
@@ -310,6 +311,27 @@ def test_a_file_under_the_name_of_another_is_not_read(place):
 def test_nothing_is_kept_where_the_environment_says_so(monkeypatch, said):
     monkeypatch.setenv("JAXROCK_CACHE", said)
     assert folder.folder() is None
+
+
+def test_what_is_imported_meanwhile():
+    """Garbage may be collected at any tuple that is made, and others may run then."""
+    names = [f"nobody_knows_{number}" for number in range(10_000)]
+    left = iter(names)
+
+    def imported(phase, _):
+        sys.modules[next(left)] = None
+
+    before = gc.get_threshold()
+    gc.callbacks.append(imported)
+    try:
+        gc.set_threshold(50)
+        assert changes.changes() == ""
+    finally:
+        gc.set_threshold(*before)
+        gc.callbacks.remove(imported)
+        assert next(left) != names[0]
+        for name in names:
+            sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize("kind", ["a class", "a module", "code in place"])

@@ -8,7 +8,6 @@ import marshal
 import sys
 import types
 import uuid
-from collections.abc import Mapping
 from itertools import repeat
 from operator import attrgetter, is_
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ class _Space(NamedTuple):
     """The names of a module or of a class, as they were when they were first looked at."""
 
     of: str
-    names: Mapping[str, Any]  # now
+    names: dict[str, Any] | types.MappingProxyType[str, Any]  # now
     before: dict[str, Any]
     many: int  # how many names there were
     named: list[str]  # names of functions, and of what wraps them
@@ -31,8 +30,8 @@ class _Space(NamedTuple):
     codes: list[types.CodeType]  # of these
 
     @classmethod
-    def at(cls, of: str, names: Mapping[str, Any]) -> "_Space":
-        before = {name: value for name, value in list(names.items()) if not name.startswith("__") or _function(value)}
+    def at(cls, of: str, names: dict[str, Any] | types.MappingProxyType[str, Any]) -> "_Space":
+        before = {name: value for name, value in names.copy().items() if not name.startswith("__") or _function(value)}
         found = {name: function for name, value in before.items() if (function := _function(value)) is not None}
         functions = list(found.values())
         return cls(of, names, before, len(names), list(found), functions, list(map(_CODE, functions)))
@@ -52,7 +51,7 @@ class _Space(NamedTuple):
         functions = zip(self.named, self.functions, self.codes)
         found += [name for name, function, code in functions if function.__code__ is not code]
         if len(names) != self.many:
-            found += [name for name in names.keys() - before.keys() if _function(names[name])]
+            found += [name for name, value in names.copy().items() if name not in before and _function(value)]
         return [f"{self.of}.{name} {_digest(names.get(name, self))}" for name in found]
 
 
@@ -69,7 +68,8 @@ def changes() -> str:
     """Digest of what differs in the package's modules from when this function first looked at them, which it does when
     the package is imported; empty: nothing."""
     found = []
-    for name, module in list(sys.modules.items()):
+    # A list of items is made item by item, and garbage is collected meanwhile, which may have others import something.
+    for name, module in sys.modules.copy().items():
         if name.partition(".")[0] != _OWN or name.startswith(_OTHERS) or not isinstance(module, types.ModuleType):
             continue
         known = _seen.get(name)
@@ -91,7 +91,7 @@ def changes() -> str:
 
 def _spaces(module: types.ModuleType) -> list[_Space]:
     names = vars(module)
-    own = [x for x in list(names.values()) if isinstance(x, type) and x.__module__ == module.__name__]
+    own = [x for x in names.copy().values() if isinstance(x, type) and x.__module__ == module.__name__]
     return [_Space.at(module.__name__, names), *(_Space.at(f"{x.__module__}.{x.__qualname__}", vars(x)) for x in own)]
 
 
