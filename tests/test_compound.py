@@ -258,6 +258,19 @@ def test_a_root_moves_as_the_implicit_function_does():
     assert ASKED
 
 
+def test_rules_are_functions_of_modules():
+    """Programs tell them by their names, which those within another share."""
+
+    def rule(value, by, change):
+        return change
+
+    assert "squared_slope" in str(jax.make_jaxpr(lambda x: given(squared_slope, x, x))(1.0))
+    with pytest.raises(ValueError, match="must be a function of a module, but is .*rule"):
+        given(rule, 1.0, 1.0)
+    with pytest.raises(ValueError, match="must be a function of a module, but is .*lambda"):
+        implicit(lambda by, x: x - by, 1.0, 1.0)
+
+
 @pytest.mark.parametrize("count", [1, 16, 21])
 def test_powers(count):
     """Beside NumPy's, of numbers in lanes, complex ones too; and their slopes."""

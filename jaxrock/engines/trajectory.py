@@ -121,7 +121,9 @@ def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
 _STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
 
 
-def states_of(stepper: Any, state: PyTree, room: int, limit: int | Int[Array, ""] | None = None) -> tuple:
+def states_of(
+    stepper: Any, state: PyTree, room: int, limit: int | Int[Array, ""] | None = None
+) -> tuple[PyTree, PyTree]:
     """Follow a block to the end, or until it has taken `limit` steps in all: the last state, and every state by the
     number of steps from the first; after the last it may stand again, or zeros. There is room for so many steps, which
     are the limit if none is told."""
@@ -133,8 +135,8 @@ def states_of(stepper: Any, state: PyTree, room: int, limit: int | Int[Array, ""
 
 
 def _stride_of(given) -> tuple[PyTree, PyTree]:
-    stepper, state, budget = given
-    return _stride(stepper.advance, state, budget, _STRIDE)
+    stepper, state, limit = given
+    return _stride(stepper.advance, state, limit, _STRIDE)
 
 
 def _rows(given) -> tuple[PyTree, PyTree]:
@@ -178,15 +180,15 @@ def _in_strides(
     return state, nodes
 
 
-def _unfinished(state: PyTree, budget: int | Int[Array, ""]) -> Bool[Array, ""]:
-    return ~state.done & (state.steps < budget)
+def _unfinished(state: PyTree, limit: int | Int[Array, ""]) -> Bool[Array, ""]:
+    return ~state.done & (state.steps < limit)
 
 
-def _stride(advance: Callable, state: PyTree, budget: int | Int[Array, ""], length: int) -> tuple[PyTree, PyTree]:
-    """The state after so many steps, and after each of them; one that is done, or has taken `budget` steps, waits."""
+def _stride(advance: Callable, state: PyTree, limit: int | Int[Array, ""], length: int) -> tuple[PyTree, PyTree]:
+    """The state after so many steps, and after each of them; one that is done, or has taken `limit` in all, waits."""
 
     def step(state):
-        going, after = _unfinished(state, budget), advance(state)
+        going, after = _unfinished(state, limit), advance(state)
         return jax.tree.map(lambda new, old: where(going, new, old), after, state)
 
     def one_more(carry):

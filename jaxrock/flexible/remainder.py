@@ -221,7 +221,8 @@ def nonlinear_arc(
 
     def round_(number, carry):
         held, _ = carry
-        led = *_, found, modes = followed(carry)
+        led = followed(carry)
+        *_, found, modes = led
         moved = jnp.max(jnp.abs(modes - held[2]))
         following = _POWERS @ found.force, _POWERS @ step.shift(found), modes, moved
         # The last round only looks. Where rounding is all that is left, stiff modes let it grow again.

@@ -201,7 +201,7 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
         lambda carry: (carry[0] < last) & (carry[4] < _MOST_STRIDES), step, start
     )
     # The top moves, too, which second derivatives feel.
-    top = jnp.where(place > 0, implicit(_to_top, place, curve), 0.0)
+    top = jnp.where(place > 0, implicit(_to_top, jnp.maximum(place, 0.0), curve), 0.0)
     of_end, of_top = jax.vmap(curve.jet)(jnp.stack([end, top]))[:, 0]
     at_end = ~nowhere & (of_end >= least)
     return jnp.where(at_end, of_end, jnp.where(place >= 0, of_top, best)), x >= last

@@ -41,7 +41,12 @@ def given(rule: Callable, values: Tree, by: Any, *settings: Any) -> Tree:
 
     `rule` is a function of a module, `settings` are static. Changes that are zero are `SymbolicZero`; to the values
     that the rule is given their derivatives belong, so that those of higher order follow.
+
+    Raises ValueError for functions within others, which programs could not tell from each other.
     """
+    for function in (rule, *settings):
+        if "<" in getattr(function, "__qualname__", ""):
+            raise ValueError(f"Argument `rule` must be a function of a module, but is {function.__qualname__}.")
     leaves, structure = _flat(values)
     more, of_by = _flat(by)
     found = _given_p.bind(

@@ -127,10 +127,10 @@ def _with_reals(states: State, reals: list) -> State:
 
 def _changes(values: tuple, by: tuple, changes: tuple) -> tuple[list, list]:
     """Changes of the last state, and of those before every step: along the steps, by products with their slopes."""
-    (_, reals), (_, (numbers, ground), still, nodes, steps), (first, told, *_) = values, by, changes
+    (_, reals), (_, told, still, nodes, steps), (first, d_told, *_) = values, by, changes
     first = jnp.stack([jnp.zeros(d.aval.shape, d.aval.dtype) if is_zero(d) else d for d in first])
-    numbers, by_numbers = _parted(numbers, told[0], jnp.zeros(0, first.dtype))
-    ground, by_ground = _parted(ground, told[1], jnp.zeros((nodes.steps.size, 0), first.dtype))
+    numbers, by_numbers = _parted(told[0], d_told[0], jnp.zeros(0, first.dtype))
+    ground, by_ground = _parted(told[1], d_told[1], jnp.zeros((nodes.steps.size, 0), first.dtype))
     nodes = _with_reals(nodes, reals)
     starts = jnp.arange(0, nodes.steps.size - 1, _TOGETHER)
 
@@ -174,7 +174,8 @@ def _one(change: Array, step: tuple) -> tuple[Array, Array]:
 
 
 def _products(still: Stepper, node: State, numbers: tuple, ground: tuple, by_numbers: Array, by_ground: Array) -> tuple:
-    """Of a step: slopes by the path, of what is seen by itself, and the change by all else that moves."""
+    """Of a step: slopes by the path, of what is seen by itself, and the change by all else that moves. `numbers`,
+    `ground`: what moves of them, and the rest."""
     moving, rest = zip(numbers, ground)
     leaves = [*_path_of(node), *jax.tree.leaves(moving)]
     slopes = differentiable(_slopes, name="slopes of a step", in_lanes=True, derivatives="by directions")
