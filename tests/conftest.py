@@ -5,8 +5,9 @@ functions are called thousands of times while a program is traced, and a check t
 JAXROCK_CHECK_ALL=1 they are checked everywhere.
 
 XLA compiles as after `keep_compiled`, and then as quickly as it can, since nearly every program runs once: that takes
-half of the time or less. With `XLA_FLAGS=` it compiles as it does by itself. Machine code of our own is compiled as it
-always is.
+half of the time or less. So does LLVM machine code of our own, which takes a third: its numbers are the same to the bit
+(`test_native.py`, `test_at_any_effort`). With `XLA_FLAGS=` both compile as they do for users, as they do in processes
+that tests start.
 """
 
 import atexit
@@ -52,7 +53,8 @@ def pytest_configure(config):
     importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
     # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
     gc.set_threshold(1_000_000, 10, 10)
-    if "XLA_FLAGS" not in os.environ:
+    quickly = "XLA_FLAGS" not in os.environ
+    if quickly:
         importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
         fewer = ("simplify-while-loops", "while-loop-invariant-code-motion", "while-loop-constant-sinking")
         flags = (
@@ -62,6 +64,8 @@ def pytest_configure(config):
         )
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
     jax = importlib.import_module("jax")
+    if quickly and importlib.util.find_spec("llvmlite"):
+        importlib.import_module("jaxrock.native.machine").EFFORT["for long"] = 0
     jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -23,11 +23,12 @@ from llvmlite import binding, ir  # noqa: E402
 import jaxrock as rk  # noqa: E402
 from jaxrock import _foreign  # noqa: E402
 from jaxrock._programs import programs_of  # noqa: E402
+from jaxrock.closed_form import single_lobe  # noqa: E402
 from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
 from jaxrock.native.builder import Builder  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.numerics.apart import apart  # noqa: E402
-from jaxrock.transforms import batching  # noqa: E402
+from jaxrock.transforms import batching, recipe  # noqa: E402
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of  # noqa: E402
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 3.5, 1e-300, 1e300, -7.3, np.inf, -np.inf, np.nan, 0.1])
@@ -802,6 +803,42 @@ def test_scenes_do_not_fall_back(name, caplog):
     with caplog.at_level(logging.DEBUG, "jaxrock"):
         jax.jit(jax.vmap(SCENES[name])).lower(jnp.full(333, 0.2), jnp.full(333, 0.5))
     assert "left to XLA" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    "name, count",
+    [("derivatives", 40), ("spring", 40), *(pytest.param(x, 100, marks=pytest.mark.slow) for x in SCENES)],
+)
+def test_at_any_effort(name, count, monkeypatch):
+    """What LLVM compiles quickly, as for tests, answers as what it takes its time for: the same to the bit."""
+    a, u = np.random.default_rng(5).uniform([[0.1], [0.2]], [[0.3], [2.0]], (2, count))
+    found = []
+    for effort in (0, 3):
+        with_effort(effort, monkeypatch)
+        found.append(jax.device_get(jax.jit(jax.vmap(lambda a, u: SCENES[name](a, u)))(a, u)))
+    for quickly, carefully in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_array_equal(quickly, carefully)
+        assert np.isfinite(quickly).mean() > 0.3
+
+
+def with_effort(effort: int, monkeypatch):
+    """Compile machine code anew, with so much of it."""
+    for kind in machine.EFFORT:
+        monkeypatch.setitem(machine.EFFORT, kind, effort)
+    for each in list(recipe._alike.values()):
+        each.plans.clear()
+
+
+def test_closed_forms_at_any_effort(monkeypatch):
+    """Of one number, as users have them, and of many."""
+    durations, shapes, found = np.linspace(0.5, 3.0, 9), np.linspace(-0.5, 0.9, 9), []
+    for effort in (0, 3):
+        with_effort(effort, monkeypatch)
+        one, many = (
+            jax.jit(how(jax.value_and_grad(single_lobe.safety_wall, (0, 1)))) for how in (lambda f: f, jax.vmap)
+        )
+        found.append(jax.device_get([*(one(*each) for each in zip(durations, shapes)), many(durations, shapes)]))
+    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 def test_diffrax_in_lanes():

@@ -20,6 +20,7 @@ from jaxrock.native.emitter import SMALL, is_known
 from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import (
+    EFFORT,
     is_there as is_there,
     lanes_for as lanes_for,
     lanes_of,
@@ -47,7 +48,8 @@ class Plan:
     """A program (closed, of one lane) as machine code for many: leaves that are not `shared` are a lane's own.
 
     `refilled`: in the program's one loop a lane that is done does not wait for others. `alone`: whether there is only
-    one lane, whose long lists all lanes of a vector may then look up. `lanes`: of a vector (None: as many as run best).
+    one lane, whose long lists all lanes of a vector may then look up, and whose program LLVM compiles in a moment if it
+    is not refilled: it runs for microseconds. `lanes`: of a vector (None: as many as run best).
     Raises `Unsupported` if the program does what is not known in `operations`.
     """
 
@@ -70,12 +72,13 @@ class Plan:
                 "%d operations are done before by XLA: not known are %s", len(before), ", ".join(sorted(unknown))
             )
         self._rest, own, self._pieces = rest.inputs, self._first_own(), []
+        effort = EFFORT["in a moment" if alone and not refilled else "for long"]
         # Of what becomes machine code only names stay: programs take more memory than all else.
         for part in around_loop(rest) if refilled else [rest]:
             is_loop = refilled and [e.primitive.name for e in part.program.jaxpr.eqns] == ["while"]
             parted = is_loop and has_parts(part.program.jaxpr.eqns[0])
             writes = emit_parted if parted else emit_loop if is_loop else functools.partial(emit, alone=alone)
-            name = registered(part.program, [v not in own for v in part.inputs], writes, self._lanes)
+            name = registered(part.program, [v not in own for v in part.inputs], writes, self._lanes, effort)
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(name, part.inputs, part.outputs))
 

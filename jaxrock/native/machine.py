@@ -5,6 +5,7 @@ Needs llvmlite.
 
 import functools
 import hashlib
+import platform
 import threading
 from collections.abc import Callable
 
@@ -16,9 +17,14 @@ from jaxrock.keeping import folder
 from jaxrock.native.interface import add_handler
 from jaxrock.native.operations import Unsupported
 
+# LLVM's effort, 0 to 3: at what runs for microseconds, in one lane, and at all else (see `Plan`). With 0 it takes a
+# third of the time, and on x86, where this was measured (`benchmarks/effort.py`), numbers are the same to the bit; the
+# code takes up to twice as long, and of derivatives in many lanes, most of which goes through memory then, three times.
+EFFORT = {"in a moment": 0 if platform.machine() in ("x86_64", "AMD64") else 3, "for long": 3}
+
 
 class _Machine:
-    """A target of LLVM, and an engine that links what is compiled for it."""
+    """Targets of LLVM, and an engine that links what is compiled for them."""
 
     def __init__(self):
         binding.initialize_native_target()
@@ -26,13 +32,17 @@ class _Machine:
         features = binding.get_host_cpu_features()
         self.lanes = 16 if features.get("avx512f") else 8  # two registers: one computes while the other waits
         self.told = f"{binding.llvm_version_info} {binding.get_host_cpu_name()} {features.flatten()}"
-        self._target = binding.Target.from_default_triple().create_target_machine(
-            cpu=binding.get_host_cpu_name(), features=features.flatten(), opt=3, jit=True, codemodel="jitdefault"
-        )
-        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), self._target)
+        self._targets = [
+            binding.Target.from_default_triple().create_target_machine(
+                cpu=binding.get_host_cpu_name(), features=features.flatten(), opt=n, jit=True, codemodel="jitdefault"
+            )
+            for n in range(4)
+        ]
+        self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), self._targets[3])
 
-    def object_of(self, text: str) -> bytes:
+    def object_of(self, text: str, effort: int) -> bytes:
         """The machine code of a module."""
+        target = self._targets[effort]
         try:
             code = binding.parse_assembly(text)
             code.verify()
@@ -44,11 +54,11 @@ class _Machine:
         passes = binding.create_new_function_pass_manager()
         passes.add_simplify_cfg_pass()
         passes.add_instruction_combine_pass()
-        builder = binding.create_pass_builder(self._target, binding.create_pipeline_tuning_options())
+        builder = binding.create_pass_builder(target, binding.create_pipeline_tuning_options())
         for function in code.functions:
             if not function.is_declaration:
                 passes.run(function, builder)
-        return self._target.emit_object(code)
+        return target.emit_object(code)
 
     def address(self, code: bytes, name: str) -> int:
         """Where a function of some machine code is, from now on."""
@@ -93,23 +103,23 @@ def machine() -> str:
     return _machine().told
 
 
-def registered(program, shared: list[bool], emit: Callable, lanes: int) -> str:
+def registered(program, shared: list[bool], emit: Callable, lanes: int, effort: int = EFFORT["for long"]) -> str:
     """The name under which XLA finds the machine code of a program: made of its text, so that compiled programs that a
     cache keeps find it again."""
     if not is_known():
         raise Unsupported("XLA's interface of this version")
     module = emit(program, shared, lanes, "program")
-    return kept(module, len(program.jaxpr.outvars), 1 + len(shared))
+    return kept(module, len(program.jaxpr.outvars), 1 + len(shared), effort)
 
 
-def kept(module: Module, outputs: int, inputs: int) -> str:
+def kept(module: Module, outputs: int, inputs: int, effort: int = EFFORT["for long"]) -> str:
     """The name under which XLA finds the machine code of the function `program` of a module."""
     add_handler(module, outputs, inputs)
     text = str(module)
     _take_apart(module)
-    name = "jaxrock_" + hashlib.sha256(f"{machine()}\n{text}".encode()).hexdigest()[:20]
+    name = "jaxrock_" + hashlib.sha256(f"{machine()}\n{effort}\n{text}".encode()).hexdigest()[:20]
     if not is_there(name):
-        code = _machine().object_of(text.replace("jaxrock_handler", name))
+        code = _machine().object_of(text.replace("jaxrock_handler", name), effort)
         folder.write("machine", name, code)
         _register(name, code)
     return name
