@@ -53,7 +53,9 @@ class Status(Enumeration):
     solver_failed = item(
         "The differential equation solver gave up: its nonlinear solver failed or its steps became too small."
     )
-    not_finite = item("The state or the motion stopped being a finite number. Check the inputs.")
+    not_finite = item(
+        "The state or the motion stopped being a finite number, or a law of restitution left [0, 1]. Check the inputs."
+    )
 
 
 def is_none(given: Any) -> Bool[Array, ""]:

@@ -148,6 +148,7 @@ def test_a_suite_of_motions_has_none():
             lambda: rk.motions.Suite([PAIR], azimuth=[0, 45, 90]),
             "`azimuth` must be finite, and in radians, from -2 pi to 2 pi, .* 45",
         ),
+        (lambda: PAIR.along(90), "`angle` must be finite, and in radians, from -2 pi to 2 pi, but is 90"),
         (lambda: rk.motions.Suite([PAIR], azimuth=0.3), "`azimuth` must be a list of angles"),
         (lambda: rk.motions.Suite([PAIR], ["a", "b"], azimuth=[0.3]), "`names` must name 1 motions, but has 2"),
     ],

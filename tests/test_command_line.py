@@ -150,8 +150,12 @@ def test_run_of_a_block_that_overturns(command, at2, tmp_path, monkeypatch):
 
 
 def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
+    """A film of an earlier run, of whatever kind, is not left beside its results."""
+    film = tmp_path / "out" / "animation.mp4"
+    film.parent.mkdir()
+    film.touch()
     status, table, _ = command("run", at2, *GIVEN, "--scale", "0.1")
-    assert status == 0
+    assert status == 0 and not film.exists()
     assert (table["verdict"], table["impacts during the motion"], table["peak rotation"]) == ("stands", "0", "0.000000")
     assert (tmp_path / "out" / "impacts.csv").read_text() == "time_s,velocity_before_rad_per_s\n"
 

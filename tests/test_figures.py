@@ -196,7 +196,9 @@ def test_feasible_region():
     assert (axis.get_ylabel(), axis.get_xlabel()) == ("amplitude [g]", "period [s]")
     assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
     assert float(axis.collections[0].get_array().max()) == 0.0
-    np.testing.assert_allclose(axis.lines[0].get_ydata(), 0.5)
+    labels = axis.get_legend_handles_labels()[1]
+    assert labels[0] == "95 % region" and len(labels) == 2
+    np.testing.assert_allclose(axis.lines[-1].get_ydata(), 0.5)
 
 
 def test_a_wall_lies_along_the_axes_of_its_region():
@@ -401,8 +403,9 @@ def test_a_spectrum_leaves_out_what_was_not_computed():
 def test_a_spectrum_of_none_that_rocks_starts_at_zero(lost):
     peaks = jnp.full(2, jnp.inf if lost else 0.0)
     found = spectrum_of([lost, lost], [1.0, 2.0])
-    for axis in rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks))):
-        assert axis.get_ylim() == (0, 1)
+    axes = rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks)))
+    assert [axis.get_ylim() for axis in axes] == [(0, 1)] * 2
+    assert [text.get_text() for text in axes[0].texts] == [] if lost else ["no block uplifts"]
 
 
 def test_the_legend_of_many_intensities_lies_beside_the_curves():

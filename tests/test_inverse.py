@@ -503,7 +503,8 @@ def test_rocks_that_say_nothing_leave_what_was_known_before(tmp_path, capsys):
 @pytest.mark.parametrize(
     "prior, message",
     [
-        (("shape", "1", "1"), "must name each of amplitude, duration at most once, but names shape"),
+        (("shape", "1", "1"), "must name one of amplitude, duration, but names shape"),
+        (("period", "1", "1", "--prior", "duration", "1", "1"), "must name duration at most once, but does so twice"),
         (("duration", "1", "wide"), "must end with two numbers, but is duration 1 wide"),
         (("duration", "1", "-1"), "must end with a positive median and deviation, but is duration 1 -1"),
     ],

@@ -74,6 +74,37 @@ def test_measures_that_are_refused(measure, message):
         rk.hazard.simulated_fragility(BLOCK, PULSES, [0.1, 0.2], measure=measure, **QUICK)
 
 
+def test_a_curve_of_another_measure_is_refused(tmp_path):
+    """As far as both are known: labels of one's own are not compared. Nor is a table for OpenQuake written of it."""
+    table = [0.1, 0.2, 0.4], [0.0, 0.5, 1.0]
+    by_velocity = rk.hazard.TabulatedFragility(*table, "PGV")
+    curves = [rk.hazard.HazardCurve([0.05, 0.5], [1e-2, 1e-4], name) for name in ("PGV", "", "peak velocity")]
+    rates = [float(rk.hazard.toppling_rate(by_velocity, curve)) for curve in curves]
+    assert rates[0] > 0 and len(set(rates)) == 1
+    said = "Argument `curve` must be of the fragility's measure, PGV, but is PGA."
+    curve = rk.hazard.HazardCurve([0.05, 0.5], [1e-2, 1e-4], "PGA")
+    of_any = rk.hazard.TabulatedFragility(*table)
+    for call in (
+        lambda: rk.hazard.toppling_rate(by_velocity, curve),
+        lambda: rk.hazard.survival_probability([of_any, by_velocity], [1e3, 1e3], curve),
+        lambda: rk.hazard.allowed_scale([by_velocity], [1e3], curve),
+    ):
+        with pytest.raises(ValueError, match=said):
+            call()
+    with pytest.raises(ValueError, match="Argument `measure` must be of the fragility's measure, PGV, but is PGA."):
+        rk.hazard.write_nrml({"topples": by_velocity}, tmp_path / "fragility.xml")
+    spectral = rk.hazard.LogNormalFragility(0.3, 0.4, "SA(0.5)")
+    longer, same = (rk.hazard.HazardCurve([0.05, 0.5], [1e-2, 1e-4], name) for name in ("SA(0.6)", "SA(0.50)"))
+    assert float(rk.hazard.toppling_rate(spectral, same)) > 0
+    with pytest.raises(ValueError, match="fragility's measure, SA.0.5., but is SA.0.6."):
+        rk.hazard.toppling_rate(spectral, longer)
+
+
+def test_fragilities_know_their_measure():
+    found = rk.hazard.simulated_fragility(BLOCK, PULSES, [0.3, 0.6, 1.2], measure="PGV", **QUICK)
+    assert found.tabulated().measure == found.fit().fragility.measure == "PGV"
+
+
 # --------------------------------------------------------------------------------------- what explains most
 
 RANDOM = np.random.default_rng(11)

@@ -53,6 +53,23 @@ def test_a_box_is_a_rectangle(azimuth, width):
     assert float(found.restitution1) == pytest.approx(float(plane.restitution), rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: rk.blocks.AsymmetricBlock.from_mesh(box(), 90),
+        lambda: rk.blocks.Rock.from_mesh(box()).section(90),
+        lambda: rk.blocks.Rock.from_mesh(box()).edges(90),
+        lambda: rk.blocks.Rock.from_mesh(box()).slenderness([0, 90]),
+        lambda: rk.blocks.Rock.from_mesh(box()).widths(90),
+        lambda: rk.blocks.draw_rocks(rk.blocks.Rock.from_mesh(box()), 90, 3, tolerance=(0.001, 0.01)),
+        lambda: rk.plot.righting(rk.blocks.Rock.from_mesh(box()), 90),
+    ],
+)
+def test_degrees_are_refused(call):
+    with pytest.raises(ValueError, match="Argument `azimuth` must be finite, and in radians, from -2 pi to 2 pi, but"):
+        call()
+
+
 def test_a_box_askew():
     """Towards its corner it stands on that; the inertia is that about the axis across."""
     azimuth = np.arctan2(DEPTH, WIDTH)

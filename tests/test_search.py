@@ -75,6 +75,7 @@ def test_the_picture_of_a_search():
     lines = [line.get_xydata() for line in axis.lines if len(line.get_xydata()) > 1]
     assert len(lines) == 4 and (axis.get_ylabel(), axis.get_xlabel()) == ("amplitude [g]", "period [s]")
     np.testing.assert_allclose(lines[0][0], np.asarray(estimate.trace.values)[0, 0, ::-1])
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["from a start", "to where it ended"]
     plt.close("all")
 
 

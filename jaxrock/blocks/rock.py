@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from jaxrock._arguments import arguments, at_least, word_of
-from jaxrock._checks import Values, finite, positive, scalar
+from jaxrock._checks import Values, direction, finite, positive, scalar
 from jaxrock.blocks.base import arms_of, rolled, rounded_edge
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.mesh import surface_of
@@ -105,7 +105,7 @@ class Rock(NamedTuple):
 
         **Returns:** a `Section`.
 
-        **Raises:** ValueError for an azimuth that is not finite; for a cut whose centre is not above its ground.
+        **Raises:** ValueError for an azimuth beyond a full turn; for a cut whose centre is not above its ground.
         """
         narrow, points = self._seen(azimuth, plane)
         last = [rolled(points * [side, 1], corner * [side, 1], narrow.centre[1]) * [side, 1]
@@ -169,7 +169,7 @@ class Rock(NamedTuple):
     @arguments
     def slenderness(self, azimuth: Values) -> Float[np.ndarray, "azimuths"]:
         """Angle of the centre of mass over the point on which it rocks towards each azimuth [rad], (azimuths,)."""
-        azimuths = np.asarray(finite("azimuth", azimuth), float)
+        azimuths = np.asarray(direction("azimuth", azimuth), float)
         if azimuths.ndim != 1:
             raise ValueError(f"Argument `azimuth` must be a list, but has shape {azimuths.shape}.")
         return np.array([self._between(each).slenderness[0] for each in azimuths])
@@ -177,24 +177,27 @@ class Rock(NamedTuple):
     @arguments
     def widths(self, azimuth: ArrayLike) -> Float[np.ndarray, " n"]:
         """How far all vertices lie in the direction of an azimuth from the centre of mass [m]."""
-        return (self.vertices - self.centre)[:, :2] @ _direction(float(scalar("azimuth", finite("azimuth", azimuth))))
+        return self._widths(float(scalar("azimuth", direction("azimuth", azimuth))))
+
+    def _widths(self, azimuth: float) -> Float[np.ndarray, " n"]:
+        return (self.vertices - self.centre)[:, :2] @ _towards(azimuth)
 
     def _seen(self, azimuth: ArrayLike, plane: str) -> tuple[Section, Float[np.ndarray, "n 2"]]:
         """The section by the points on the ground alone; width, from the centre of mass, and height of all points."""
-        azimuth = float(scalar("azimuth", finite("azimuth", azimuth)))
-        points = np.stack([self.widths(azimuth), self.vertices[:, 2]], axis=1)
+        azimuth = float(scalar("azimuth", direction("azimuth", azimuth)))
+        points = np.stack([self._widths(azimuth), self.vertices[:, 2]], axis=1)
         if plane == "projection":
             return self._between(azimuth), points
         if self.faces is None:
             raise ValueError("Argument `plane` must be 'projection' for a rock without `faces`.")
-        return section_of_slab(Slab.cut(points, self.widths(azimuth + np.pi / 2), self.faces), self.tolerance)
+        return section_of_slab(Slab.cut(points, self._widths(azimuth + np.pi / 2), self.faces), self.tolerance)
 
     def _between(self, azimuth: float) -> Section:
         """The section by the points on the ground alone."""
-        direction = _direction(azimuth)
-        places = (self.base[:, :2] - self.centre[:2]) @ direction
+        towards = _towards(azimuth)
+        places = (self.base[:, :2] - self.centre[:2]) @ towards
         right, left = (np.array([places[k], self.base[k, 2]]) for k in (places.argmax(), places.argmin()))
-        axis = np.array([-direction[1], direction[0], 0.0])
+        axis = np.array([-towards[1], towards[0], 0.0])
         return Section(
             right, left, np.array([0.0, self.centre[2]]), float(np.sqrt(axis @ self.inertia @ axis)), (False, False)
         )
@@ -215,5 +218,5 @@ def section_of(mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str, 
     return found
 
 
-def _direction(azimuth: float) -> np.ndarray:
+def _towards(azimuth: float) -> np.ndarray:
     return np.array([np.cos(azimuth), np.sin(azimuth)])

@@ -71,7 +71,8 @@ def _entries(found: rk.hazard.SimulatedFragility, fits: dict) -> list[Entry]:
         if bound == "upper" and not found.undecided:
             continue
         errors = np.sqrt(np.diag(np.asarray(fit.covariance)))
-        words, key = ("", "") if not found.undecided else (f", {bound} bound", f"_{bound}")
+        counted = {"lower": "standing", "upper": "toppled"}[bound]
+        words, key = ("", "") if not found.undecided else (f", undecided as {counted}", f"_{bound}")
         said = "standard errors of their logarithms"
         known = f"{errors[0]:.3f}, {errors[1]:.3f}" if np.isfinite(errors).all() else "not known"  # one record has none
         entries += [

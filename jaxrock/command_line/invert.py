@@ -146,9 +146,12 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
     """Median and standard deviation by name."""
     known = ("amplitude", "duration", *_estimated(pulse))
     priors = {}
-    for name, *numbers in given:
-        if name not in known or name in priors:
-            raise ValueError(f"Argument `--prior` must name each of {', '.join(known)} at most once, but names {name}.")
+    for word, *numbers in given:
+        name = "duration" if word == "period" else word  # as the estimate calls it, if that is a pulse's extent
+        if name not in known:
+            raise ValueError(f"Argument `--prior` must name one of {', '.join(known)}, but names {word}.")
+        if name in priors:
+            raise ValueError(f"Argument `--prior` must name {name} at most once, but does so twice.")
         try:
             median, deviation = number(numbers[0]), number(numbers[1])
         except ValueError:

@@ -10,6 +10,8 @@ from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_record, add_restitution, model_of, number, record_of
 from jaxrock.command_line.output import Entry, Report, save, write_csv
 
+_FILMS = ("gif", "html", "mp4")
+
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=number, default=0.6, help="full width [m] (default 0.6)")
@@ -24,7 +26,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--animate",
         nargs="?",
         const="gif",
-        choices=("gif", "html", "mp4"),
+        choices=_FILMS,
         help="also write a film: a GIF, or as said; none of a block that never uplifts",
     )
     add_restitution(parser)
@@ -42,7 +44,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     report.table(_entries(size, block, record, model, result, response))
     _write(report, arguments.out, response)
     if arguments.animate:
-        _film(report, arguments.out / f"animation.{arguments.animate}", response, block)
+        _film(report, _film_in(arguments.out, arguments.animate), response, block)
     for status in (response.status, result.status):
         if status != rk.Status.successful:
             return report.failed(f"these are not results: {rk.Status[status]}")
@@ -91,6 +93,8 @@ def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
 def _write(report: Report, folder: Path, response: rk.responses.Response) -> None:
     """Files and figures of the response."""
     folder.mkdir(parents=True, exist_ok=True)
+    for ending in _FILMS:
+        _film_in(folder, ending).unlink(missing_ok=True)  # of an earlier run, which may have been of another block
     write_csv(report, folder / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
     write_csv(report, folder / "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
@@ -99,10 +103,13 @@ def _write(report: Report, folder: Path, response: rk.responses.Response) -> Non
     save(report, rk.plot.phase(response).figure, folder / "phase.png")
 
 
+def _film_in(folder: Path, ending: str) -> Path:
+    return folder / f"animation.{ending}"
+
+
 def _film(report: Report, path: Path, response: rk.responses.Response, block: rk.Block) -> None:
-    """The film, which takes a minute; none of a block that never moves, and none of an earlier run in its place."""
+    """The film, which takes a minute; none of a block that never moves."""
     if response.status == rk.Status.successful and float(response.max_rotation) == 0:
-        path.unlink(missing_ok=True)
         return report.say("no film: the block never uplifts")
     rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
     report.wrote(path)

@@ -319,8 +319,8 @@ class FlexibleScene(eqx.Module):
         grows, decays = mirrored(self.rocking)
         outward, inward = (state.side * self._amplitudes(state).real[k] for k in (grows, decays))
         rates = (self.rocking.rates[grows].real, -self.rocking.rates[decays].real)
-        ahead = jnp.where(state.side != 0, still_to_come(outward, inward, *rates), jnp.inf)
-        ahead /= self.numbers.balance**2
+        ahead = still_to_come(outward, inward, *rates) / self.numbers.balance**2
+        ahead = jnp.where(state.side != 0, ahead, jnp.inf)
         beyond = jnp.where(outward + inward > 0, jnp.minimum(state.closeness_beyond, ahead), ahead)
         fallen = jnp.where(state.fallen, state.closeness_beyond, beyond)
         return jnp.where(gone, -fallen, jnp.minimum(state.closeness, ahead))

@@ -40,7 +40,7 @@ class HazardCurve(eqx.Module):
       least 2.
     - `rates`: (n,) exceedances a year, 0 or more, never rising. Not known are the first ones if infinite (the
       probability was 1 to rounding), and the last ones if zero (it was 0 to rounding).
-    - `measure`: what the levels are, such as "PGA"; a label.
+    - `measure`: what the levels are, such as "PGA"; a label, which fragilities over another measure refuse.
 
     Both may have more axes in front, for use under `jax.vmap`.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact
 
+from jaxrock._arguments import arguments
 from jaxrock._checks import (
     Values,
     as_real,
@@ -26,6 +27,7 @@ from jaxrock._checks import (
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock.motions.measures import are_different
 from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
@@ -34,7 +36,7 @@ Real = Inexact[Array, "..."]
 class AbstractFragility(Owner):
     """The probability that a rock topples, against the intensity of the shaking: what every fragility offers.
 
-    One of your own needs `__call__`, and `knots` if it is not smooth.
+    One of your own needs `__call__`, and `knots` if it is not smooth; it may have a `measure`.
     """
 
     __repr__ = described
@@ -56,15 +58,19 @@ class LogNormalFragility(AbstractFragility):
 
     - `median`: intensity that topples half of the time, in the unit of the hazard curve, positive.
     - `dispersion`: standard deviation of the logarithm of the intensity that topples [-], positive.
+    - `measure`: what the intensity is, such as "PGA"; a label, which a hazard curve of another measure refuses.
 
     **Raises:** ValueError for a value outside its range.
     """
 
     median: Real = parameter("-", positive)
     dispersion: Real = parameter("-", positive)
+    measure: str = eqx.field(static=True)
 
-    def __init__(self, median: ArrayLike, dispersion: ArrayLike):
+    @arguments
+    def __init__(self, median: ArrayLike, dispersion: ArrayLike, measure: str = ""):
         set_parameters(self, median=median, dispersion=dispersion)
+        self.measure = measure
 
     def __call__(self, level: Values) -> Real:
         level = if_known(at_level, "level", level)
@@ -75,6 +81,11 @@ class LogNormalFragility(AbstractFragility):
     def knots(self) -> Inexact[Array, " knots"]:
         # Eight standard deviations away the probability is 0 or 1 to rounding.
         return self.median * jnp.exp(self.dispersion * jnp.array([-8.0, -4.0, 0.0, 4.0, 8.0]))
+
+
+def lognormal_of(median: Real, dispersion: Real, measure: str) -> LogNormalFragility:
+    """A lognormal fragility of numbers that may be NaN, which the constructor refuses."""
+    return eqx.tree_at(lambda f: (f.median, f.dispersion), LogNormalFragility(1.0, 1.0, measure), (median, dispersion))
 
 
 @one_program
@@ -95,17 +106,21 @@ class TabulatedFragility(AbstractFragility):
 
     - `levels`: (n,) intensities, in the unit of the hazard curve, positive and rising; n at least 2.
     - `probabilities`: (n,) of toppling, in [0, 1]; they may rise and fall, as overturning does with amplitude.
+    - `measure`: as of `LogNormalFragility`.
 
     **Raises:** ValueError for values outside their ranges, or of other shapes.
     """
 
     levels: Inexact[Array, "*batch n"]
     probabilities: Inexact[Array, "*batch n"]
+    measure: str = eqx.field(static=True)
 
-    def __init__(self, levels: Values, probabilities: Values):
+    @arguments
+    def __init__(self, levels: Values, probabilities: Values, measure: str = ""):
         levels = rising("levels", levels)
         self.levels, probabilities = alike(levels, share("probabilities", probabilities))
         self.probabilities = beside("probabilities", probabilities, levels)
+        self.measure = measure
 
     def __call__(self, level: Values) -> Real:
         return _interpolated(if_known(at_level, "level", level), self.levels, self.probabilities)
@@ -121,6 +136,13 @@ def _interpolated(level: Real, levels: Real, probabilities: Real) -> Real:
     inside = jnp.where(below | above, levels[0], level)  # logarithms of 0 and of infinity have no slopes
     between = jnp.interp(jnp.log(inside), jnp.log(levels), probabilities)
     return jnp.where(below, 0.0, jnp.where(above, probabilities[-1], between))
+
+
+def check_measure(name: str, measure: str, fragility: AbstractFragility) -> None:
+    """That an argument tells the measure of a fragility, as far as both are known."""
+    own = str(getattr(fragility, "measure", ""))
+    if are_different(measure, own):
+        raise ValueError(f"Argument `{name}` must be of the fragility's measure, {own}, but is {measure}.")
 
 
 def rising(name: str, value: Values) -> Inexact[Array, "*batch n"]:
@@ -284,13 +306,8 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     status = FitStatus.where(growing, FitStatus.successful, FitStatus.not_growing)
     status = FitStatus.where(converged, status, FitStatus.not_converged)
     status = FitStatus.where(separable, FitStatus.separable, status)
-    fit = (
-        LogNormalFragility(1.0, 1.0),
-        jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T)),
-        likelihood,
-    )
-    # Put in afterwards: the constructor refuses NaN.
-    fit = eqx.tree_at(lambda f: (f[0].median, f[0].dispersion), fit, (median, dispersion))
+    covariance = jnp.linalg.inv(rows @ (-curvature[:, None] * rows.T))
+    fit = lognormal_of(median, dispersion, ""), covariance, likelihood
     good = status == FitStatus.successful
     fit = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), fit)
     test = slope_tests((logarithm - centre)[None], toppled, survived)[0]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxrock._arguments import arguments, path_of
 from jaxrock._aside import written_aside
 from jaxrock._checks import shown
-from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility
+from jaxrock.hazard.fragility import LogNormalFragility, TabulatedFragility, check_measure
 from jaxrock.hazard.openquake import units_of_openquake
 
 _SPACE = "http://openquake.org/xmlns/nrml/0.5"
@@ -38,8 +38,8 @@ def write_nrml(
     OpenQuake draws straight lines between the levels of a table, `TabulatedFragility` straight lines over their
     logarithms: they differ between levels far apart.
 
-    **Raises:** ValueError for fragilities that do not go together, or spectral velocities; OSError if the file cannot
-    be written.
+    **Raises:** ValueError for fragilities that do not go together, or of another measure, or spectral velocities;
+    OSError if the file cannot be written.
     """
     if measure.startswith("SV("):
         raise ValueError(f"Argument `measure` must be one that OpenQuake knows, as SA, but is {measure!r}.")
@@ -50,6 +50,8 @@ def write_nrml(
             "Argument `fragilities` must hold fragilities by name, all lognormal or all tabulated, but is "
             f"{shown(fragilities)}."
         )
+    for each in fragilities.values():
+        check_measure("measure", measure, each)
     fragilities = {name: _in_unit(each, units_of_openquake(measure)) for name, each in fragilities.items()}
     root = ElementTree.Element("nrml", xmlns=_SPACE)
     model = ElementTree.SubElement(

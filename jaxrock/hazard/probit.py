@@ -86,7 +86,7 @@ class ProbitFit(AbstractTable):
         """
         if len(self.names) != 1 or not self.slopes[0] > 0:
             raise ValueError("A lognormal fragility must have one measure, with which the probability grows.")
-        return LogNormalFragility(jnp.exp(-self.intercept / self.slopes[0]), 1 / self.slopes[0])
+        return LogNormalFragility(jnp.exp(-self.intercept / self.slopes[0]), 1 / self.slopes[0], self.names[0])
 
 
 @arguments

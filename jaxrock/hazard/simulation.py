@@ -24,6 +24,7 @@ from jaxrock.hazard.fragility import (
     FragilityFit,
     TabulatedFragility,
     fit_fragility,
+    lognormal_of,
     probit,
     rising_list,
     slope_tests,
@@ -122,7 +123,7 @@ class SimulatedFragility(AbstractTable):
     def tabulated(self, bound: str | None = None) -> TabulatedFragility:
         """Shares at the levels as a fragility, which rises and falls as they do. `bound`: as in `counts`."""
         motions, _, draws = self.verdict.shape
-        return TabulatedFragility(self.levels, self.counts(bound).sum(axis=0) / (motions * draws))
+        return TabulatedFragility(self.levels, self.counts(bound).sum(axis=0) / (motions * draws), self.measure)
 
     def fit(self, bound: str | None = None) -> FragilityFit:
         """The lognormal fragility under which the verdicts are most probable.
@@ -152,7 +153,8 @@ class SimulatedFragility(AbstractTable):
             covariance, test = _clustered(fit, self.levels, *placed((toppled, np.asarray(trials))))
         if np.all(toppled == toppled[0]):
             covariance = unknown
-        return eqx.tree_at(lambda f: (f.covariance, f.p_value), fit, (covariance, test))
+        fragility = lognormal_of(fit.fragility.median, fit.fragility.dispersion, self.measure)
+        return eqx.tree_at(lambda f: (f.fragility, f.covariance, f.p_value), fit, (fragility, covariance, test))
 
     def intervals(self, bound: str | None = None, confidence: ArrayLike = 0.95) -> FragilityIntervals:
         """Confidence intervals of the fit's median and dispersion, which hold for few motions: Student's t for the

@@ -84,7 +84,7 @@ class SurfaceFragility(eqx.Module):
 
     def at(self, ratio: ArrayLike) -> LogNormalFragility:
         """The fragility in peak acceleration of motions of one PGV/PGA [s]."""
-        return LogNormalFragility(self._median(ratio), self.dispersion)
+        return LogNormalFragility(self._median(ratio), self.dispersion, "PGA")
 
     def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
@@ -275,7 +275,7 @@ class SimulatedSurface(eqx.Module):
         shares = jnp.asarray(self.upper if upper else self.lower)
         place = jnp.log(ratio)
         row = jax.vmap(lambda share: jnp.interp(place, jnp.log(self.ratio), share))(shares)
-        return TabulatedFragility(self.acceleration, row)
+        return TabulatedFragility(self.acceleration, row, "PGA")
 
     def fit(self, bound: str | None = None) -> SurfaceFit:
         """The two-measure lognormal fragility of all cells: a smooth summary.

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, checked, inner_share, not_negative, placed, scalar, share
 from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled, shakings
-from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility
+from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, check_measure
 from jaxrock.numerics.roots import search_root
 
 Number = Inexact[Array, ""]
@@ -38,6 +38,12 @@ _Stack = tuple[AbstractFragility, int]  # how many are in it, which a fragility 
 _FACTORS = np.geomspace(1e-4, 1e4, 161)
 
 
+def _check(fragilities: Fragilities, curve: HazardCurve) -> None:
+    check_one(curve)
+    for each in _one_or_many("fragilities", fragilities):
+        check_measure("curve", curve.measure, each)
+
+
 @arguments
 def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     """Annual rate of shakings that topple a rock: the fragility integrated over the rates of the hazard curve.
@@ -50,11 +56,11 @@ def toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     **Returns:** the rate [1/year]. A lognormal fragility is integrated in closed form over each power law, any other
     by Gauss-Legendre quadrature between levels and knots.
 
-    **Raises:** ValueError for several curves or fragilities in one.
+    **Raises:** ValueError for several curves or fragilities in one, and for those of different measures.
 
     **Source:** Cornell, Jalayer, Hamburger & Foutch (2002), the integral, and its closed form over one power law.
     """
-    check_one(curve)
+    _check(fragility, curve)
     _rocks(fragility, 0.0)
     return _toppling_rate(fragility, curve)
 
@@ -75,9 +81,9 @@ def survival_probability(fragilities: Fragilities, ages: Values, curve: HazardCu
 
     **Returns:** the probability.
 
-    **Raises:** ValueError for ages outside their range, or not as many as rocks.
+    **Raises:** ValueError for ages outside their range, or not as many as rocks, and for another measure's curve.
     """
-    check_one(curve)
+    _check(fragilities, curve)
     return jnp.exp(-_topplings(*_rocks(fragilities, ages), curve))
 
 
@@ -124,11 +130,11 @@ def allowed_scale(fragilities: Fragilities, ages: Values, curve: HazardCurve, pr
     up at 20 factors a decade: where a fragility that rises and falls makes it dip for less than that, the dip may be
     missed. A large factor brings the weakest shakings into play: compare with that of `curve.extended`.
 
-    **Raises:** ValueError for arguments outside their ranges.
+    **Raises:** ValueError for arguments outside their ranges, and for another measure's curve.
 
     **Source:** Anderson & Brune (1999), the rule of rejection.
     """
-    check_one(curve)
+    _check(fragilities, curve)
     probability = scalar("probability", inner_share("probability", probability))
     return _allowed_scale(*_rocks(fragilities, ages), curve, -jnp.log(probability))
 

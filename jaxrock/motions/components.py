@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, list_of, word_of
-from jaxrock._checks import finite, one_program, scalar, shown
+from jaxrock._checks import direction, one_program, scalar, shown
 from jaxrock._described import described
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
@@ -81,9 +81,9 @@ class Components(eqx.Module):
         **Returns:** a `Record`: cos(angle) first + sin(angle) second. `with_vertical(components.vertical)` adds the
         vertical component.
 
-        **Raises:** ValueError for an angle that is not finite.
+        **Raises:** ValueError for an angle beyond a full turn.
         """
-        angle = scalar("angle", finite("angle", angle))
+        angle = scalar("angle", direction("angle", angle))
         samples = _combined(angle, self.first.samples, self.second.samples)
         name = "" if not self.first.name else f"{self.first.name}, turned"
         return Record(samples, self.first.dt, name, self.first.origin._replace(component=""))

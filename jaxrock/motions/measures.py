@@ -41,6 +41,17 @@ def unit_of(name: str) -> str:
     return _AT_PERIOD[spectral[1]][1] if spectral else _NAMED[name][1] if name in _NAMED else ""
 
 
+def are_different(first: str, second: str) -> bool:
+    """Whether two names stand for different measures of the package; of another name nothing is known."""
+
+    def parts(name):
+        spectral = _SPECTRAL.fullmatch(name)
+        return (spectral[1], float(spectral[2])) if spectral else (name, None) if name in _NAMED else None
+
+    first, second = parts(first), parts(second)
+    return None not in (first, second) and first != second
+
+
 def measure_of(name: str, value: str | Callable) -> Measure:
     """The measure that a word or a function stands for: an argument of this name.
 

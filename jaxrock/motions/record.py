@@ -71,8 +71,8 @@ class Record(Straight):
 
     **Arguments:**
 
-    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1. Or (..., n) of many records of one
-      length, for use under `jax.vmap`.
+    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1 (of one, it lasts no time and moves
+      nothing). Or (..., n) of many records of one length, for use under `jax.vmap`.
     - `dt`: time between samples [s], positive.
     - `name`: where it comes from; shown in tables and figures. Compiled functions do not see it: one serves all names,
       and a record that it returns has the name that the first one had.

@@ -203,7 +203,9 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
     # The top moves, too, which second derivatives feel.
     top = jnp.where(place > 0, implicit(_to_top, jnp.maximum(place, 0.0), curve), 0.0)
     of_end, of_top = jax.vmap(curve.jet)(jnp.stack([end, top]))[:, 0]
-    at_end = ~nowhere & (of_end >= least)
+    # Where the curve still rises at its end, its top is next to that, and by rounding may be the higher of the two.
+    noise = tables.errors[0] @ jnp.abs(jnp.exp(tables.rates * last)) + tables.floor[0]
+    at_end = ~nowhere & (of_end >= least - noise)
     return jnp.where(at_end, of_end, jnp.where(place >= 0, of_top, best)), x >= last
 
 

@@ -39,22 +39,23 @@ def feasible_region(
     below = np.asarray(region.log_likelihood - region.log_likelihood.max())[np.ix_(up, across)]
     shade = draw_cells(axis, columns, rows, np.maximum(below, -20), cmap="Blues")
     axis.figure.colorbar(shade, ax=axis, label="log-likelihood, less that of the best", extend="min")
-    if min(below.shape) > 1:  # a line of cells has no border
+    if min(below.shape) > 1 and below.min() < np.log(0.05):  # else there is no border
         axis.contour(columns, rows, below, levels=[np.log(0.05)], colors="black", linewidths=1, linestyles="solid")
+        axis.plot([], [], color="black", linewidth=1, label="95 % region")
     if curve is not None:
         broken_curve(axis, *curve, color=RED, linewidth=1, label="up to here all that stand, stand")
     ends = limits_of(columns), limits_of(rows)
     if estimate is not None and set(region.names) <= set(estimate.names):
         place = [float(estimate[name]) for name in region.names[::-1]]
         inside = all(low <= x <= high for x, (low, high) in zip(place, ends))
-        axis.plot(*place, "k+", markersize=9, label="most likely" if inside else None)
+        axis.plot(*place, "k+", markersize=9, clip_on=not inside, label="most likely" if inside else None)
     for values, scale in ((rows, axis.set_yscale), (columns, axis.set_xscale)):
         if values.min() > 0:
             scale("log")
     log_ticks(axis)
     axis.set(xlim=ends[0], ylim=ends[1], ylabel=_label(region.names[0]), xlabel=_label(region.names[1]))
     if axis.get_legend_handles_labels()[0]:
-        axis.legend(frameon=False, fontsize=8)
+        axis.legend(fontsize=8, framealpha=0.8)
     return axis
 
 
@@ -98,9 +99,12 @@ def search(estimate: Estimate, region: FeasibleRegion | None = None, axis: "Axes
     else:
         axis.set(ylabel=_label(names[0]), xlabel=_label(names[1]))
     rows, columns = (np.asarray(estimate.trace.values)[..., estimate.names.index(name)] for name in names)
+    told: dict[str, str | None] = {"way": "from a start", "end": "to where it ended"}
     for row, column in zip(rows.T, columns.T):
         here = np.flatnonzero(~np.isnan(row))
         if here.size:
-            axis.plot(column[here], row[here], color=GREY, linewidth=0.7)
-            axis.plot(column[here[-1]], row[here[-1]], ".", color=RED, markersize=4)
+            axis.plot(column[here], row[here], color=GREY, linewidth=0.7, label=told.pop("way", None))
+            axis.plot(column[here[-1]], row[here[-1]], ".", color=RED, markersize=4, label=told.pop("end", None))
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8, framealpha=0.8)
     return axis

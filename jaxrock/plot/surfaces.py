@@ -72,6 +72,8 @@ def spectrum(result: Spectrum, axes: "Sequence[Axes] | None" = None, *, by_durat
         shade(axis, abscissa, lost.all(axis=0), color=RED, alpha=0.15, linewidth=0, label=said)
         if axis.dataLim.y1 <= 0:  # all overturned, or all at rest
             axis.set_ylim(0, 1, auto=True)
+    if known.any() and not lost.any() and all(axis.dataLim.y1 <= 0 for axis in axes):
+        axes[0].text(0.5, 0.5, "no block uplifts", ha="center", color=GREY, transform=axes[0].transAxes)
     axes[0].set_ylabel(r"peak rotation $\theta_{max}/\alpha$")
     axes[1].set_ylabel(r"peak velocity $\dot\theta_{max}/(p\alpha)$")
     self_similar = result.intensity is not None

@@ -105,7 +105,8 @@ def critical_amplitudes(
     - `derivatives`: whether to find `derivative`; without, it is not a number (NaN). None: for known arguments; of
       traced ones JAX takes derivatives of `value`, and of what is traced.
     - `max_ends`: how many ends to look for, from the lowest on, 1 to 256; there are so many results then, filled up.
-      None: all there are, which takes much longer under records; traced arguments need a number.
+      None: all there are, which under records takes minutes where the range is wide, also where it finds no more
+      (the bar grows with what there is still to look at); traced arguments need a number.
     - `progress`: as in `rocking_spectrum`.
 
     **Returns:** a `Critical`. Intervals of overturning that are much narrower than the sampling and give no sign of
