@@ -10,7 +10,7 @@ class Progress:
 
     def __init__(self, total: int, label: str, shown: bool | None = None):
         self.total, self.done, self.bar = total, 0, None
-        if _is_watched() if shown is None else shown:
+        if total > 0 and (_is_watched() if shown is None else shown):
             self.bar = _kind()(total=total, desc=label, delay=0 if shown else 1)
 
     def add(self, more: int) -> None:

@@ -55,7 +55,7 @@ PUBLIC = {
     ),
     "a fragility": (
         lambda: rk.hazard.LogNormalFragility(0.4, 0.3),
-        r"\(median=0\.4, dispersion=0\.3\)",
+        r"\(median=0\.4, dispersion=0\.3, measure=''\)",
     ),
     "a hazard curve": (
         lambda: rk.hazard.HazardCurve([0.1, 0.2], [0.1, 0.01]),

@@ -201,9 +201,12 @@ def test_checks_do_not_keep_a_program_from_the_cache():
     assert "callback" not in str(jax.make_jaxpr(traced)(0.5, ()))
 
 
-def test_progress(capsys):
-    rk.sweep(simple, **lists(3, 4), progress=True)
-    assert "12/12" in capsys.readouterr().err
+def test_progress(capsys, tmp_path):
+    """No bar of a store that is finished."""
+    for said in ("12/12", "12 of 12 points come from"):
+        rk.sweep(simple, **lists(3, 4), progress=True, store=tmp_path / "store")
+        told = capsys.readouterr().err
+        assert said in told and "0it" not in told
     rk.sweep(simple, **lists(3, 4))
     assert capsys.readouterr().err == ""
 

@@ -44,7 +44,7 @@ def history_fit(fit: HistoryFit, time: ArrayLike, axes: "Sequence[Axes] | None" 
     axes[1].plot(time, fit.residuals / alpha, ".", color=RED, markersize=3)
     axes[1].axhline(0, color=GREY, linewidth=0.5)
     axes[0].set_ylabel(r"rotation $\theta/\alpha$")
-    axes[1].set(xlabel="time [s]", ylabel="residual")
+    axes[1].set(xlabel="time [s]", ylabel=r"residual $\theta/\alpha$")
     axes[0].legend(fontsize=8, frameon=False, loc="upper right")
     return axes
 
