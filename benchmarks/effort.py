@@ -89,9 +89,8 @@ def main():
         same = len({each[3] for each in (*found[0], *found[3])}) == 1
         for effort, answers in found.items():
             first, of_llvm, then = (statistics.median(x) for x in list(zip(*answers, strict=True))[:3])
-            rows.append(
-                [question, effort, f"{first:.2f}", f"{of_llvm:.2f}", f"{1e3 * then:.3f}", "yes" if same else "no"]
-            )
+            numbers = f"{first:.2f}", f"{of_llvm:.2f}", f"{1e3 * then:.3f}"
+            rows.append([question, str(effort), *numbers, "yes" if same else "no"])
     heads = ["question", "effort", "first answer [s]", "of it LLVM [s]", "the next [ms]", "same to the bit"]
     text = f"""# LLVM's effort
 
@@ -99,7 +98,8 @@ Written by `python benchmarks/effort.py`, {surroundings()}.
 
 Machine code of one program, compiled by LLVM with effort 0 and 3: processor seconds of the first answer in a fresh
 process with nothing kept, of LLVM within it, and the least time of the answers after it; medians of {TIMES}, in turns.
-The package compiles closed forms of one number with effort 0, all else with 3 (`jaxrock.native.machine.EFFORT`).
+The package compiles closed forms of one number with effort 0, all else with 3 (`jaxrock.native.machine.EFFORT`). Of one
+number the last bit may differ: effort 3 computes the last operations for one lane only, and rounds them otherwise.
 
 {table(heads, rows)}
 """
