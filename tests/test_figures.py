@@ -405,7 +405,7 @@ def test_a_spectrum_of_none_that_rocks_starts_at_zero(lost):
     found = spectrum_of([lost, lost], [1.0, 2.0])
     axes = rk.plot.spectrum(eqx.tree_at(lambda x: (x.max_rotation, x.max_velocity), found, (peaks, peaks)))
     assert [axis.get_ylim() for axis in axes] == [(0, 1)] * 2
-    assert [text.get_text() for text in axes[0].texts] == [] if lost else ["no block uplifts"]
+    assert [text.get_text() for text in axes[0].texts] == ([] if lost else ["no block uplifts"])
 
 
 def test_the_legend_of_many_intensities_lies_beside_the_curves():

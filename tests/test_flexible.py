@@ -346,8 +346,8 @@ def by_width():
 
 @pytest.mark.parametrize("count", [16, pytest.param(200, marks=pytest.mark.slow)])
 def test_slopes_of_largest_values_wherever_they_are(count):
-    """At a top, at the kink of an impact, and where the history ends while they still grow: there one in seven was
-    wrong. That of the margin where the base stands still, too, where it was no number."""
+    """At a top, at the kink of an impact, and where the history ends while they still grow, where they were wrong. That
+    of the margin where the base stands still, too, where it was no number."""
     random = np.random.default_rng(1)
     given = (
         random.uniform(0.25, 0.6, count),

@@ -724,7 +724,7 @@ def test_programs_have_names_of_their_own():
     program, other = (jax.make_jaxpr(lambda x, factor=factor: [jnp.exp(x) * factor])(1.0) for factor in (3, 4))
 
     def name(program, shared, lanes=8):
-        return machine.registered(program, [shared], kernels.emit, lanes)
+        return machine.registered(program, [shared], kernels.emit, lanes, 3)
 
     assert name(program, False) == name(program, False)
     assert len({name(program, False), name(program, True), name(other, False), name(program, False, lanes=2)}) == 4

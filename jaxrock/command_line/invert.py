@@ -76,8 +76,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar=("PARAMETER", "MEDIAN", "SD"),
-        help="what is known beforehand of amplitude, duration or shape, with the standard deviation of its logarithm "
-        "(of the shape itself): the estimate is the most probable motion then; once for each",
+        help="what is known beforehand of amplitude, duration (or period) or shape, with the standard deviation of its "
+        "logarithm (of the shape itself): the estimate is the most probable motion then; once for each",
     )
     parser.add_argument(
         "--starts", type=int, default=64, help="points from which the maximum is looked for (default 64)"

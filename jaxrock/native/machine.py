@@ -17,9 +17,10 @@ from jaxrock.keeping import folder
 from jaxrock.native.interface import add_handler
 from jaxrock.native.operations import Unsupported
 
-# LLVM's effort, 0 to 3: at what runs for microseconds, in one lane, and at all else (see `Plan`). With 0 it takes half
-# of the time or less, and on x86, where this was measured (`benchmarks/effort.py`), numbers of many lanes are the same
-# to the bit; with 3 it rounds the last operations of one lane otherwise. The code takes up to three times as long.
+# LLVM's effort, 0 to 3: at what runs for microseconds, in one lane, and at all else (see `Plan`). With 0 it takes a
+# third to two thirds of the time, and on x86, where this was measured (`benchmarks/effort.py`), numbers of many lanes
+# are the same to the bit; with 3 it rounds the last operations of one lane otherwise. The code takes up to three times
+# as long.
 EFFORT = {"in a moment": 0 if platform.machine() in ("x86_64", "AMD64") else 3, "for long": 3}
 
 
@@ -103,7 +104,7 @@ def machine() -> str:
     return _machine().told
 
 
-def registered(program, shared: list[bool], emit: Callable, lanes: int, effort: int = EFFORT["for long"]) -> str:
+def registered(program, shared: list[bool], emit: Callable, lanes: int, effort: int) -> str:
     """The name under which XLA finds the machine code of a program: made of its text, so that compiled programs that a
     cache keeps find it again."""
     if not is_known():
@@ -112,7 +113,7 @@ def registered(program, shared: list[bool], emit: Callable, lanes: int, effort: 
     return kept(module, len(program.jaxpr.outvars), 1 + len(shared), effort)
 
 
-def kept(module: Module, outputs: int, inputs: int, effort: int = EFFORT["for long"]) -> str:
+def kept(module: Module, outputs: int, inputs: int, effort: int) -> str:
     """The name under which XLA finds the machine code of the function `program` of a module."""
     add_handler(module, outputs, inputs)
     text = str(module)

@@ -15,7 +15,7 @@ from llvmlite import ir
 
 from jaxrock.native.call import Plan, lanes_of, ran, room_for
 from jaxrock.native.kernels import Frame, is_long
-from jaxrock.native.machine import kept
+from jaxrock.native.machine import EFFORT, kept
 from jaxrock.native.pool import count_up
 
 _I1, _I8, _I32, _I64 = ir.IntType(1), ir.IntType(8), ir.IntType(32), ir.IntType(64)
@@ -27,10 +27,11 @@ class Postponed:
 
     def __init__(self, plan: Plan):
         self._plan = plan
-        own, results = plan.own, plan.results
-        self._listed = kept(_listed(), 2, 3)
-        self._collected = kept(_moved(own, own, _collect), len(own), 2 + len(own))
-        self._put_back = kept(_moved([*results, *results], results, _put_back), len(results), 2 + 2 * len(results))
+        own, results, effort = plan.own, plan.results, EFFORT["for long"]
+        self._listed = kept(_listed(), 2, 3, effort)
+        self._collected = kept(_moved(own, own, _collect), len(own), 2 + len(own), effort)
+        put_back = _moved([*results, *results], results, _put_back)
+        self._put_back = kept(put_back, len(results), 2 + 2 * len(results), effort)
 
     @classmethod
     def of(cls, plan: Plan) -> "Postponed | None":

@@ -87,6 +87,10 @@ class _Tables(eqx.Module):
             floor=sides.at[0].add(eps * jnp.abs(level)),
         )
 
+    def noise(self, turned: Complex[Array, " modes"]) -> Inexact[Array, " two"]:
+        """What rounding may have changed in value and slope, where the modes have grown and turned so much."""
+        return self.errors @ jnp.abs(turned) + self.floor
+
 
 def _partial_sums(terms: Inexact[Array, "*rows modes"]) -> Inexact[Array, "*rows sums"]:
     """Sums of the first 0, 1, ... modes."""
@@ -108,7 +112,7 @@ class _View:
         self.slow, self.drift = smooth[:2, None] + _partial_sums(terms[:2])
         swing, bend = _partial_sums(sizes[:2])
         self.swing, self.bend = swing[-1] - swing, largest[0] + bend
-        self.noise = tables.errors @ jnp.abs(turned) + tables.floor
+        self.noise = tables.noise(turned)
         # What cannot leave the noise may be passed over.
         still = jnp.maximum(jnp.abs(self.slope), self.noise[1])
         within = _ratio(self.noise[0], still), jnp.sqrt(_ratio(self.noise[0], self.curvature))
@@ -204,8 +208,7 @@ def highest(curve: Curve, best: Scalar, end: Scalar) -> tuple[Scalar, Flag]:
     top = jnp.where(place > 0, implicit(_to_top, jnp.maximum(place, 0.0), curve), 0.0)
     of_end, of_top = jax.vmap(curve.jet)(jnp.stack([end, top]))[:, 0]
     # Where the curve still rises at its end, its top is next to that, and by rounding may be the higher of the two.
-    noise = tables.errors[0] @ jnp.abs(jnp.exp(tables.rates * last)) + tables.floor[0]
-    at_end = ~nowhere & (of_end >= least - noise)
+    at_end = ~nowhere & (of_end >= least - tables.noise(jnp.exp(tables.rates * last))[0])
     return jnp.where(at_end, of_end, jnp.where(place >= 0, of_top, best)), x >= last
 
 
