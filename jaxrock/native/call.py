@@ -28,7 +28,7 @@ from jaxrock.native.machine import (
     registered,
 )
 from jaxrock.native.parted import emit_parted, has_parts
-from jaxrock.native.partition import ahead, around_loop, computed
+from jaxrock.native.partition import Part, ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
 from jaxrock.native.pool import HAS_THREADS
 from jaxrock.native.unmarked import unmarked
@@ -65,12 +65,13 @@ class Plan:
         program = hoisted(program, _is_before_loops)
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
         self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()
-        self._once, self._each, rest = ahead(program, shared, is_known, _is_large)
+        self._first, once, self._each, rest = ahead(program, shared, is_known, _is_large)
         before = self._each.program.jaxpr.eqns
         if unknown := {equation.primitive.name for equation in before if not is_known(equation)}:
             _LOG.debug(
                 "%d operations are done before by XLA: not known are %s", len(before), ", ".join(sorted(unknown))
             )
+        self._once = self._of_all(once)
         self._rest, own, self._pieces = rest.inputs, self._first_own(), []
         effort = EFFORT["in a moment" if alone and not refilled else "for long"]
         # Of what becomes machine code only names stay: programs take more memory than all else.
@@ -82,10 +83,18 @@ class Plan:
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(name, part.inputs, part.outputs))
 
+    def _of_all(self, part: Part) -> _Piece:
+        """What all lanes share, in one lane: of numbers XLA would compile every few operations for themselves."""
+        name = ""
+        if part.outputs:
+            writes, lanes = functools.partial(emit, alone=True), lanes_for(None, False, False)
+            name = registered(part.program, [True] * len(part.inputs), writes, lanes, EFFORT["in a moment"])
+        return _Piece(name, part.inputs, part.outputs)
+
     @property
     def names(self) -> list[str]:
         """Of all machine code that it calls."""
-        return [piece.name for piece in self._pieces]
+        return [piece.name for piece in [self._once, *self._pieces] if piece.name]
 
     def _first_own(self) -> set:
         """Variables that a lane has of its own before its machine code runs."""
@@ -142,7 +151,10 @@ class Plan:
     def _prepared(self, leaves: list) -> dict:
         """Values of variables before machine code runs."""
         values = dict(zip(self._inputs, leaves))
-        computed(self._once, values, batched=False)
+        computed(self._first, values, batched=False)
+        if self._once.name:
+            self._add(self._once, values, np.ones(3, np.int32), 1)
+            values.update((v, values[v].reshape(v.aval.shape)) for v in self._once.outputs)
         computed(self._each, values, batched=True)
         own = self._first_own()
         values.update((v, values[v][0]) for v in self._each.outputs if v not in own)
@@ -151,10 +163,15 @@ class Plan:
     def _run(self, values: dict, sizes, room: int) -> list:
         """The machine code: what the program returns, the axis of lanes behind."""
         arrays = []
-        for name, inputs, outputs in self._pieces:
-            results = [jax.ShapeDtypeStruct((*v.aval.shape, room), v.aval.dtype) for v in outputs]
-            arrays = ran(name, results, sizes, *(values[v] for v in inputs))
-            values.update((v, x) for v, x in zip(outputs, arrays) if not isinstance(v, Literal))
+        for piece in self._pieces:
+            arrays = self._add(piece, values, sizes, room)
+        return arrays
+
+    def _add(self, piece: _Piece, values: dict, sizes, room: int) -> list:
+        """Results of a piece of machine code, which are added to the values of variables."""
+        results = [jax.ShapeDtypeStruct((*v.aval.shape, room), v.aval.dtype) for v in piece.outputs]
+        arrays = ran(piece.name, results, sizes, *(values[v] for v in piece.inputs))
+        values.update((v, x) for v, x in zip(piece.outputs, arrays) if not isinstance(v, Literal))
         return arrays
 
 

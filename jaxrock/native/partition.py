@@ -43,11 +43,21 @@ def needed_by(equations: list, outputs: list) -> dict:
     return dict.fromkeys(v for v in used if not isinstance(v, Literal))
 
 
-def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long: Callable) -> tuple[Part, Part, Part]:
-    """What XLA computes first, of what all lanes share and of each lane's own; and the rest.
+class Parts(NamedTuple):
+    """What XLA computes `first` of what all lanes share, what machine code computes of it `once`, what XLA computes of
+    `each` lane's own, and the `rest`, of machine code."""
 
-    All that lanes share is computed once. A lane's own is left to the rest, but for long arrays, and operations that
-    are not known, with what they need; loops are in the rest, and what follows from it.
+    first: Part
+    once: Part
+    each: Part
+    rest: Part
+
+
+def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long: Callable) -> Parts:
+    """A program in parts, in the order in which they run.
+
+    Long arrays, and operations that are not known, are XLA's, with what they need; but for loops over a lane's own, and
+    what follows from these.
     """
     jaxpr = program.jaxpr
     needed = set()
@@ -57,25 +67,24 @@ def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long:
             needed.update(equation.outvars)
             needed.update(v for v in equation.invars if not isinstance(v, Literal))
     own = {v for v, same in zip(jaxpr.invars, shared, strict=True) if not same}
-    parts, later = ([], [], []), set()
+    first, once, each, rest, later = [], [], [], [], set()
     for equation in jaxpr.eqns:
         inputs = {v for v in equation.invars if not isinstance(v, Literal)}
-        if inputs & later or (inputs & own and not needed.intersection(equation.outvars)):
+        is_needed = bool(needed.intersection(equation.outvars))
+        if inputs & later or (inputs & own and not is_needed):
             later |= set(equation.outvars)
-            parts[2].append(equation)
+            rest.append(equation)
         elif inputs & own:
             own |= set(equation.outvars)
-            parts[1].append(equation)
+            each.append(equation)
         else:
-            parts[0].append(equation)
-    for_rest = needed_by(parts[2], jaxpr.outvars)
-
-    def results(part, needed):
-        return [v for equation in part for v in equation.outvars if v in needed]
-
-    first = part_of(program, parts[0], results(parts[0], for_rest | needed_by(parts[1], [])))
-    second = part_of(program, parts[1], results(parts[1], for_rest))
-    return first, second, part_of(program, parts[2], list(jaxpr.outvars))
+            (first if is_needed else once).append(equation)
+    made, wanted = [part_of(program, rest, list(jaxpr.outvars))], needed_by(rest, jaxpr.outvars)
+    for equations in (each, once, first):
+        outputs = [v for equation in equations for v in equation.outvars if v in wanted]
+        made.append(part_of(program, equations, outputs))
+        wanted |= needed_by(equations, [])
+    return Parts(*reversed(made))
 
 
 def around_loop(part: Part) -> list[Part]:
