@@ -1,6 +1,9 @@
-"""Programs of JAX that stand within its operations: loops, cases, calls."""
+"""Programs of JAX: those within their operations (loops, cases, calls), and what follows from what."""
 
+from collections.abc import Iterable
 from typing import Any
+
+from jax.extend.core import Jaxpr, Literal
 
 
 def programs_of(equation: Any) -> list:
@@ -11,4 +14,13 @@ def programs_of(equation: Any) -> list:
             program = getattr(each, "jaxpr", each)
             if hasattr(program, "eqns"):
                 found.append(program)
+    return found
+
+
+def following(program: Jaxpr, variables: Iterable) -> set:
+    """Variables of a program, and all that follows from them."""
+    found = set(variables)
+    for equation in program.eqns:
+        if any(not isinstance(v, Literal) and v in found for v in equation.invars):
+            found.update(equation.outvars)
     return found

@@ -170,8 +170,11 @@ def _in_strides(
         kept = jax.tree.map(lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, place, 0), nodes, rows)
         return turn + 1, state, kept
 
-    # (`zeros.at[0].set` is a scatter, of which XLA makes a loop.)
-    nodes = jax.tree.map(lambda x: jnp.pad(x[None], [(0, most * length), *[(0, 0)] * x.ndim]), state)
+    # (`zeros.at[0].set` is a scatter, of which XLA makes a loop; padding would be a program for each.)
+    nodes = jax.tree.map(
+        lambda x: jax.lax.dynamic_update_slice_in_dim(jnp.zeros((most * length + 1, *x.shape), x.dtype), x[None], 0, 0),
+        state,
+    )
     # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
     # wait, and keep their last state once more.
     _, state, nodes = loop(

@@ -27,6 +27,7 @@ from jaxrock.native.machine import (
     machine as machine,
     registered,
 )
+from jaxrock.native.operations import Unsupported
 from jaxrock.native.parted import emit_parted, has_parts
 from jaxrock.native.partition import Part, ahead, around_loop, computed
 from jaxrock.native.plain import has_foreign, plain
@@ -65,13 +66,18 @@ class Plan:
         program = hoisted(program, _is_before_loops)
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
         self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()
-        self._first, once, self._each, rest = ahead(program, shared, is_known, _is_large)
+        first, once, self._each, rest = ahead(program, shared, is_known, _is_large)
+        self._long = {v for v in self._outputs if _is_large(v)}  # as XLA has them
+        if any(v in self._long for equation in rest.program.jaxpr.eqns for v in equation.outvars):
+            raise Unsupported("long results of what machine code computes")
         before = self._each.program.jaxpr.eqns
         if unknown := {equation.primitive.name for equation in before if not is_known(equation)}:
             _LOG.debug(
                 "%d operations are done before by XLA: not known are %s", len(before), ", ".join(sorted(unknown))
             )
-        self._once = self._of_all(once)
+        self._first, self._once = [first], self._of_all(once)
+        if once.outputs and self._once is None:
+            self._first.append(once)
         self._rest, own, self._pieces = rest.inputs, self._first_own(), []
         effort = EFFORT["in a moment" if alone and not refilled else "for long"]
         # Of what becomes machine code only names stay: programs take more memory than all else.
@@ -83,18 +89,22 @@ class Plan:
             own.update(v for v in part.outputs if not isinstance(v, Literal))
             self._pieces.append(_Piece(name, part.inputs, part.outputs))
 
-    def _of_all(self, part: Part) -> _Piece:
+    def _of_all(self, part: Part) -> _Piece | None:
         """What all lanes share, in one lane: of numbers XLA would compile every few operations for themselves."""
-        name = ""
-        if part.outputs:
-            writes, lanes = functools.partial(emit, alone=True), lanes_for(None, False, False)
-            name = registered(part.program, [True] * len(part.inputs), writes, lanes, EFFORT["in a moment"])
+        if not part.outputs:
+            return None
+        shared, writes = [True] * len(part.inputs), functools.partial(emit, alone=True)
+        try:
+            name = registered(part.program, shared, writes, lanes_for(None, False, False), EFFORT["in a moment"])
+        except Unsupported as reason:
+            _LOG.debug("what all scenes share is left to XLA: %s", reason)
+            return None
         return _Piece(name, part.inputs, part.outputs)
 
     @property
     def names(self) -> list[str]:
         """Of all machine code that it calls."""
-        return [piece.name for piece in [self._once, *self._pieces] if piece.name]
+        return [piece.name for piece in [self._once, *self._pieces] if piece is not None]
 
     def _first_own(self) -> set:
         """Variables that a lane has of its own before its machine code runs."""
@@ -127,6 +137,7 @@ class Plan:
         results (at least 1; known at run time only)."""
         values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
+        long = {v: _of_each(values[v], (size, *v.aval.shape)) for v in self._long}
         more = 0 if self._alone else max(size, self._lanes) - size
         told = size + more, size if count is None else count, threads
         sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
@@ -134,7 +145,8 @@ class Plan:
             x = values[v]
             x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
             values[v] = x if is_long(v.aval.shape) else jnp.moveaxis(x, 0, -1)
-        return [jnp.moveaxis(x, -1, 0)[:size] for x in self._run(values, sizes, size + more)]
+        found = iter(self._run(values, sizes, size + more))
+        return [long[v] if _is_large(v) else jnp.moveaxis(next(found), -1, 0)[:size] for v in self._outputs]
 
     def own_of(self, leaves: list) -> list:
         """Of leaves those that are `own`."""
@@ -151,8 +163,9 @@ class Plan:
     def _prepared(self, leaves: list) -> dict:
         """Values of variables before machine code runs."""
         values = dict(zip(self._inputs, leaves))
-        computed(self._first, values, batched=False)
-        if self._once.name:
+        for part in self._first:
+            computed(part, values, batched=False)
+        if self._once is not None:
             self._add(self._once, values, np.ones(3, np.int32), 1)
             values.update((v, values[v].reshape(v.aval.shape)) for v in self._once.outputs)
         computed(self._each, values, batched=True)
@@ -173,6 +186,11 @@ class Plan:
         arrays = ran(piece.name, results, sizes, *(values[v] for v in piece.inputs))
         values.update((v, x) for v, x in zip(piece.outputs, arrays) if not isinstance(v, Literal))
         return arrays
+
+
+def _of_each(x, shape: tuple[int, ...]):
+    """A list of each lane, or of all, of each."""
+    return x if x.shape == shape else jnp.broadcast_to(x, shape)
 
 
 def room_for(size: int) -> int:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from jaxrock._programs import following
+
 
 class Part(NamedTuple):
     """Some operations of a program."""
@@ -60,13 +62,14 @@ def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long:
     what follows from these.
     """
     jaxpr = program.jaxpr
-    needed = set()
+    own = {v for v, same in zip(jaxpr.invars, shared, strict=True) if not same}
+    needed, moving = set(), following(jaxpr, own)
     for equation in reversed(jaxpr.eqns):
         before = not is_known(equation) or needed.intersection(equation.outvars) or any(map(is_long, equation.outvars))
-        if equation.primitive.name != "while" and before:
+        is_loop = equation.primitive.name == "while" and moving.intersection(equation.outvars)
+        if before and not is_loop:
             needed.update(equation.outvars)
             needed.update(v for v in equation.invars if not isinstance(v, Literal))
-    own = {v for v, same in zip(jaxpr.invars, shared, strict=True) if not same}
     first, once, each, rest, later = [], [], [], [], set()
     for equation in jaxpr.eqns:
         inputs = {v for v in equation.invars if not isinstance(v, Literal)}
@@ -79,7 +82,8 @@ def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long:
             each.append(equation)
         else:
             (first if is_needed else once).append(equation)
-    made, wanted = [part_of(program, rest, list(jaxpr.outvars))], needed_by(rest, jaxpr.outvars)
+    short = [v for v in jaxpr.outvars if not is_long(v)]
+    made, wanted = [part_of(program, rest, short)], needed_by(rest, jaxpr.outvars)
     for equations in (each, once, first):
         outputs = [v for equation in equations for v in equation.outvars if v in wanted]
         made.append(part_of(program, equations, outputs))

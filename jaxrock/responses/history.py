@@ -254,22 +254,36 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     scene = Scene.of(block, motion, model)
     stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration)
     run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like)
-    state, nodes, final = run((block, motion, model, initial, stop, engine))
-    stepper = engine.stepper(scene, stop, history=True)
+    given = block, motion, model, initial, stop, engine
+    state, nodes, final = run(given)
+    stepper, _ = _begin(given)
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
+    summary = _part(_summary, engine)((stepper, state, final))
+    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
+
+
+def _part(function: Callable, engine: AbstractEngine, results: Callable | None = None) -> Callable:
+    """A part of a history, which is machine code where its steps are."""
+    if not engine.in_lanes:
+        return function
+    name = function.__name__
+    return differentiable(function, name=name, results=results, in_lanes=True, derivatives="in a direction")
+
+
+def _summary(given) -> Summary:
+    stepper, state, final = given
     # The largest within the duration: the end may be on the way to a peak.
     higher = surpasses(state.opening, state.peak)
     lost = final.overturned
-    summary = Summary(
+    return Summary(
         impact_count=state.impacts,
         max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
-        max_velocity=jnp.where(lost, jnp.inf, state.fastest * scene.p),
+        max_velocity=jnp.where(lost, jnp.inf, state.fastest * stepper.scene.p),
         time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
         overturned=lost,
         margin=final.margin,
         status=final.status,
     )
-    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
 
 
 def _like(given) -> tuple[State, State, Outcome]:
@@ -295,21 +309,22 @@ def _on_tape(given) -> tuple[State, State, Outcome]:
 
 def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
     """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
-    scene = Scene.of(block, motion, model)
-    stop = stop.astype(scene.p.dtype)
-    stepper = engine.stepper(scene, stop, history=True, taped=taped)
-    state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-    budget = engine.budget(scene, history=True)
+    given = block, motion, model, initial, stop, engine
+    stepper, state = _started(given, taped=True) if taped else _begin(given)
+    budget = engine.budget(stepper.scene, history=True)
     state, nodes = stepper.on_tape(state, budget) if taped else states_of(stepper, state, budget)
-    return state, nodes, _concluded(stepper, state, taped)
+    return state, nodes, (_end if taped else _part(_end, engine, outcome_like))((stepper, state))
 
 
-def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:
-    if taped or not stepper.engine.in_lanes:
-        return conclude(stepper, state)
-    return differentiable(_end, None, None, "end", outcome_like, in_lanes=True, derivatives="in a direction")(
-        (stepper, state)
-    )
+def _begin(given) -> tuple[Any, State]:
+    return _part(_started, given[-1])(given)
+
+
+def _started(given, taped: bool = False) -> tuple[Any, State]:
+    block, motion, model, initial, stop, engine = given
+    scene = Scene.of(block, motion, model)
+    stepper = engine.stepper(scene, stop.astype(scene.p.dtype), history=True, taped=taped)
+    return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
 
 
 def _end(given) -> Outcome:

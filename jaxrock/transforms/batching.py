@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
+from jaxrock._programs import following
 from jaxrock.numerics.xla_cpu import marking
 from jaxrock.transforms.recipe import Recipe
 
@@ -284,8 +285,5 @@ class _Scenes:
 def _follow_from(function: Callable, inputs: list) -> list[bool]:
     """Which results of a function depend on its inputs."""
     program = jax.make_jaxpr(function)(inputs).jaxpr
-    moved = set(program.invars)
-    for equation in program.eqns:
-        if any(not isinstance(x, Literal) and x in moved for x in equation.invars):
-            moved.update(equation.outvars)
+    moved = following(program, program.invars)
     return [not isinstance(x, Literal) and x in moved for x in program.outvars]
