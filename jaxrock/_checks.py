@@ -12,7 +12,7 @@ import numpy as np
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from jaxrock._guard import guarded
+from jaxrock._guard import as_array, guarded
 from jaxrock._words import meant
 
 Making = TypeVar("Making", bound=Callable)
@@ -108,7 +108,7 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
             known = native(known)
             is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
             return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
-        array = jnp.asarray(known)
+        array = as_array(known)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):

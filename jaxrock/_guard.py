@@ -7,6 +7,7 @@ finds neither: there a value that fails becomes what is not a number, and the st
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,7 +30,13 @@ def guarded(values: PyTree, failed: Bool[Array, ""], message: str) -> PyTree:
     Only real numbers can be marked, and what nobody uses is not computed: of whole numbers alone a check may be lost.
     """
     leaves, structure = jax.tree.flatten(values)
-    return jax.tree.unflatten(structure, _guard_p.bind(jnp.asarray(failed), *map(jnp.asarray, leaves), message=message))
+    return jax.tree.unflatten(structure, _guard_p.bind(*map(as_array, [failed, *leaves]), message=message))
+
+
+def as_array(value: Any) -> Array:
+    """`value` as an array. (Of a number that is differentiated outside of `jax.jit`, `jnp.asarray` would have a program
+    compiled that changes nothing.)"""
+    return value if isinstance(value, jax.Array) else jnp.asarray(value)
 
 
 @_guard_p.def_impl

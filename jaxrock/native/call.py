@@ -67,9 +67,6 @@ class Plan:
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
         self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()
         first, once, self._each, rest = ahead(program, shared, is_known, _is_large)
-        self._long = {v for v in self._outputs if _is_large(v)}  # as XLA has them
-        if any(v in self._long for equation in rest.program.jaxpr.eqns for v in equation.outvars):
-            raise Unsupported("long results of what machine code computes")
         before = self._each.program.jaxpr.eqns
         if unknown := {equation.primitive.name for equation in before if not is_known(equation)}:
             _LOG.debug(
@@ -137,7 +134,6 @@ class Plan:
         results (at least 1; known at run time only)."""
         values = self._prepared(leaves)
         size = next(x.shape[0] for x, same in zip(leaves, self._shared) if not same)
-        long = {v: _of_each(values[v], (size, *v.aval.shape)) for v in self._long}
         more = 0 if self._alone else max(size, self._lanes) - size
         told = size + more, size if count is None else count, threads
         sizes = np.array(told, np.int32) if count is None else jnp.stack([jnp.asarray(x, jnp.int32) for x in told])
@@ -145,8 +141,7 @@ class Plan:
             x = values[v]
             x = jnp.concatenate([x, jnp.repeat(x[-1:], more, axis=0)]) if more else x
             values[v] = x if is_long(v.aval.shape) else jnp.moveaxis(x, 0, -1)
-        found = iter(self._run(values, sizes, size + more))
-        return [long[v] if _is_large(v) else jnp.moveaxis(next(found), -1, 0)[:size] for v in self._outputs]
+        return [jnp.moveaxis(x, -1, 0)[:size] for x in self._run(values, sizes, size + more)]
 
     def own_of(self, leaves: list) -> list:
         """Of leaves those that are `own`."""
@@ -186,11 +181,6 @@ class Plan:
         arrays = ran(piece.name, results, sizes, *(values[v] for v in piece.inputs))
         values.update((v, x) for v, x in zip(piece.outputs, arrays) if not isinstance(v, Literal))
         return arrays
-
-
-def _of_each(x, shape: tuple[int, ...]):
-    """A list of each lane, or of all, of each."""
-    return x if x.shape == shape else jnp.broadcast_to(x, shape)
 
 
 def room_for(size: int) -> int:

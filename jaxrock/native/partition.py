@@ -82,8 +82,7 @@ def ahead(program: ClosedJaxpr, shared: list[bool], is_known: Callable, is_long:
             each.append(equation)
         else:
             (first if is_needed else once).append(equation)
-    short = [v for v in jaxpr.outvars if not is_long(v)]
-    made, wanted = [part_of(program, rest, short)], needed_by(rest, jaxpr.outvars)
+    made, wanted = [part_of(program, rest, list(jaxpr.outvars))], needed_by(rest, jaxpr.outvars)
     for equations in (each, once, first):
         outputs = [v for equation in equations for v in equation.outvars if v in wanted]
         made.append(part_of(program, equations, outputs))

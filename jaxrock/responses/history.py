@@ -30,6 +30,7 @@ from jaxrock.responses.current_model import current_model, standing
 from jaxrock.responses.outcome import Outcome, conclude, outcome_like
 from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
+from jaxrock.transforms.preparation import prepared
 
 Scalar = Inexact[Array, "..."]
 
@@ -254,20 +255,17 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     scene = Scene.of(block, motion, model)
     stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration)
     run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like)
-    given = block, motion, model, initial, stop, engine
-    state, nodes, final = run(given)
-    stepper, _ = _begin(given)
+    told = block, motion, model, initial, stop, engine
+    state, nodes, final = run(told)
+    stepper, _ = _part(_started, told, engine)
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
-    summary = _part(_summary, engine)((stepper, state, final))
+    summary = _part(_summary, (stepper, state, final), engine)
     return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
 
 
-def _part(function: Callable, engine: AbstractEngine, results: Callable | None = None) -> Callable:
-    """A part of a history, which is machine code where its steps are."""
-    if not engine.in_lanes:
-        return function
-    name = function.__name__
-    return differentiable(function, name=name, results=results, in_lanes=True, derivatives="in a direction")
+def _part(function: Callable, told: tuple, engine: AbstractEngine, within: bool = False) -> Any:
+    """A part of a history: machine code where its steps are."""
+    return prepared(function, told, within) if engine.in_lanes else function(told)
 
 
 def _summary(given) -> Summary:
@@ -309,15 +307,19 @@ def _on_tape(given) -> tuple[State, State, Outcome]:
 
 def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
     """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
-    given = block, motion, model, initial, stop, engine
-    stepper, state = _started(given, taped=True) if taped else _begin(given)
+    told = block, motion, model, initial, stop, engine
+    stepper, state = _started(told, taped=True) if taped else _part(_started, told, engine, within=True)
     budget = engine.budget(stepper.scene, history=True)
     state, nodes = stepper.on_tape(state, budget) if taped else states_of(stepper, state, budget)
-    return state, nodes, (_end if taped else _part(_end, engine, outcome_like))((stepper, state))
+    return state, nodes, _concluded(stepper, state, taped)
 
 
-def _begin(given) -> tuple[Any, State]:
-    return _part(_started, given[-1])(given)
+def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:
+    if taped or not stepper.engine.in_lanes:
+        return conclude(stepper, state)
+    return differentiable(_end, None, None, "end", outcome_like, in_lanes=True, derivatives="in a direction")(
+        (stepper, state)
+    )
 
 
 def _started(given, taped: bool = False) -> tuple[Any, State]:
