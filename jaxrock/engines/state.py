@@ -63,8 +63,28 @@ class Node(eqx.Module):
     done: Bool[Array, "..."]
 
     @classmethod
-    def of(cls, state: "State | Node") -> "Node":
+    def of(cls, state: "State | Kept | Node") -> "Node":
         """Those of a state."""
+        return cls(*(getattr(state, field.name) for field in fields(cls)))
+
+
+class Kept(eqx.Module):
+    """What a history keeps of the `State` at the start of every step."""
+
+    piece: Int[Array, "..."]
+    local: Inexact[Array, "..."]
+    side: Inexact[Array, "..."]
+    opening: Inexact[Array, "..."]
+    velocity: Inexact[Array, "..."]
+    uplifting: Bool[Array, "..."]
+    done: Bool[Array, "..."]
+    impacts: Int[Array, "..."]
+    impact_time: Inexact[Array, "..."]
+    impact_velocity: Inexact[Array, "..."]
+
+    @classmethod
+    def of(cls, state: State) -> "Kept":
+        """Those fields of a state."""
         return cls(*(getattr(state, field.name) for field in fields(cls)))
 
 

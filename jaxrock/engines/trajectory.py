@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox.internal import unvmap_any
-from jaxtyping import Array, Bool, Inexact, Int, PyTree
+from jaxtyping import Array, Bool, Inexact, Int, PyTree, UInt
 
 from jaxrock._checks import Values, checked, if_traced, is_at_hand, is_traced, placed
 from jaxrock.numerics.choice import where
@@ -121,27 +121,38 @@ def _in_order(path: Trajectory, told: Callable) -> tuple[tuple, Int[Array, ""]]:
 _STRIDE = 8  # steps at a time of machine code, where one alone takes less than keeping it
 
 
+def _whole(state: PyTree) -> PyTree:
+    return state
+
+
 def states_of(
-    stepper: Any, state: PyTree, room: int, limit: int | Int[Array, ""] | None = None
+    stepper: Any,
+    state: PyTree,
+    room: int,
+    limit: int | Int[Array, ""] | None = None,
+    keep: Callable[[PyTree], PyTree] = _whole,
 ) -> tuple[PyTree, PyTree]:
-    """Follow a block to the end, or until it has taken `limit` steps in all: the last state, and every state by the
-    number of steps from the first; after the last it may stand again, or zeros. There is room for so many steps, which
-    are the limit if none is told."""
+    """Follow a block to the end, or until it has taken `limit` steps in all: the last state, and `keep(state)` of every
+    state by the number of steps from the first; after the last it may stand again, or zeros.
+
+    There is room for so many steps, which are the limit if none is told. `keep` is a function of a module.
+    """
     engine, limit = stepper.engine, room if limit is None else limit
     if not engine.in_lanes:
-        return _in_strides(lambda s: _stride(stepper.advance, s, limit, 1), state, limit, engine.loop, room)
-    many = differentiable(_stride_of, name="stride", results=_rows, in_lanes=True, derivatives="in a direction")
-    return _in_strides(lambda s: many((stepper, s, jnp.int32(limit))), state, limit, engine.loop, room, _STRIDE)
+        return _in_strides(lambda s: _stride(stepper.advance, s, limit, 1, keep), state, limit, engine.loop, room, keep)
 
+    def stride(given):
+        stepper, state, limit = given
+        return _stride(stepper.advance, state, limit, _STRIDE, keep)
 
-def _stride_of(given) -> tuple[PyTree, PyTree]:
-    stepper, state, limit = given
-    return _stride(stepper.advance, state, limit, _STRIDE)
+    def rows(given):
+        _, state, _ = given
+        kept = jax.eval_shape(keep, state)
+        return state, jax.tree.map(lambda x: jax.ShapeDtypeStruct((_STRIDE, *x.shape), x.dtype), kept)
 
-
-def _rows(given) -> tuple[PyTree, PyTree]:
-    _, state, _ = given
-    return state, jax.tree.map(lambda x: jax.ShapeDtypeStruct((_STRIDE, *x.shape), x.dtype), state)
+    name = f"stride, {keep.__qualname__}"
+    many = differentiable(stride, name=name, results=rows, in_lanes=True, derivatives="in a direction")
+    return _in_strides(lambda s: many((stepper, s, jnp.int32(limit))), state, limit, engine.loop, room, keep, _STRIDE)
 
 
 def rows_of(engine: Any, budget: int) -> int:
@@ -155,11 +166,17 @@ def followed(advance: Callable, state: PyTree, budget: int, loop: Callable) -> t
 
     `loop(unfinished, step, carry, budget)` repeats.
     """
-    return _in_strides(lambda s: _stride(advance, s, budget, 1), state, budget, loop, budget)
+    return _in_strides(lambda s: _stride(advance, s, budget, 1, _whole), state, budget, loop, budget, _whole)
 
 
 def _in_strides(
-    stride: Callable, state: PyTree, limit: int | Int[Array, ""], loop: Callable, room: int, length: int = 1
+    stride: Callable,
+    state: PyTree,
+    limit: int | Int[Array, ""],
+    loop: Callable,
+    room: int,
+    keep: Callable,
+    length: int = 1,
 ) -> tuple[PyTree, PyTree]:
     most = -(-room // length)
 
@@ -167,14 +184,13 @@ def _in_strides(
         turn, state, nodes = carry
         state, rows = stride(state)
         place = (turn * length + 1).astype(jnp.uint32)  # of integers with a sign each leaf would ask which it has
-        kept = jax.tree.map(lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, place, 0), nodes, rows)
-        return turn + 1, state, kept
+        return turn + 1, state, _with_rows(nodes, rows, place)
 
-    # (`zeros.at[0].set` is a scatter, of which XLA makes a loop; padding would be a program for each.)
-    nodes = jax.tree.map(
-        lambda x: jax.lax.dynamic_update_slice_in_dim(jnp.zeros((most * length + 1, *x.shape), x.dtype), x[None], 0, 0),
-        state,
-    )
+    # At a place that it knows XLA would make of zeros and a row a program for each leaf, which pads; of
+    # `zeros.at[0].set` a loop. It does not know that no steps are negative.
+    rows, first = jax.tree.map(lambda x: x[None], keep(state)), (state.steps < 0).astype(jnp.uint32)
+    zeros = jax.tree.map(lambda x: jnp.zeros((most * length + 1, *x.shape[1:]), x.dtype), rows)
+    nodes = _with_rows(zeros, rows, first)
     # Under `jax.vmap` a condition of each lane would have JAX copy all that is kept at every step: lanes that are done
     # wait, and keep their last state once more.
     _, state, nodes = loop(
@@ -183,12 +199,19 @@ def _in_strides(
     return state, nodes
 
 
+def _with_rows(nodes: PyTree, rows: PyTree, place: UInt[Array, ""]) -> PyTree:
+    return jax.tree.map(lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, place, 0), nodes, rows)
+
+
 def _unfinished(state: PyTree, limit: int | Int[Array, ""]) -> Bool[Array, ""]:
     return ~state.done & (state.steps < limit)
 
 
-def _stride(advance: Callable, state: PyTree, limit: int | Int[Array, ""], length: int) -> tuple[PyTree, PyTree]:
-    """The state after so many steps, and after each of them; one that is done, or has taken `limit` in all, waits."""
+def _stride(
+    advance: Callable, state: PyTree, limit: int | Int[Array, ""], length: int, keep: Callable
+) -> tuple[PyTree, PyTree]:
+    """The state after so many steps, and what is kept of it after each of them; one that is done, or has taken `limit`
+    in all, waits."""
 
     def step(state):
         going, after = _unfinished(state, limit), advance(state)
@@ -198,16 +221,15 @@ def _stride(advance: Callable, state: PyTree, limit: int | Int[Array, ""], lengt
         left, state, kept = carry
         state = step(state)
         # The rows move up: at places of its own each would be a choice among all.
-        return left - 1, state, jax.tree.map(lambda rows, x: jnp.concatenate([rows[1:], x[None]]), kept, state)
+        return left - 1, state, jax.tree.map(lambda rows, x: jnp.concatenate([rows[1:], x[None]]), kept, keep(state))
 
     if length == 1:
         state = step(state)
-        return state, jax.tree.map(lambda x: x[None], state)
-    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *x.shape)), state)
+        return state, jax.tree.map(lambda x: x[None], keep(state))
+    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *x.shape)), keep(state))
     return jax.lax.while_loop(lambda carry: carry[0] > 0, one_more, (jnp.int32(length), state, kept))[1:]
 
 
-def times_of(time: Callable, nodes: PyTree, last: PyTree) -> Inexact[Array, " nodes"]:
-    """Times of the nodes up to the last state; infinite past it."""
-    number = jnp.arange(nodes.steps.size)
-    return where(number <= last.steps, jax.vmap(time)(nodes), jnp.inf)
+def times_of(time: Callable, nodes: PyTree, steps: Int[Array, ""]) -> Inexact[Array, " nodes"]:
+    """Times of the nodes up to the last state, which is after so many steps; infinite past it."""
+    return where(jnp.arange(nodes.done.size) <= steps, jax.vmap(time)(nodes), jnp.inf)

@@ -246,7 +246,7 @@ def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajec
     def run(given):
         scene = scene_of(*given)
         state, nodes = followed(lambda s: scene.advance(s), scene.start(), budget, loop)
-        times = times_of(scene.time, nodes, state)
+        times = times_of(scene.time, nodes, state.steps)
         impacted = nodes.impacted & (jnp.arange(times.size) > 0) & jnp.isfinite(times)
         return scene.conclude(state), Trajectory(scene, nodes, times, impacted, given[-1])
 

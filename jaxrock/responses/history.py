@@ -12,41 +12,27 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
-from jaxrock._described import described
 from jaxrock._precision import say_if_single
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
+from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import Node, State, initial_state, surpasses
+from jaxrock.engines.state import Node, State
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.careful import Series
-from jaxrock.engines.trajectory import Trajectory, at_times, rows_of, states_of, times_of
+from jaxrock.engines.trajectory import Trajectory, at_times, times_of
 from jaxrock.flexible.response import FlexibleResponse, simulate_flexible
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import padded
 from jaxrock.responses.arguments import USUAL, AnyBlock, RigidBlock, engine_of, start_of, steps_of_flexible
 from jaxrock.responses.current_model import current_model, standing
-from jaxrock.responses.outcome import Outcome, conclude, outcome_like
+from jaxrock.responses.steps import Summary, followed, history_like, on_tape, started
 from jaxrock.status import Status, marked_result, still_if_none
 from jaxrock.transforms.differentiation import differentiable, with_derivatives_of
-from jaxrock.transforms.preparation import prepared
+from jaxrock.transforms.preparation import numbers_of, with_numbers
 
 Scalar = Inexact[Array, "..."]
-
-
-class Summary(eqx.Module):
-    """What is known of a history as a whole (see `Response`)."""
-
-    impact_count: Int[Array, "..."]
-    max_rotation: Scalar
-    max_velocity: Scalar
-    time_of_max: Scalar
-    overturned: Bool[Array, "..."]
-    margin: Scalar
-    status: Status
-
-    __repr__ = described
 
 
 class Response(AbstractTable):
@@ -252,85 +238,15 @@ def simulate(
 
 @jax.jit
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
-    scene = Scene.of(block, motion, model)
-    stop = motion.end + 10 / scene.p if duration is None else jnp.asarray(duration)
-    run = _followed if engine.reverse else differentiable(_followed, _on_tape, None, "history", _like)
+    p = block.p if isinstance(block, Block) else block.p1
+    stop = motion.end + 10 / p if duration is None else jnp.asarray(duration)
     told = block, motion, model, initial, stop, engine
-    state, nodes, final = run(told)
-    stepper, _ = _part(_started, told, engine)
-    impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.steps.size) <= state.steps)
-    summary = _part(_summary, (stepper, state, final), engine)
-    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, state), impacted, stop)
-
-
-def _part(function: Callable, told: tuple, engine: AbstractEngine, within: bool = False) -> Any:
-    """A part of a history: machine code where its steps are."""
-    return prepared(function, told, within) if engine.in_lanes else function(told)
-
-
-def _summary(given) -> Summary:
-    stepper, state, final = given
-    # The largest within the duration: the end may be on the way to a peak.
-    higher = surpasses(state.opening, state.peak)
-    lost = final.overturned
-    return Summary(
-        impact_count=state.impacts,
-        max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
-        max_velocity=jnp.where(lost, jnp.inf, state.fastest * stepper.scene.p),
-        time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
-        overturned=lost,
-        margin=final.margin,
-        status=final.status,
-    )
-
-
-def _like(given) -> tuple[State, State, Outcome]:
-    """What these look like."""
-    *_, engine = given
-
-    def made(block, motion, model, initial, stop):
-        scene = Scene.of(block, motion, model)
-        state = initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-        rows = rows_of(engine, engine.budget(scene, history=True))
-        return state, jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), state)
-
-    return *jax.eval_shape(made, *given[:-1]), outcome_like(given)
-
-
-def _followed(given) -> tuple[State, State, Outcome]:
-    return _steps(*given)
-
-
-def _on_tape(given) -> tuple[State, State, Outcome]:
-    return _steps(*given, taped=True)
-
-
-def _steps(block, motion, model, initial, stop, engine, *, taped: bool = False):
-    """The state at the end of a history, the states before all steps (and after the last), and what came of it."""
-    told = block, motion, model, initial, stop, engine
-    stepper, state = _started(told, taped=True) if taped else _part(_started, told, engine, within=True)
-    budget = engine.budget(stepper.scene, history=True)
-    state, nodes = stepper.on_tape(state, budget) if taped else states_of(stepper, state, budget)
-    return state, nodes, _concluded(stepper, state, taped)
-
-
-def _concluded(stepper: AbstractStepper, state: State, taped: bool) -> Outcome:
-    if taped or not stepper.engine.in_lanes:
-        return conclude(stepper, state)
-    return differentiable(_end, None, None, "end", outcome_like, in_lanes=True, derivatives="in a direction")(
-        (stepper, state)
-    )
-
-
-def _started(given, taped: bool = False) -> tuple[Any, State]:
-    block, motion, model, initial, stop, engine = given
-    scene = Scene.of(block, motion, model)
-    stepper = engine.stepper(scene, stop.astype(scene.p.dtype), history=True, taped=taped)
-    return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
-
-
-def _end(given) -> Outcome:
-    return conclude(*given)
+    run = followed if engine.reverse else differentiable(followed, on_tape, None, "history", history_like)
+    steps, nodes, summary, numbers = run(told)
+    stepper, _ = started(told)
+    stepper = with_numbers(stepper, with_derivatives_of(numbers, numbers_of(stepper)))
+    impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.done.size) <= steps)
+    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, steps), impacted, stop)
 
 
 @by_numpy_or_one_program()

@@ -1,0 +1,108 @@
+"""The steps of a history, and what is known of it as a whole: all of it that has to be followed.
+
+It is told a block, a motion, a model, how the block starts, when to stop [s] and an engine. What stands around the loop
+over the steps is machine code where the steps are.
+"""
+
+from dataclasses import fields
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact, Int
+
+from jaxrock._described import described
+from jaxrock.engines.scene import Scene
+from jaxrock.engines.state import Kept, State, initial_state, surpasses
+from jaxrock.engines.trajectory import rows_of, states_of
+from jaxrock.numerics.fixed import fixed
+from jaxrock.responses.outcome import conclude, outcome_like
+from jaxrock.status import Status
+from jaxrock.transforms.differentiation import differentiable
+from jaxrock.transforms.preparation import numbers_of, prepared
+
+Scalar = Inexact[Array, "..."]
+
+
+class Summary(eqx.Module):
+    """What is known of a history as a whole (see `Response`)."""
+
+    impact_count: Int[Array, "..."]
+    max_rotation: Scalar
+    max_velocity: Scalar
+    time_of_max: Scalar
+    overturned: Bool[Array, "..."]
+    margin: Scalar
+    status: Status
+
+    __repr__ = described
+
+
+def history_like(told) -> tuple:
+    """What `followed` returns looks like."""
+    *_, engine = told
+
+    def made(*told):
+        stepper, state = started((*told, engine))
+        rows = rows_of(engine, engine.budget(stepper.scene, history=True))
+        nodes = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), Kept.of(state))
+        return state.steps, nodes, numbers_of(stepper)
+
+    steps, nodes, numbers = jax.eval_shape(made, *told[:-1])
+    return steps, nodes, _summary_like(told), numbers
+
+
+def followed(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
+    """How many steps there are, what is kept of the states before all (and after the last), what is known of the
+    history, and the numbers of the stepper that followed it, without their derivatives: XLA need not compute these
+    again."""
+    engine, end = told[-1], _summary
+    stepper, state = prepared(started, told) if engine.in_lanes else started(told)
+    state, nodes = states_of(stepper, state, engine.budget(stepper.scene, history=True), keep=Kept.of)
+    if engine.in_lanes:
+        end = differentiable(
+            _summary, None, None, "summary", _summary_like, in_lanes=True, derivatives="in a direction"
+        )
+    return state.steps, nodes, end((stepper, state)), fixed(numbers_of(stepper))
+
+
+def on_tape(told) -> tuple[Int[Array, ""], Kept, Summary, list]:
+    """The same, so that reverse mode goes through the steps."""
+    stepper, state = started(told, taped=True)
+    state, nodes = stepper.on_tape(state, stepper.engine.budget(stepper.scene, history=True))
+    return state.steps, Kept.of(nodes), _summary((stepper, state)), fixed(numbers_of(stepper))
+
+
+def started(told, taped: bool = False) -> tuple[Any, State]:
+    """The stepper that follows a history, and the state at its start."""
+    block, motion, model, initial, stop, engine = told
+    scene = Scene.of(block, motion, model)
+    stepper = engine.stepper(scene, stop.astype(scene.p.dtype), history=True, taped=taped)
+    return stepper, initial_state(scene, *(jnp.asarray(x, scene.p.dtype) for x in initial))
+
+
+def _summary(given) -> Summary:
+    stepper, state = given
+    final = conclude(stepper, state)
+    # The largest within the duration: the end may be on the way to a peak.
+    higher = surpasses(state.opening, state.peak)
+    lost = final.overturned
+    return Summary(
+        impact_count=state.impacts,
+        max_rotation=jnp.where(lost, jnp.inf, jnp.maximum(state.peak, state.opening)),
+        max_velocity=jnp.where(lost, jnp.inf, state.fastest * stepper.scene.p),
+        time_of_max=jnp.where(lost, jnp.inf, jnp.where(higher, stepper.time(state), state.peak_time)),
+        overturned=lost,
+        margin=final.margin,
+        status=final.status,
+    )
+
+
+def _summary_like(given) -> Summary:
+    """What it looks like."""
+
+    def made(found):
+        return Summary(*(getattr(found, field.name) for field in fields(Summary)))
+
+    return jax.eval_shape(made, outcome_like(given))
