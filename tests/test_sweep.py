@@ -206,7 +206,7 @@ def test_progress(capsys, tmp_path):
     for said in ("12/12", "12 of 12 points come from"):
         rk.sweep(simple, **lists(3, 4), progress=True, store=tmp_path / "store")
         told = capsys.readouterr().err
-        assert said in told and "0it" not in told
+        assert said in told and " 0it" not in told
     rk.sweep(simple, **lists(3, 4))
     assert capsys.readouterr().err == ""
 

@@ -27,10 +27,14 @@ def prepared(function: Callable, tree: Any) -> Any:
 
 def numbers_of(tree: Any) -> list:
     """Numbers and short arrays in a tree."""
-    return [x for x in jax.tree.leaves(tree) if x.size <= _SHORT]
+    return [x for x in jax.tree.leaves(tree) if _is_short(x)]
 
 
 def with_numbers(tree: Any, numbers: list) -> Any:
     """A tree with these instead of its own."""
     rest = iter(numbers)
-    return jax.tree.map(lambda x: next(rest) if x.size <= _SHORT else x, tree)
+    return jax.tree.map(lambda x: next(rest) if _is_short(x) else x, tree)
+
+
+def _is_short(x: Any) -> bool:
+    return isinstance(x, jax.Array) and x.size <= _SHORT

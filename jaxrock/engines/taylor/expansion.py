@@ -7,6 +7,7 @@ parameters: derivatives cost a few products each. The end itself moves, too, whe
 
 import functools
 import operator
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ from jaxrock.motions.shaking import Shaking
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
-from jaxrock.numerics.polynomial import product_term
+from jaxrock.numerics.polynomial import product_term, sum_of_products
 from jaxrock.numerics.xla_cpu import keep, keep_by
 
 Scalar = Inexact[Array, ""]
@@ -119,7 +120,13 @@ class _Weights(NamedTuple):
     def times(self, change: Start) -> Any:
         """The change of the end."""
         pairs = zip(jax.tree.leaves(self.start), jax.tree.leaves(change, is_leaf=is_zero), strict=True)
-        return sum((weight * moved for weight, moved in pairs if not is_zero(moved)), start=0.0)
+        return _summed((weight, moved) for weight, moved in pairs if not is_zero(moved))
+
+
+def _summed(pairs: Iterable[tuple[Scalar, Scalar]]) -> Any:
+    """The sum of the products of pairs."""
+    factors = list(zip(*pairs))
+    return sum_of_products(*factors) if factors else 0.0
 
 
 def _weighed(terms: list | None, vertical: list[Scalar] | None, order: int, like: Scalar) -> list | None:
@@ -186,8 +193,8 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
     def backwards(own):
         of_term, of_source = [None] * (order + 1), [None] * (order - 1)
         for m in range(order, -1, -1):
-            later = [of_source[k] * pulls[k - m] for k in range(m, min(order - 1, m + len(pulls)))]
-            of_term[m] = keep(own[m] + sum(later, start=0.0), stretch)
+            later = _summed((of_source[k], pulls[k - m]) for k in range(m, min(order - 1, m + len(pulls))))
+            of_term[m] = keep(own[m] + later, stretch)
             if m >= 2:
                 source = of_term[m] * scale * (1 / (m * (m - 1)))
                 of_source[m - 2] = keep(where(start.uplifting, 0.0, source) if m == 2 else source, stretch)
@@ -197,13 +204,14 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
         of_term, of_source = backwards(own)
 
         def gain(_, terms, sign=None):
-            terms = [term for term in terms if term is not None]
-            return sum(w * (term if sign is None else sign * term) for w, term in zip(of_source, terms))
+            total = _summed(zip(of_source, (term for term in terms if term is not None)))
+            return total if sign is None else sign * total
 
         def of_shaking(length_of_series, factors):
             """What the end gains per change of coefficient j of the ground's acceleration."""
             pairs = ([(of_source[k], factors[k - j]) for k in range(j, order - 1)] for j in range(length_of_series))
-            return [sum((w * f for w, f in each if f is not None), start=jnp.zeros_like(length)) for each in pairs]
+            sums = [_summed((w, f) for w, f in each if f is not None) for each in pairs]
+            return [jnp.broadcast_to(x, length.shape).astype(length.dtype) for x in sums]
 
         horizontal, vertical = start.shaking
         zero = jnp.zeros_like(length)
@@ -211,7 +219,7 @@ def _weights(order: int, start: Start, length: Scalar) -> tuple[_Weights, _Weigh
             start.moments.restoring_terms.each(gain, sources.restoring),
             start.moments.arm_terms.each(functools.partial(gain, sign=side), sources.arm),
         )
-        of_stretch = sum(w * c for w, c in zip(of_term[2:], series.opening[2:])) * 2 / stretch
+        of_stretch = sum_of_products(of_term[2:], series.opening[2:]) * 2 / stretch
         shaking = Shaking(
             [side * gain for gain in of_shaking(len(horizontal), series.arm)],
             None if vertical is None else of_shaking(len(vertical), series.restoring),
