@@ -6,6 +6,7 @@ of JAX (`compound`), which is written out where it is compiled.
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -96,7 +97,7 @@ def _sum_of_products_changed(operation, numbers, changes):
 _products = Compound("sum_of_products", _sum_of_products, _sum_of_products_changed)
 
 
-def sum_of_products(first: list, second: list) -> Scalar:
+def sum_of_products(first: Sequence, second: Sequence) -> Scalar:
     """The sum of the products of numbers of two lists of one length."""
     return _products(*first, *second)[0]
 
