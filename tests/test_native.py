@@ -70,6 +70,33 @@ def agree(function, *values, shared=(), rtol=0.0):
         same(found, expected, rtol)
 
 
+def of_shared(leaves):
+    """Numbers, and a long list that a loop changes: that is XLA's."""
+    alpha, a, values = leaves
+    widest = jax.lax.fori_loop(0, 3, lambda k, x: jnp.maximum(x, jnp.roll(x, -k)), values * alpha)
+    return [jnp.sin(alpha) * a + jnp.sqrt(alpha) / (1 + alpha) + widest[3], jnp.cos(alpha)]
+
+
+def test_what_all_share_is_computed_once_in_a_lane(caplog, monkeypatch):
+    """By machine code, as that of a lane's own is, to the bit; where it does not know that after all, by XLA."""
+    alpha, a, values = np.float64(0.3), np.arange(20.0), np.sin(np.arange(100.0))
+    found = run(of_shared, [alpha, a, values], [True, False, True])
+    own = run(of_shared, [np.full(20, alpha), a, values], [False, False, True])
+    np.testing.assert_array_equal(found, own)
+
+    def refuses(program, shared, lanes, name, alone=False):
+        raise Unsupported("nothing")
+
+    plain_emit = kernels.emit
+    monkeypatch.setattr(
+        native, "emit", lambda *given, alone=False: (refuses if alone else plain_emit)(*given, alone=alone)
+    )
+    with caplog.at_level(logging.DEBUG, "jaxrock"):
+        left = run(of_shared, [alpha, a, values], [True, False, True])
+    np.testing.assert_allclose(left, own, rtol=1e-15)
+    assert "what all scenes share is left to XLA: nothing" in caplog.text
+
+
 def test_lists_in_order():
     values = np.stack([np.roll(np.array([0.5, -np.inf, np.nan, 3.0, -2.0, np.inf, 3.0]), k) for k in range(7)])
     agree(lambda x: [jnp.sort(x)], values)
@@ -786,6 +813,21 @@ SCENES = {
     "another solver of diffrax": lambda a, u: by_diffrax(a, u, solver=diffrax.Dopri8()).margin,
     "diffrax under a record": lambda a, u: by_diffrax(a, u, SHORT).margin,
 }
+
+
+BESIDE = {"parameter", "constant", "get-tuple-element", "bitcast", "copy", "tuple", "custom-call"}
+
+
+@pytest.mark.parametrize("size, most", [(8, 18), (65, 18), (None, 32)], ids=["few", "many", "a history"])
+def test_xla_compiles_little_beside_machine_code(size, most):
+    """Nearly every operation that it is left is a program of its own: 28 and 30 of scenes that share a block, 38 of a
+    history, before what they share, and what a history begins and ends with, was machine code, too."""
+    shaken = jax.vmap(lambda alpha, a: rk.outcome(rk.Block(alpha, 2.0), rk.SinePulse(a, 0.6)), (None, 0))
+    if size is None:
+        shaken = lambda alpha, a: rk.simulate(rk.Block(alpha, 2.0), rk.SinePulse(a, 0.6)).trajectory
+    text = jax.jit(shaken).lower(0.2, 0.5 if size is None else np.linspace(0.1, 1.0, size)).compile().as_text()
+    operations = re.findall(r"^  (?:ROOT )?%\S+ = .*? ([a-z-]+)\(", text[text.index("ENTRY") :], re.M)
+    assert 0 < sum(each not in BESIDE for each in operations) <= most
 
 
 # What the others are made of.
