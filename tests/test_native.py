@@ -84,7 +84,7 @@ def test_what_all_share_is_computed_once_in_a_lane(caplog, monkeypatch):
     own = run(of_shared, [np.full(20, alpha), a, values], [False, False, True])
     np.testing.assert_array_equal(found, own)
 
-    def refuses(program, shared, lanes, name, alone=False):
+    def refuses(*given, alone):
         raise Unsupported("nothing")
 
     plain_emit = kernels.emit
