@@ -63,7 +63,7 @@ class Node(eqx.Module):
     done: Bool[Array, "..."]
 
     @classmethod
-    def of(cls, state: "State | Kept | Node") -> "Node":
+    def of(cls, state: "State | Node") -> "Node":
         """Those of a state."""
         return cls(*(getattr(state, field.name) for field in fields(cls)))
 
@@ -71,21 +71,20 @@ class Node(eqx.Module):
 class Kept(eqx.Module):
     """What a history keeps of the `State` at the start of every step."""
 
-    piece: Int[Array, "..."]
-    local: Inexact[Array, "..."]
-    side: Inexact[Array, "..."]
-    opening: Inexact[Array, "..."]
-    velocity: Inexact[Array, "..."]
-    uplifting: Bool[Array, "..."]
-    done: Bool[Array, "..."]
+    start: Node
     impacts: Int[Array, "..."]
     impact_time: Inexact[Array, "..."]
     impact_velocity: Inexact[Array, "..."]
 
     @classmethod
     def of(cls, state: State) -> "Kept":
-        """Those fields of a state."""
-        return cls(*(getattr(state, field.name) for field in fields(cls)))
+        """That of a state."""
+        return cls(Node.of(state), state.impacts, state.impact_time, state.impact_velocity)
+
+    @property
+    def done(self) -> Bool[Array, "..."]:
+        """Whether it is the last."""
+        return self.start.done
 
 
 ROUNDING = 4096  # units of rounding that peaks of one height may be apart

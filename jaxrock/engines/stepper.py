@@ -16,7 +16,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Bool, Inexact, Int, PyTree
 
 from jaxrock.engines.scene import Scene
-from jaxrock.engines.state import Kept, Node, State
+from jaxrock.engines.state import Node, State
 from jaxrock.numerics.choice import where
 
 Scalar = Inexact[Array, ""]
@@ -96,7 +96,7 @@ class AbstractStepper(eqx.Module):
             return self
         return replace(self, scene=self.scene.on(side))  # type: ignore[call-arg]  # a field of all that are no base
 
-    def time(self, state: State | Kept | Node) -> Scalar:
+    def time(self, state: State | Node) -> Scalar:
         """Time of a state [s]."""
         return self.scene.start(state.piece) + state.local
 

@@ -196,7 +196,7 @@ def _highest(values: Inexact[Array, " points"]) -> Scalar:
 def _extremes(response: Response, sides: list) -> tuple[Scalar, Scalar]:
     """Largest friction needed and least normal force below the saddle, over points in all steps."""
     path = response.trajectory
-    stepper, nodes, times = path.stepper, path.nodes, path.times
+    stepper, nodes, times = path.stepper, path.nodes.start, path.times
     shares, follow = jnp.linspace(0.0, 1.0, _WITHIN + 1), evaluation(stepper)
 
     def step(node, start, end):

@@ -158,7 +158,7 @@ def _impacts_of(xp: Any, path: Trajectory) -> tuple:
 
 
 def _peaks_of(xp: Any, path: Trajectory) -> tuple:
-    nodes = path.nodes
+    nodes = path.nodes.start
     turned = (nodes.velocity == 0) & (nodes.side != 0) & (nodes.opening > 0) & xp.isfinite(path.times)
     # A step through a piece without a length leaves a block that turns where it is.
     stays = turned[:-1] & (nodes.opening[1:] == nodes.opening[:-1])
@@ -246,13 +246,13 @@ def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary,
     stepper, _ = started(told)
     stepper = with_numbers(stepper, with_derivatives_of(numbers, numbers_of(stepper)))
     impacted = (jnp.diff(nodes.impacts, prepend=0) > 0) & (jnp.arange(nodes.done.size) <= steps)
-    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes, steps), impacted, stop)
+    return summary, Trajectory(stepper, nodes, times_of(stepper.time, nodes.start, steps), impacted, stop)
 
 
 @by_numpy_or_one_program()
 def _evaluate(path: Trajectory, time):
     """Rotation [rad] and angular velocity [rad/s] at times."""
-    return _after_nodes(path.stepper, *path.before(time, Node.of(path.nodes)), path.duration, time.shape)
+    return _after_nodes(path.stepper, *path.before(time, path.nodes.start), path.duration, time.shape)
 
 
 @functools.partial(jax.jit, static_argnames="shape")

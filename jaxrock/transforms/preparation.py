@@ -11,8 +11,11 @@ _SHORT = 8  # numbers of an array that machine code keeps in registers
 
 
 def prepared(function: Callable, tree: Any) -> Any:
-    """`function(tree)`, a function of a module: its numbers by machine code where that is; long arrays, which many
-    scenes may share, by XLA. It is part of something that forward mode goes through as a whole."""
+    """`function(tree)`, numbers and short arrays by machine code where that is; long ones, which many scenes may share,
+    by XLA. It is part of something that forward mode goes through as a whole.
+
+    `function`: of a module, of one scene, depends on nothing else; `tree`: its argument, of arrays.
+    """
     whole = function(tree)
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in numbers_of(whole)]
     found = differentiable(
