@@ -108,13 +108,11 @@ class Scene(eqx.Module):
         stretch = found_in_place(motion) if in_place and is_in_place(motion) else None
         motion = motion if stretch is None else stretch.motion
         knots, envelope = motion.knots, motion.envelope
-        lengths = motion.lengths
         if stretch is not None:
             count = stretch.end
         else:  # up to the last piece with a length: a late motion's knots may all be one number
-            lasting = where(lengths > 0, jnp.arange(1, knots.size, dtype=jnp.int32), 0)
             # Of motions that end together one may go on longer: what lies between their ends has slopes.
-            count = jnp.max(lasting) if knots.size > _MANY and not is_of_several(motion) else None
+            count = motion.lasting.count if knots.size > _MANY and not is_of_several(motion) else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."

@@ -120,8 +120,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
     # not followed to where squares of them overflow.
     finite = finite & (scene.threshold + scene.p + scene.outlook.strongest_drive + scene.knots[-1] < _MOST)
     # What a constructor refuses a step of an optimiser may have made of a block or a motion.
-    lengths = scene.motion.lengths if scene.first is None else scene.motion.length(scene.first)
-    forward = (scene.knots[0] >= 0) & (scene.knots[-1] >= 0) & (lengths >= 0).all()
+    forward = scene.motion.lasting.forward if scene.first is None else scene.motion.length(scene.first) >= 0
+    forward = forward & (scene.knots[0] >= 0) & (scene.knots[-1] >= 0)
     finite = finite & (scene.threshold > 0) & (scene.p > 0) & forward
     spread = Spread.none(opening).plus(eps * opening, eps * outward)
     if scene.motion.lateness is not None:  # a push that comes too late: at first a velocity that is missing

@@ -18,9 +18,10 @@ from jaxrock._checks import Values, delay, factor, if_known, not_nan, of_each, w
 from jaxrock._described import described
 from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.motions.finer import Finer
+from jaxrock.motions.pieces import Lasting, acceleration_at
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.choice import where
-from jaxrock.numerics.lookup import count_up_to, pick
+from jaxrock.numerics.lookup import pick
 
 Scalar = Inexact[Array, ""]
 Piece = Int[Array, ""]  # number of a smooth piece
@@ -48,6 +49,11 @@ class AbstractMotion(Owner):
     def length(self, piece: Piece) -> Scalar:
         """How long one piece lasts [s]."""
         return pick(self.lengths, piece)
+
+    @property
+    def lasting(self) -> Lasting:
+        """Up to which piece the motion lasts, and whether time runs forward in all."""
+        return Lasting.of(self.lengths)
 
     @property
     def lateness(self) -> Scalar | None:
@@ -109,7 +115,7 @@ class AbstractMotion(Owner):
         **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
         value after it.
         """
-        return _acceleration(self, if_known(not_nan, "time", time))
+        return acceleration_at(self, if_known(not_nan, "time", time))
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
         """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
@@ -142,18 +148,6 @@ class AbstractMotion(Owner):
         return Summed(self, -other) if isinstance(other, AbstractMotion) else NotImplemented
 
     __array_ufunc__ = None  # an array of NumPy times a motion is a motion, and not an array of motions
-
-
-@jax.jit
-def _acceleration(motion: AbstractMotion, time: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-    knots = motion.knots
-
-    def at(t):
-        piece = jnp.clip(count_up_to(knots, t) - 1, 0, knots.size - 2)
-        value = motion.series(piece, t - knots[piece], jnp.ones_like(t), 0)[0]
-        return where((t >= 0) & (t < knots[-1]), value, 0.0)
-
-    return jax.vmap(at)(time.ravel().astype(knots.dtype)).reshape(time.shape)
 
 
 class _Changed(AbstractMotion):
@@ -190,6 +184,10 @@ class AtTheSameTimes(_Changed):
 
     def length(self, piece: Piece) -> Scalar:
         return self.motion.length(piece)
+
+    @property
+    def lasting(self) -> Lasting:
+        return self.motion.lasting
 
     @property
     def lateness(self) -> Scalar | None:
@@ -251,6 +249,10 @@ class Shifted(_Changed):
         return where(piece > 0, self.motion.length(jnp.maximum(piece - 1, 0)), self.delay)
 
     @property
+    def lasting(self) -> Lasting:
+        return self.motion.lasting.after(self.delay)
+
+    @property
     def lateness(self) -> Scalar | None:
         return self.motion.lateness
 
@@ -285,8 +287,8 @@ def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar
     leaves = jax.tree.leaves(parts, is_leaf=lambda node: isinstance(node, Shifted))
     if not any(isinstance(leaf, Shifted) for leaf in leaves):
         return None
-    found = [part.lateness for part in parts]
-    return sum((late for late in found if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
+    rounding = jnp.finfo(knots.dtype).eps * knots[-1]
+    return sum((late for part in parts if (late := part.lateness) is not None), rounding)
 
 
 class _Together(AbstractMotion):
@@ -339,8 +341,7 @@ class Summed(_Together):
     def bounds(self) -> Inexact[Array, " pieces"]:
         # Looked up before they are scaled: what only scales a part leaves that to all scales alike.
         both = self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both))
-        first, second = (bounds.times_gain(bounds.values) for bounds in both)
-        return first + second
+        return functools.reduce(jnp.add, (bounds.times_gain(bounds.values) for bounds in both))
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
         both = (motion.series for motion in self._both)
@@ -349,7 +350,7 @@ class Summed(_Together):
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
         spread = self._finer.spread(*(motion.vertical_bounds for motion in self._both), quiet=0.0)
-        found = [bounds for bounds in spread if bounds is not None]
+        found = [values for values in spread if values is not None]
         return functools.reduce(jnp.add, found) if found else None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:

@@ -14,6 +14,7 @@ from jaxrock._checks import Values, is_traced, not_negative, of_each, placed, si
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
+from jaxrock.motions.pieces import Lasting
 from jaxrock.numerics.choice import where
 
 _SHORT = 64  # samples of a record that is a program of its own
@@ -135,6 +136,10 @@ class Record(Straight):
     def length(self, piece: Piece) -> Scalar:
         return self.lengths[0]
 
+    @property
+    def lasting(self) -> Lasting:
+        return Lasting.of_equal(self.dt, self.samples.shape[-1] - 1)
+
 
 class AbstractChosen(AbstractMotion):
     """A record whose samples lie among those of others."""
@@ -162,6 +167,10 @@ class Padded(Straight):
 
     def length(self, piece: Piece) -> Scalar:
         return where(self.dt * piece < self.finish, self.dt, 0.0)
+
+    @property
+    def lasting(self) -> Lasting:
+        return Lasting.of_equal(self.dt, self.samples.shape[-1] - 1, self.finish)
 
 
 def padded(motion: AbstractMotion) -> AbstractMotion:
