@@ -3,10 +3,12 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.motions.pieces import Lasting
 from jaxrock.responses.outcome import _outcome
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # compiles in half the time
@@ -48,6 +50,31 @@ def test_derivatives_by_the_time_step_with_room():
     _, _, (found, expected) = with_and_without_room(65)
     assert abs(expected) > 1
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["anywhere", "beside where a piece begins", "of refused time steps"])
+def test_how_many_pieces_last_without_looking_at_each(kind, most=400):
+    """By two numbers as by a list: wherever the record ends, as times are rounded, and for what was never checked."""
+    draw = np.random.default_rng(8)
+    dt, finish = draw.uniform(1e-3, 0.1, 3000), draw.uniform(-0.1, 1.1, 3000)
+    if kind == "anywhere":
+        finish = finish * most * dt
+    elif kind == "beside where a piece begins":
+        finish = dt * draw.integers(0, most + 2, dt.size)
+        finish = np.stack([np.nextafter(finish, -1.0), finish, np.nextafter(finish, 1e9)], axis=1).ravel()
+        dt = np.repeat(dt, 3)
+    else:
+        dt, finish = map(np.ravel, np.meshgrid([-0.1, -0.0, 0.0, np.nan, np.inf, 5e-324], [-1.0, 0.0, 1.0, np.nan]))
+
+    def both(dt, finish):
+        listed = jnp.where(dt * jnp.arange(most) < finish, dt, 0.0)
+        return Lasting.of_equal(dt, most, finish), Lasting.of(listed)
+
+    found, expected = jax.vmap(both)(dt, finish)
+    np.testing.assert_array_equal(found.forward, dt >= 0)
+    assert np.all(expected.forward[found.forward])
+    np.testing.assert_array_equal(found.count[found.forward], expected.count[found.forward])
+    assert kind != "anywhere" or len(np.unique(found.count)) > 300
 
 
 def test_records_of_many_lengths_are_one_program():

@@ -12,7 +12,9 @@ import pytest
 
 import jaxrock as rk
 from jaxrock.inverse.likelihood import _of_strength
+from jaxrock.motions.pieces import Lasting
 from jaxrock.motions.pulses.pulse import AbstractPulse
+from jaxrock.motions.record import padded, with_room
 
 EPS = np.finfo(float).eps
 ORDER = 12
@@ -563,3 +565,12 @@ def test_sums_of_many_motions_are_small_programs():
         return len(jax.make_jaxpr(lambda motion: (motion.scales, motion.lateness))(motion).eqns)
 
     assert operations(8) < 4.5 * operations(4)  # squares, for the knots of sums within sums
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_how_many_pieces_last(name):
+    """As the lengths tell it: of the motion, with room for more samples, after quiet, and after none."""
+    for motion in (MOTIONS[name], padded(MOTIONS[name]), with_room(2.0 * MOTIONS[name])):
+        for whole in (motion, motion.shifted(0.3), motion.shifted(0.0)):
+            found, expected = whole.lasting, Lasting.of(whole.lengths)
+            assert (int(found.count), bool(found.forward)) == (int(expected.count), bool(expected.forward))

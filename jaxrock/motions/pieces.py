@@ -1,6 +1,6 @@
 """What the pieces of a motion tell: how many of them last, and which acceleration there is at a time."""
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,11 +37,12 @@ class Lasting(NamedTuple):
             return cls(jnp.zeros((), jnp.int32), jnp.ones((), bool))
         if finish is None:
             return cls(where(length > 0, most, 0).astype(jnp.int32), length >= 0)
-        found = jnp.clip(jnp.ceil(where(length > 0, end / length, 0.0)), 0, most)
+        found = jnp.ceil(end / where(length > 0, length, 1.0))
+        found = where(found > 0, jnp.minimum(found, most), 0.0)  # none, too, where it is not a number
         # The quotient is rounded, and so are times at which pieces begin: these decide, as they do in `knots`.
         found = where((found > 0) & (length * (found - 1) >= end), found - 1, found)
         found = where((found < most) & (length * found < end), found + 1, found)
-        return cls(found.astype(jnp.int32), (length >= 0) | ~(end > 0))
+        return cls(where(length > 0, found, 0).astype(jnp.int32), length >= 0)
 
     def after(self, quiet: Scalar) -> "Lasting":
         """Of the same pieces after one more, of this length [s]."""
@@ -49,15 +50,8 @@ class Lasting(NamedTuple):
         return Lasting(where(self.count > 0, self.count + 1, first), self.forward & (quiet >= 0))
 
 
-class _OfPieces(Protocol):
-    @property
-    def knots(self) -> Inexact[Array, " knots"]: ...
-
-    def series(self, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int) -> list[Scalar]: ...
-
-
 @jax.jit
-def acceleration_at(motion: _OfPieces, time: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+def acceleration_at(motion: Any, time: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
     """Acceleration of a motion [g] at times from its start [s]: zero outside of it, at a jump the value after it."""
     knots = motion.knots
 
