@@ -73,8 +73,8 @@ def test_how_many_pieces_last_without_looking_at_each(kind, most=400):
     found, expected = jax.vmap(both)(dt, finish)
     np.testing.assert_array_equal(found.forward, dt >= 0)
     assert np.all(expected.forward[found.forward])
-    np.testing.assert_array_equal(found.count[found.forward], expected.count[found.forward])
-    assert kind != "anywhere" or len(np.unique(found.count)) > 300
+    np.testing.assert_array_equal(found.pieces[found.forward], expected.pieces[found.forward])
+    assert kind != "anywhere" or len(np.unique(found.pieces)) > 300
 
 
 def test_records_of_many_lengths_are_one_program():

@@ -573,4 +573,4 @@ def test_how_many_pieces_last(name):
     for motion in (MOTIONS[name], padded(MOTIONS[name]), with_room(2.0 * MOTIONS[name])):
         for whole in (motion, motion.shifted(0.3), motion.shifted(0.0)):
             found, expected = whole.lasting, Lasting.of(whole.lengths)
-            assert (int(found.count), bool(found.forward)) == (int(expected.count), bool(expected.forward))
+            assert (int(found.pieces), bool(found.forward)) == (int(expected.pieces), bool(expected.forward))

@@ -112,7 +112,7 @@ class Scene(eqx.Module):
             count = stretch.end
         else:  # up to the last piece with a length: a late motion's knots may all be one number
             # Of motions that end together one may go on longer: what lies between their ends has slopes.
-            count = motion.lasting.count if knots.size > _MANY and not is_of_several(motion) else None
+            count = motion.lasting.pieces if knots.size > _MANY and not is_of_several(motion) else None
         if envelope.vertical is not None and not model.feels_weight:
             raise ValueError(
                 "Argument `motion` must not be vertical for a Spring, whose moment does not weigh anything."

@@ -15,11 +15,11 @@ Scalar = Inexact[Array, ""]
 class Lasting(NamedTuple):
     """Up to which piece a motion lasts, and whether time runs forward.
 
-    - `count`: of pieces up to the last with a length above zero.
+    - `pieces`: how many there are up to the last with a length above zero.
     - `forward`: whether no piece has a length below zero, or one that is not a number.
     """
 
-    count: Int[Array, ""]
+    pieces: Int[Array, ""]
     forward: Bool[Array, ""]
 
     @classmethod
@@ -47,7 +47,7 @@ class Lasting(NamedTuple):
     def after(self, quiet: Scalar) -> "Lasting":
         """Of the same pieces after one more, of this length [s]."""
         first = where(quiet > 0, 1, 0).astype(jnp.int32)
-        return Lasting(where(self.count > 0, self.count + 1, first), self.forward & (quiet >= 0))
+        return Lasting(where(self.pieces > 0, self.pieces + 1, first), self.forward & (quiet >= 0))
 
 
 @jax.jit
