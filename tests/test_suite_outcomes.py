@@ -11,6 +11,7 @@ import scipy.stats
 
 import jaxrock as rk
 from jaxrock.blocks.random import _drawn, _drawn_sides
+from jaxrock.hazard import fragility, probit, surfaces
 from jaxrock.hazard.suites import measures_by_name
 from jaxrock.studies import azimuths, suite_scenes
 from jaxrock.studies.suite_scenes import of_motion, stacked
@@ -215,6 +216,39 @@ def test_a_probit_of_two_measures_by_another_optimiser():
     # Tables often come in single precision; what is computed with them does not.
     single = rk.hazard.fit_probit({name: values.astype(np.float32) for name, values in MEASURES.items()}, FELL)
     np.testing.assert_allclose(single.slopes, fit.slopes, rtol=1e-5)
+
+
+FITS = {
+    "of a lognormal fragility": (lambda x, y, fell, labels: rk.hazard.fit_fragility(x, fell), fragility._fit),
+    "of a surface": (lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell), surfaces._fit),
+    "of clusters": (lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell, 1, labels), surfaces._fit),
+} | {
+    f"of a line, {errors}": (
+        lambda x, y, fell, labels, errors=errors: rk.hazard.fit_probit(
+            {"x": x, "y": y}, fell, clusters=labels, errors=errors
+        ),
+        probit._fit,
+    )
+    for errors in ("information", "clusters", "jackknife")
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_fits_of_many_sizes_are_one_program(name):
+    """They have room for more rows and clusters, which changes nothing: beside what is traced, which has none."""
+    fit, program = FITS[name]
+
+    def of_first(count):
+        return *(values[:count] for values in (*MEASURES.values(), FELL)), np.arange(count) // 5
+
+    fit(*of_first(N))
+    before = program._cache_size()
+    *data, labels = of_first(N - 13)
+    found = fit(*data, labels)
+    assert program._cache_size() == before
+    expected = jax.jit(lambda *data: fit(*data, labels))(*data)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("clusters", [None, np.arange(N) // 5])

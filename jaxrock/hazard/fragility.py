@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Inexact
 
 from jaxrock._arguments import arguments
@@ -27,6 +26,7 @@ from jaxrock._checks import (
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock._tables import AbstractTable, Column, scenes
+from jaxrock.hazard.probit_line import probit, probit_line, slope_tests, with_room
 from jaxrock.motions.measures import are_different
 from jaxrock.status import Enumeration, item
 
@@ -269,7 +269,9 @@ def fit_fragility(levels: Values, toppled: Values, trials: Values = 1) -> Fragil
 
     **Source:** Silvapulle (1981), when the maximum exists; Baker (2015), the fit to counts at levels.
     """
-    return _fit(*counted(levels, toppled, trials))
+    levels, toppled, survived = counted(levels, toppled, trials)
+    (levels,), toppled, survived, _ = with_room([levels], toppled, survived)
+    return _fit(levels, toppled, survived)
 
 
 def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real, Real]:
@@ -284,7 +286,7 @@ def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real
     return levels, toppled, trials - toppled
 
 
-@eqx.filter_jit
+@jax.jit
 def _fit(levels, toppled, survived) -> FragilityFit:
     highest_survived, highest_toppled = (jnp.max(jnp.where(n > 0, levels, 0.0)) for n in (survived, toppled))
     lowest_survived, lowest_toppled = (jnp.min(jnp.where(n > 0, levels, jnp.inf)) for n in (survived, toppled))
@@ -313,82 +315,3 @@ def _fit(levels, toppled, survived) -> FragilityFit:
     test = slope_tests((logarithm - centre)[None], toppled, survived)[0]
     fragility, covariance, likelihood = fit
     return FragilityFit(fragility, covariance, likelihood, highest_survived, lowest_toppled, status, test)
-
-
-def probit(z, toppled, survived):
-    """Log-likelihood of outcomes with the probability Phi(z), and its first and second derivative by each z."""
-    signed, counts = jnp.stack([z, -z]), jnp.stack([toppled, survived])
-    logarithm = log_ndtr(signed)
-    ratio = jnp.exp(-(signed**2) / 2 - logarithm) / math.sqrt(2 * math.pi)
-    slopes = counts * ratio
-    return jnp.sum(counts * logarithm), slopes[0] - slopes[1], -jnp.sum(slopes * (signed + ratio), axis=0)
-
-
-def probit_line(abscissas, toppled, survived):
-    """Intercept and slopes of z, by (slopes, n) abscissas, for which outcomes are most probable; and if it was found.
-
-    The logarithm of the likelihood is concave, so that a step of Newton's method, cut short where it is too long,
-    always climbs.
-    """
-
-    def newton(abscissas, slope, curvature):
-        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), abscissas])
-        return jnp.linalg.solve(rows @ (-curvature[:, None] * rows.T), rows @ slope)
-
-    fixed = jax.lax.stop_gradient((abscissas, toppled, survived))
-    shares = 0.5 ** jnp.arange(8, dtype=abscissas.dtype)
-
-    def step(carry):
-        line, derivatives, _, count = carry
-        change = newton(fixed[0], *derivatives)
-        candidates = line + shares[:, None] * change
-        # All at every candidate, though only the best one's slopes are needed: `probit` is compiled once.
-        climbed, *found = jax.vmap(lambda line: probit(line[0] + line[1:] @ fixed[0], *fixed[1:]))(candidates)
-        best = jnp.argmax(climbed)
-        return candidates[best], tuple(x[best] for x in found), jnp.max(jnp.abs(change)), count + 1
-
-    dtype = abscissas.dtype
-    tight, ratio = jnp.sqrt(jnp.finfo(dtype).eps), math.sqrt(2 / math.pi)
-    level = ratio * (fixed[1] - fixed[2]), -(ratio**2) * (fixed[1] + fixed[2])  # derivatives where z is 0
-    start = jnp.zeros(1 + len(abscissas), dtype), level, jnp.asarray(jnp.inf, dtype), 0
-    line, _, change, _ = jax.lax.while_loop(lambda carry: (carry[2] > tight) & (carry[3] < 50), step, start)
-    # One step more, with derivatives by the data: those of first order are exact.
-    _, *derivatives = probit(line[0] + line[1:] @ abscissas, toppled, survived)
-    return line + newton(abscissas, *derivatives), change <= tight
-
-
-def slope_tests(abscissas, toppled, survived, labels=None, count: int = 0):
-    """How probably outcomes that have nothing to do with an abscissa, given the others, give such a slope: (slopes,).
-
-    Rao's score test, with the observed information: at the line without it, whose slope is zero. (A test of the slope
-    in its standard errors finds less the better outcomes are parted.) Of clusters by their labels, of which there are
-    `count`, by the scatter of their scores. 1 where nothing could tell a slope: an abscissa is constant, all ended
-    alike or are parted by the others, or the scores of each cluster cancel.
-    """
-
-    def test(tested, others):
-        rows = jnp.concatenate([jnp.ones_like(abscissas[:1]), others, tested[None]])
-        if len(others):
-            line = probit_line(others, toppled, survived)[0]
-        else:
-            line = jax.scipy.special.ndtri(jnp.where(mixed, jnp.sum(toppled) / jnp.sum(toppled + survived), 0.5))[None]
-        likelihood, by_z, curvature = probit(line @ rows[:-1], toppled, survived)
-        information = rows @ (-curvature[:, None] * rows.T)
-        combination = jnp.append(-jnp.linalg.solve(information[:-1, :-1], information[:-1, -1]), 1.0)
-        scores = (combination @ rows) * by_z
-        if labels is None:
-            scatter = combination @ information @ combination
-        else:
-            scatter = jnp.sum(jnp.zeros(count).at[labels].add(scores) ** 2) * count / (count - 1)
-        rounding = 8 * jnp.finfo(scores.dtype).eps * jnp.sum(jnp.abs(scores))
-        nothing = ~mixed | (likelihood >= -1e-6) | (jnp.ptp(tested) <= 1e-9) | (scatter <= rounding**2)
-        ratio = jnp.abs(jnp.sum(scores)) / jnp.sqrt(2 * jnp.where(nothing, 1.0, scatter))
-        return jnp.where(nothing, 1.0, jax.lax.erfc(ratio))
-
-    mixed = (jnp.sum(toppled) > 0) & (jnp.sum(survived) > 0)
-    if len(abscissas) == 1:
-        return test(abscissas[0], abscissas[:0])[None]
-    rests = np.array([np.delete(np.arange(len(abscissas)), index) for index in range(len(abscissas))])
-    return jax.lax.map(
-        lambda index: test(abscissas[index], abscissas[jnp.asarray(rests)[index]]), np.arange(len(rests))
-    )

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, is_traced, not_negative, one_program, positive, shown
 from jaxrock._tables import AbstractTable, Column
-from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes, probit, probit_line, slope_tests
+from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes
+from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, slope_tests, with_room
 
 
 class ProbitFit(AbstractTable):
@@ -135,15 +136,16 @@ def fit_probit(
     if errors != "information" and labels.max() < 1:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
     count = 0 if errors == "information" else int(labels.max()) + 1
-    logarithms, survived = _prepared(lists, toppled, trials)
-    numbers = _fit(logarithms, toppled, survived, jnp.asarray(labels), count, errors)
+    lists, toppled, survived, labels = with_room(lists, toppled, trials - toppled, labels)
+    logarithms = _logarithms(lists)
+    numbers = _fit(logarithms, toppled, survived, labels, count, most_clusters(count), errors)
     return or_separable(ProbitFit(tuple(measures), *numbers), logarithms, toppled, survived)
 
 
 @one_program
-def _prepared(lists, toppled, trials):
-    """Logarithms of the measures, whose sums over outcomes are long, and how many survived."""
-    return jnp.log(jnp.stack(lists).astype(jnp.result_type(float))), trials - toppled
+def _logarithms(lists):
+    """Of the measures, in the precision that there is: their sums over outcomes are long."""
+    return jnp.log(jnp.stack(lists).astype(jnp.result_type(float)))
 
 
 def or_separable(fit, logarithms, toppled, survived):
@@ -174,8 +176,8 @@ def inverse_information(rows, curvature, trials):
     return covariance, (even > 0) & (even < jnp.finfo(rows.dtype).eps ** -0.75)
 
 
-@functools.partial(jax.jit, static_argnums=(4, 5))
-def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
+@functools.partial(jax.jit, static_argnames=("most", "errors"))
+def _fit(logarithms, toppled, survived, labels, count, most: int, errors: str):
     centre, size = jnp.mean(logarithms, 1), jnp.std(logarithms, 1)
     known = jnp.all(size > 1e-9)
     size = jnp.where(size > 1e-9, size, 1.0)
@@ -186,7 +188,7 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     covariance, told = inverse_information(rows, curvature, toppled + survived)
     told &= jnp.all(jnp.isfinite(covariance))
     if errors == "clusters":
-        scores = jnp.zeros((count, len(rows))).at[labels].add((rows * by_z).T)
+        scores = jnp.zeros((most, len(rows))).at[labels].add((rows * by_z).T)
         covariance = covariance @ (scores.T @ scores * count / (count - 1)) @ covariance
     elif errors == "jackknife":
 
@@ -194,7 +196,7 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
             kept = (labels != left_out).astype(toppled.dtype)
             return probit_line(abscissas, toppled * kept, survived * kept)
 
-        lines, found = jax.lax.map(without, jnp.arange(count), batch_size=64)
+        lines, found = jax.lax.map(without, jnp.arange(most), batch_size=64)  # without those beyond: as with all
         off = lines - line
         covariance = jnp.where(jnp.all(found), (count - 1) / count * off.T @ off, jnp.nan)
     # In the logarithms themselves: intercept = line[0] - sum(line[k] centre[k]/size[k]).
@@ -204,6 +206,6 @@ def _fit(logarithms, toppled, survived, labels, count: int, errors: str):
     status = FitStatus.where(converged, FitStatus.successful, FitStatus.not_converged)
     status = FitStatus.where(likelihood >= -1e-6, FitStatus.separable, status)
     numbers = (back @ line)[0], (back @ line)[1:], back @ covariance @ back.T, likelihood
-    tests = slope_tests(abscissas, toppled, survived, None if errors == "information" else labels, count)
+    tests = slope_tests(abscissas, toppled, survived, None if errors == "information" else labels, count, most)
     means = [jnp.sum(abscissas * n, axis=1) / jnp.sum(n) for n in (toppled, survived)]
     return *(jnp.where(converged, x, jnp.nan) for x in numbers), tests, means[0] < means[1], status

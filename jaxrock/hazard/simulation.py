@@ -25,11 +25,10 @@ from jaxrock.hazard.fragility import (
     TabulatedFragility,
     fit_fragility,
     lognormal_of,
-    probit,
     rising_list,
-    slope_tests,
 )
 from jaxrock.hazard.intervals import FragilityIntervals, intervals_of_motions
+from jaxrock.hazard.probit_line import probit, slope_tests
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.measures import measure_of, power_of, strengths, unit_of
@@ -228,7 +227,7 @@ def _clustered(fit: FragilityFit, levels, toppled, draws):
     motions = toppled.shape[0]
     abscissas = jnp.tile(jnp.log(levels), motions)[None]
     labels = jnp.repeat(jnp.arange(motions), levels.size)
-    test = slope_tests(abscissas, toppled.ravel(), draws - toppled.ravel(), labels, motions)[0]
+    test = slope_tests(abscissas, toppled.ravel(), draws - toppled.ravel(), labels, motions, motions)[0]
     return fit.covariance @ (scores.T @ scores * motions / (motions - 1)) @ fit.covariance, test
 
 

@@ -41,11 +41,10 @@ from jaxrock.hazard.fragility import (
     alike,
     lognormal,
     outcomes,
-    probit,
-    probit_line,
     rising_list,
 )
 from jaxrock.hazard.probit import inverse_information, or_separable
+from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, with_room
 from jaxrock.hazard.simulation import SimulatedFragility, counts
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
@@ -158,24 +157,25 @@ def fit_surface(
     count = int(labels.max()) + 1
     if count < 2:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    fit, scores, measures, survived = _fit(acceleration, ratio, toppled, trials)
+    lists, toppled, survived, labels = with_room([acceleration, ratio], toppled, trials - toppled, labels)
+    fit, scores, measures = _fit(*lists, toppled, survived)
     fit = or_separable(fit, measures, toppled, survived)
     if clusters is None:
         return fit
-    return eqx.tree_at(lambda f: f.covariance, fit, _clustered(fit.covariance, scores, labels, count))
+    covariance = _clustered(fit.covariance, scores, labels, count, most_clusters(count))
+    return eqx.tree_at(lambda f: f.covariance, fit, covariance)
 
 
-@functools.partial(jax.jit, static_argnames="count")
-def _clustered(covariance, scores, labels, count: int) -> Float[Array, "3 3"]:
-    summed = jnp.zeros((count, 3)).at[labels].add(scores)
+@functools.partial(jax.jit, static_argnames="most")
+def _clustered(covariance, scores, labels, count: ArrayLike, most: int) -> Float[Array, "3 3"]:
+    summed = jnp.zeros((most, 3)).at[labels].add(scores)
     return covariance @ (summed.T @ summed * count / (count - 1)) @ covariance
 
 
 @jax.jit
-def _fit(acceleration, ratio, toppled, trials):
-    """The fit, the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion), the
-    logarithms of the measures, and how many survived."""
-    survived = trials - toppled
+def _fit(acceleration, ratio, toppled, survived):
+    """The fit, the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion), and the
+    logarithms of the measures."""
     measures = jnp.log(jnp.stack([acceleration, ratio]))
     centre = jnp.mean(measures, axis=1, keepdims=True)
     size = jnp.std(measures, axis=1, keepdims=True)
@@ -197,7 +197,7 @@ def _fit(acceleration, ratio, toppled, trials):
     status = FitStatus.where(converged, status, FitStatus.not_converged)
     numbers = jnp.exp(logarithm), exponent, dispersion, covariance
     *numbers, covariance = (jnp.where(status == FitStatus.successful, x, jnp.nan) for x in numbers)
-    return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T, measures, survived
+    return SurfaceFit(SurfaceFragility(*numbers), covariance, status), (rows * by_z).T, measures
 
 
 @arguments

@@ -63,14 +63,19 @@ def _at_elements(one: Callable, *values) -> Any:
 _LEAST, _DOUBLED = 8, 4096  # elements for which there is room, and up to which room is doubled
 
 
+def room_for(size: int) -> int:
+    """Room for so many: a few numbers serve all."""
+    doubled = 1 << (max(size, _LEAST) - 1).bit_length()
+    return doubled if size <= _DOUBLED else -(-size // (doubled // 8)) * (doubled // 8)
+
+
 def _with_room(function: Callable, values: list) -> Any:
     """The function of known arrays: of any shape in a few lengths, for each of which it is compiled."""
     shape = np.broadcast_shapes(*(x.shape for x in values))
     if shape == ():
         return function(*values)
     size = math.prod(shape)
-    doubled = 1 << (max(size, _LEAST) - 1).bit_length()
-    room = doubled if size <= _DOUBLED else -(-size // (doubled // 8)) * (doubled // 8)
+    room = room_for(size)
     filled = [np.empty(room, x.dtype) for x in values]
     for whole, x in zip(filled, values):
         whole[:size] = np.broadcast_to(np.asarray(x), shape).ravel()
