@@ -25,6 +25,7 @@ from jaxrock._checks import (
 )
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.hazard.probit_line import probit, probit_line, slope_tests, with_room
 from jaxrock.motions.measures import are_different
@@ -286,7 +287,7 @@ def counted(levels: Values, toppled: Values, trials: Values) -> tuple[Real, Real
     return levels, toppled, trials - toppled
 
 
-@jax.jit
+@quickly()
 def _fit(levels, toppled, survived) -> FragilityFit:
     highest_survived, highest_toppled = (jnp.max(jnp.where(n > 0, levels, 0.0)) for n in (survived, toppled))
     lowest_survived, lowest_toppled = (jnp.min(jnp.where(n > 0, levels, jnp.inf)) for n in (survived, toppled))

@@ -1,6 +1,5 @@
 """Probit fits of outcomes to the logarithms of any number of intensity measures, with errors of few motions, too."""
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, is_traced, not_negative, one_program, positive, shown
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes
 from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, slope_tests, with_room
@@ -176,7 +176,7 @@ def inverse_information(rows, curvature, trials):
     return covariance, (even > 0) & (even < jnp.finfo(rows.dtype).eps ** -0.75)
 
 
-@functools.partial(jax.jit, static_argnames=("most", "errors"))
+@quickly(static_argnames=("most", "errors"))
 def _fit(logarithms, toppled, survived, labels, count, most: int, errors: str):
     centre, size = jnp.mean(logarithms, 1), jnp.std(logarithms, 1)
     known = jnp.all(size > 1e-9)

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int8
 
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, checked, one_of, placed
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -216,7 +217,7 @@ class SimulatedFragility(AbstractTable):
         }
 
 
-@eqx.filter_jit
+@quickly()
 def _clustered(fit: FragilityFit, levels, toppled, draws):
     """Covariance of (ln median, ln dispersion), and the test of the slope, where what one record (a row) does at all
     levels is one outcome."""

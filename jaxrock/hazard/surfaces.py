@@ -4,7 +4,6 @@ Peak acceleration alone says whether a block uplifts, the ratio of peak velocity
 pushed: together they say most of what a motion does to a rock.
 """
 
-import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Annotated
@@ -31,6 +30,7 @@ from jaxrock._checks import (
 )
 from jaxrock._described import described
 from jaxrock._parameters import one_of_many
+from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -166,13 +166,13 @@ def fit_surface(
     return eqx.tree_at(lambda f: f.covariance, fit, covariance)
 
 
-@functools.partial(jax.jit, static_argnames="most")
+@quickly(static_argnames="most")
 def _clustered(covariance, scores, labels, count: ArrayLike, most: int) -> Float[Array, "3 3"]:
     summed = jnp.zeros((most, 3)).at[labels].add(scores)
     return covariance @ (summed.T @ summed * count / (count - 1)) @ covariance
 
 
-@jax.jit
+@quickly()
 def _fit(acceleration, ratio, toppled, survived):
     """The fit, the derivatives of every outcome's log-likelihood by (ln median, exponent, ln dispersion), and the
     logarithms of the measures."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from jaxrock._arguments import arguments, list_of
 from jaxrock._checks import Values, checked, inner_share, not_negative, placed, scalar, share
+from jaxrock._quickly import quickly
 from jaxrock.hazard.curves import HazardCurve, check_one, power_laws, scaled, shakings
 from jaxrock.hazard.fragility import AbstractFragility, LogNormalFragility, check_measure
 from jaxrock.numerics.roots import search_root
@@ -172,7 +173,7 @@ def _stacked(*numbers: Any) -> Array:
     return placed(np.stack([np.asarray(number) for number in numbers]))
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit)
 def _toppling_rate(fragility: AbstractFragility, curve: HazardCurve) -> Number:
     if type(fragility) is LogNormalFragility:  # what is made of it may have other probabilities
         return _lognormal_rate(fragility, curve)
@@ -202,7 +203,7 @@ def _lognormal_rate(fragility: LogNormalFragility, curve: HazardCurve) -> Number
     return within + jnp.where(first, curve.rates, 0.0) @ fragility(curve.levels)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit)
 def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve: HazardCurve) -> Number:
     """Expected number of shakings that topple at least one of the rocks that are fragile by then."""
 
@@ -220,7 +221,7 @@ def _topplings(rocks: tuple[_Stack, ...], ages: Inexact[Array, " rocks"], curve:
     return (ages - jnp.append(ages[1:], 0.0)) @ (joint @ rates)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit)
 def _allowed_scale(rocks, ages, curve, most: Number) -> Number:
     """As `allowed_scale`, at which `most` topplings are expected."""
     numbers, rest = eqx.partition((rocks, ages, curve, most), eqx.is_array)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxrock._quickly import quickly
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scalar
 from jaxrock.motions.record import with_room
@@ -26,7 +27,7 @@ def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Sca
     return _peaks_of(with_room(motion))
 
 
-@jax.jit
+@quickly()
 def _peaks_of(motion: AbstractMotion):
     """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
 

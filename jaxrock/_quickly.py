@@ -1,0 +1,61 @@
+"""Programs that run for a moment, which XLA compiles in the least time."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import jax
+import numpy as np
+
+from jaxrock._checks import is_traced
+
+Made = TypeVar("Made", bound=Callable)
+
+_MUCH = 100_000  # numbers, with which a program runs long enough for it to matter how well it was compiled
+# Without LLVM's effort and XLA's newer emitters, which newer jaxlibs cannot do without.
+_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+
+
+@functools.cache
+def _options() -> dict[str, Any]:
+    """Those options that this jaxlib knows."""
+    for known in (_OPTIONS, dict(list(_OPTIONS.items())[:1])):
+        try:
+            jax.jit(lambda x: x + 1, compiler_options=known).lower(1.0).compile()
+        except Exception:  # reported by an internal error type
+            continue
+        return known
+    return {}
+
+
+def quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Made], Made]:
+    """Decorate a function of few numbers: compiled by `jit` with `settings`, on CPUs in a quarter of the time, to what
+    takes three times as long to run: milliseconds (`benchmarks/fits.py`). Of what is traced it is a part of another
+    program, which has options of its own."""
+
+    def decorate(function: Made) -> Made:
+        whole = jit(function, **settings)
+
+        @functools.cache
+        def at_once() -> Callable:
+            return jit(function, compiler_options=_options(), **settings)
+
+        @functools.wraps(function)
+        def run(*args: Any, **named: Any) -> Any:
+            if not _are_few((args, named)):
+                return whole(*args, **named)
+            with jax.ensure_compile_time_eval():  # known within other programs, too
+                return at_once()(*args, **named)
+
+        return cast(Made, run)
+
+    return decorate
+
+
+def _are_few(tree: Any) -> bool:
+    """Whether all arrays in it are known, small, and on a CPU."""
+    arrays = [x for x in jax.tree.leaves(tree) if isinstance(x, (jax.Array, np.ndarray))]
+    if is_traced(tree) or sum(x.size for x in arrays) > _MUCH:
+        return False
+    platforms = {device.platform for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
+    return platforms == {"cpu"}
