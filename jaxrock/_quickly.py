@@ -30,8 +30,8 @@ def _options() -> dict[str, Any]:
 
 def quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Made], Made]:
     """Decorate a function of few numbers: compiled by `jit` with `settings`, on CPUs in a quarter of the time, to what
-    takes three times as long to run: milliseconds (`benchmarks/fits.py`). Of what is traced it is a part of another
-    program, which has options of its own."""
+    takes three times as long to run: milliseconds (`benchmarks/fits.py`). Within another program it is a part of that,
+    which has options of its own."""
 
     def decorate(function: Made) -> Made:
         whole = jit(function, **settings)
@@ -42,10 +42,8 @@ def quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Made], Made]:
 
         @functools.wraps(function)
         def run(*args: Any, **named: Any) -> Any:
-            if not _are_few((args, named)):
-                return whole(*args, **named)
-            with jax.ensure_compile_time_eval():  # known within other programs, too
-                return at_once()(*args, **named)
+            by_itself = _are_few((args, named)) and not is_traced(jax.lax.neg(0.0))  # which a program around it traces
+            return (at_once() if by_itself else whole)(*args, **named)
 
         return cast(Made, run)
 

@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 import pytest
 
 import jaxrock as rk
 from jaxrock._arguments import path_of
+from jaxrock._quickly import _MUCH, _options, quickly
 from jaxrock.command_line.main import main
 from jaxrock.engines import scene
 from jaxrock.keeping import changes, facts, folder
@@ -392,3 +394,33 @@ def test_what_cannot_be_deleted_is_said(place, capsys, tmp_path):
         patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as where nothing may be written
         assert main(["cache", "--clear"]) == 2
     assert "1 of 1 files" in capsys.readouterr().err and folder.kept()
+
+
+def test_programs_of_a_moment():
+    """Known numbers have a program of their own, which is compiled quickly; within other programs they are part of
+    those, whatever transforms them."""
+    traces = []
+
+    @quickly(static_argnames="power")
+    def total(numbers, power):
+        traces.append(power)
+        return jnp.sum(numbers**power)
+
+    known = jnp.arange(3.0)
+    for _ in range(2):
+        assert float(total(known, power=2)) == 5.0
+    assert traces == [2]
+    assert float(jax.jit(lambda x: x * total(known, power=2))(2.0)) == 10.0
+    np.testing.assert_array_equal(jax.vmap(lambda x: x * total(known, power=2))(known), 5 * known)
+    np.testing.assert_array_equal(jax.grad(lambda x: total(x, power=2))(known), 2 * known)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(lambda x: total(x * known, power=2)))(known), 5 * known**2)
+    assert float(total(jnp.ones(_MUCH + 1), power=3)) == _MUCH + 1
+    assert total(jax.device_put(known, jax.devices()[-1]), power=2).devices() == {jax.devices()[-1]}
+    with jax.disable_jit():
+        assert float(total(known, power=2)) == 5.0
+
+
+def test_options_of_programs_of_a_moment():
+    """What this jaxlib knows of them: LLVM's effort always, XLA's emitters as long as there are others."""
+    assert {"xla_backend_optimization_level": 0} == {k: v for k, v in _options().items() if "emitters" not in k}
+    assert ("xla_cpu_use_fusion_emitters" in _options()) or jaxlib.version.__version_info__[:2] > (0, 10)

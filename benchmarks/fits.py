@@ -1,0 +1,109 @@
+"""What a first fit costs, and one of another size: `python benchmarks/fits.py` writes `fits.md`.
+
+Fresh processes, with nothing kept and XLA's own settings, in turns: compiled quickly (`jaxrock._quickly`), and as XLA
+compiles by itself.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from common import table  # first: the search path
+from peers_solvers.report import surroundings
+
+HERE = Path(__file__).parent
+TIMES, ROWS, OTHER = 3, 200, 190
+WAYS = ("quickly", "by itself")
+# Question: what is called of so many rows (n).
+QUESTIONS = {
+    "`fit_fragility`": "hazard.fit_fragility(x[:n], fell[:n])",
+    "`fit_probit` by two measures, clusters": (
+        "hazard.fit_probit({'PGA': x[:n], 'ratio': y[:n]}, fell[:n], clusters=np.arange(n) // 5)"
+    ),
+    "the same, jackknife": (
+        "hazard.fit_probit({'PGA': x[:n], 'ratio': y[:n]}, fell[:n], clusters=np.arange(n) // 5, errors='jackknife')"
+    ),
+    "`fit_surface`": "hazard.fit_surface(x[:n], y[:n], fell[:n])",
+    "`toppling_rate`": "hazard.toppling_rate(fragility, curve)",
+    "`survival_probability` of two rocks": "hazard.survival_probability([fragility, fragility], [1e2, 1e3], curve)",
+    "`peak_velocity` of a pulse": "rk.intensity.peak_velocity(rk.RickerPulse(0.5, 0.6))",
+}
+
+
+def ask(question, way):
+    """In this process: processor seconds of the first answer, of one to another number of rows, seconds of the next
+    ones, and all numbers of the first."""
+    import jax
+    import numpy as np
+
+    jax.config.update("jax_enable_x64", True)
+    import jaxrock as rk
+    from jaxrock import _quickly
+
+    if way != WAYS[0]:
+        _quickly._MUCH = -1
+    draw = np.random.default_rng(1)
+    x, y = (np.exp(draw.normal(mean, 0.5, ROWS)) for mean in (-1, -2))
+    names = {
+        "rk": rk, "hazard": rk.hazard, "np": np, "x": x, "y": y,
+        "fell": np.log(x) + 0.5 * np.log(y) + draw.normal(0, 0.5, ROWS) > -2,
+        "fragility": rk.hazard.LogNormalFragility(0.3, 0.4, "PGA"),
+        "curve": rk.hazard.HazardCurve([0.1, 0.2, 0.4, 0.8], [1e-2, 1e-3, 1e-4, 1e-5]),
+    }  # fmt: skip
+
+    def timed(clock, count):
+        begun = clock()
+        answer = jax.block_until_ready(jax.tree.leaves(eval(QUESTIONS[question], names | {"n": count})))
+        return clock() - begun, answer
+
+    first, answer = timed(time.process_time, ROWS)
+    other = timed(time.process_time, OTHER)[0]
+    again = min(timed(time.perf_counter, ROWS)[0] for _ in range(50))
+    numbers = [float(number) for leaf in answer for number in np.ravel(np.asarray(leaf, float))]
+    return first, other, again, numbers
+
+
+def asked(question, way):
+    """The same in a fresh process."""
+    words = [sys.executable, __file__, question, way]
+    run = subprocess.run(words, env=os.environ | {"JAXROCK_CACHE": "off"}, capture_output=True, text=True, check=True)
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def main():
+    rows = []
+    for question in QUESTIONS:
+        found = {way: [] for way in WAYS}
+        for _ in range(TIMES):
+            for way in WAYS:
+                found[way].append(asked(question, way))
+        pairs = zip(*(found[way][0][3] for way in WAYS), strict=True)
+        off = max((abs(one - other) / abs(other) for one, other in pairs if other), default=0.0)
+        for way, answers in found.items():
+            first, other, again = (statistics.median(x) for x in list(zip(*answers, strict=True))[:3])
+            rows.append([question, way, f"{first:.2f}", f"{other:.2f}", f"{1e3 * again:.2f}", f"{off:.0e}"])
+    heads = ["question", "compiled", "first [s]", f"of {OTHER} rows then [s]", "again [ms]", "relative difference"]
+    text = f"""# Fits, rates and peaks
+
+Written by `python benchmarks/fits.py`, {surroundings()}.
+
+Processor seconds of the first answer in a fresh process with nothing kept, and of one to {OTHER} rows of outcomes after
+one to {ROWS}, which have room in one program; the least time of answers after that; medians of {TIMES}, in turns. Of
+known numbers, few and on a CPU, the package has XLA compile such programs quickly (`jaxrock._quickly`): without LLVM's
+effort and XLA's newer emitters. The difference is the largest of any number of the answer, covariances too.
+
+{table(heads, rows)}
+"""
+    (HERE / "fits.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(json.dumps(ask(sys.argv[1], sys.argv[2])))
+    else:
+        main()
