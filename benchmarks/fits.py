@@ -1,4 +1,4 @@
-"""What a first fit costs, and one of another size: `python benchmarks/fits.py` writes `fits.md`.
+"""First fits, rates, peaks and estimates, and fits of another size: `python benchmarks/fits.py` writes `fits.md`.
 
 Fresh processes, with nothing kept and XLA's own settings, in turns: compiled quickly (`jaxrock._quickly`), and as XLA
 compiles by itself.
@@ -30,6 +30,9 @@ QUESTIONS = {
     "`fit_surface`": "hazard.fit_surface(x[:n], y[:n], fell[:n])",
     "`toppling_rate`": "hazard.toppling_rate(fragility, curve)",
     "`survival_probability` of two rocks": "hazard.survival_probability([fragility, fragility], [1e2, 1e3], curve)",
+    "`log_density` at 64 points": "rk.inverse.log_density(*asked)(points)",
+    "`estimate_motion`, 8 starts": "rk.inverse.estimate_motion(*asked, starts=8, progress=False).values",
+    "`feasible_region`, 12 x 12": "rk.inverse.feasible_region(rk.inverse.Likelihood(*asked[:2]), grid, progress=False)",
     "`peak_velocity` of a pulse": "rk.intensity.peak_velocity(rk.RickerPulse(0.5, 0.6))",
 }
 
@@ -48,10 +51,15 @@ def ask(question, way):
         _quickly._MUCH = -1
     draw = np.random.default_rng(1)
     x, y = (np.exp(draw.normal(mean, 0.5, ROWS)) for mean in (-1, -2))
+    alpha, p = np.array([0.10, 0.13, 0.16, 0.20, 0.24]), np.array([3.0, 2.6, 3.4, 2.8, 3.2])
+    rocks = rk.inverse.Observations(alpha, p, ["toppled"] * 2 + ["survived"] * 3, alpha_sd=0.04 * alpha)
+    unknowns = {"amplitude": rk.inverse.Unknown(0.05, 2.0), "period": rk.inverse.Unknown(0.2, 3.0)}
     names = {
         "rk": rk, "hazard": rk.hazard, "np": np, "x": x, "y": y,
         "fell": np.log(x) + 0.5 * np.log(y) + draw.normal(0, 0.5, ROWS) > -2,
         "fragility": rk.hazard.LogNormalFragility(0.3, 0.4, "PGA"),
+        "asked": (rocks, rk.SinePulse, unknowns), "points": draw.normal(0, 1, (64, 2)),
+        "grid": {"amplitude": np.geomspace(0.1, 1.5, 12), "period": np.geomspace(0.3, 2.0, 12)},
         "curve": rk.hazard.HazardCurve([0.1, 0.2, 0.4, 0.8], [1e-2, 1e-3, 1e-4, 1e-5]),
     }  # fmt: skip
 
@@ -62,7 +70,7 @@ def ask(question, way):
 
     first, answer = timed(time.process_time, ROWS)
     other = timed(time.process_time, OTHER)[0]
-    again = min(timed(time.perf_counter, ROWS)[0] for _ in range(50))
+    again = min(timed(time.perf_counter, ROWS)[0] for _ in range(3 if "motion" in question else 50))
     numbers = [float(number) for leaf in answer for number in np.ravel(np.asarray(leaf, float))]
     return first, other, again, numbers
 
@@ -87,14 +95,15 @@ def main():
             first, other, again = (statistics.median(x) for x in list(zip(*answers, strict=True))[:3])
             rows.append([question, way, f"{first:.2f}", f"{other:.2f}", f"{1e3 * again:.2f}", f"{off:.0e}"])
     heads = ["question", "compiled", "first [s]", f"of {OTHER} rows then [s]", "again [ms]", "relative difference"]
-    text = f"""# Fits, rates and peaks
+    text = f"""# Fits, rates, peaks and estimates
 
 Written by `python benchmarks/fits.py`, {surroundings()}.
 
 Processor seconds of the first answer in a fresh process with nothing kept, and of one to {OTHER} rows of outcomes after
 one to {ROWS}, which have room in one program; the least time of answers after that; medians of {TIMES}, in turns. Of
 known numbers, few and on a CPU, the package has XLA compile such programs quickly (`jaxrock._quickly`): without LLVM's
-effort and XLA's newer emitters. The difference is the largest of any number of the answer, covariances too.
+effort and XLA's newer emitters; also where such a program follows scenes, if these are machine code. The difference is
+the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb settles at.
 
 {table(heads, rows)}
 """

@@ -1,6 +1,7 @@
 """Programs that run for a moment, which XLA compiles in the least time."""
 
 import functools
+import importlib.util
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -28,10 +29,15 @@ def _options() -> dict[str, Any]:
     return {}
 
 
-def quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Made], Made]:
+@functools.cache
+def _has_machine_code() -> bool:
+    return importlib.util.find_spec("llvmlite") is not None
+
+
+def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: Any) -> Callable[[Made], Made]:
     """Decorate a function of few numbers: compiled by `jit` with `settings`, on CPUs in a quarter of the time, to what
     takes three times as long to run: milliseconds (`benchmarks/fits.py`). Within another program it is a part of that,
-    which has options of its own."""
+    which has options of its own. If it `follows_scenes` only where these are machine code, and not left to XLA, too."""
 
     def decorate(function: Made) -> Made:
         whole = jit(function, **settings)
@@ -43,6 +49,7 @@ def quickly(jit: Callable = jax.jit, **settings: Any) -> Callable[[Made], Made]:
         @functools.wraps(function)
         def run(*args: Any, **named: Any) -> Any:
             by_itself = _are_few((args, named)) and not is_traced(jax.lax.neg(0.0))  # which a program around it traces
+            by_itself = by_itself and (not follows_scenes or _has_machine_code())
             return (at_once() if by_itself else whole)(*args, **named)
 
         return cast(Made, run)

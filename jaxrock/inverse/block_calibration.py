@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxrock._arguments import arguments, at_least, known, list_of
 from jaxrock._checks import Range, Values, as_real, below_one, share, shown, whole
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.calibration_grid import STILL, Axis, Table, blocks_of_cells, weighed
@@ -367,26 +368,26 @@ def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[
     return best.x, bool(best.success) or float(np.abs(best.jac).max()) < 1e-3
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _density(problem, values):
     return problem.log_density(jnp.stack([problem.place(name, values[name]) for name in problem.unknowns]))
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _heights(problem, points):
     return jax.lax.map(problem.log_density, points)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _value(problem, place, weights):
     return jax.value_and_grad(lambda x: problem.log_density(x, weights))(place)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _probabilities(problem, place, shares):
     return problem.probabilities(place, shares)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _hessian(problem, place):
     return jax.hessian(problem.log_density)(place)

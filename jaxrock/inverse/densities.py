@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, check_shapes
+from jaxrock._quickly import quickly
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
@@ -88,7 +89,7 @@ class LogDensity(eqx.Module):
         return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) -> Real:
     """The log-density or, not `by_point`, the objective: one program for both."""
     problem = density.problem

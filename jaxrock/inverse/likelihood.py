@@ -33,6 +33,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import as_real, below_one, check_shapes, positive, put_down, scalar, shown
+from jaxrock._quickly import quickly
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import Possible, levels_around
@@ -256,7 +257,7 @@ def _made(motion: Any) -> AbstractMotion:
     return motion
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def as_program(what: Callable, likelihood: Likelihood, values: Mapping[str, ArrayLike], *how):
     """A function of a likelihood as it is now (`current`), at values by name, as one compiled program."""
     return what(likelihood, values, *how)

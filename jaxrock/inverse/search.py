@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 from jaxrock._checks import placed, shown
+from jaxrock._quickly import quickly
 from jaxrock.inverse.unknowns import Evaluator, Problem
 from jaxrock.numerics.climb import Summits, climb
 
@@ -137,7 +138,7 @@ def _each(function):
     return eqx.filter_vmap(function, in_axes=eqx.if_array(0), out_axes=eqx.if_array(0))
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _begun(solver, problem: Problem, ends: Real, points: Real):
     loss = _loss_of(problem, ends)
 
@@ -148,7 +149,7 @@ def _begun(solver, problem: Problem, ends: Real, points: Real):
     return _each(one)(points)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _stepped(solver, problem: Problem, ends: Real, points: Real, state):
     loss = _loss_of(problem, ends)
 

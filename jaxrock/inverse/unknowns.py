@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import finite, positive, scalar, shown
 from jaxrock._described import described
+from jaxrock._quickly import quickly
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
@@ -144,7 +145,7 @@ class Problem(eqx.Module):
         return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
     def density(places):
         terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
