@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock import _quickly
 from jaxrock._arguments import path_of
 from jaxrock._quickly import _MUCH, _options, quickly
 from jaxrock.command_line.main import main
@@ -424,3 +425,21 @@ def test_options_of_programs_of_a_moment():
     """What this jaxlib knows of them: LLVM's effort always, XLA's emitters as long as there are others."""
     assert {"xla_backend_optimization_level": 0} == {k: v for k, v in _options().items() if "emitters" not in k}
     assert ("xla_cpu_use_fusion_emitters" in _options()) or jaxlib.version.__version_info__[:2] > (0, 10)
+
+
+def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
+    """What is compiled quickly runs three times as long: that matters where scenes are no machine code."""
+    ways = []
+
+    def jit(function, **settings):
+        def compiled(*args):
+            ways.append("quickly" if "compiler_options" in settings else "well")
+            return function(*args)
+
+        return compiled
+
+    total = quickly(jit, follows_scenes=True)(jnp.sum)
+    for has in (True, False, True):
+        monkeypatch.setattr(_quickly, "_has_machine_code", lambda has=has: has)
+        assert float(total(jnp.arange(3.0))) == 3.0
+    assert ways == ["quickly", "well", "quickly"]
