@@ -157,8 +157,9 @@ def fit_surface(
     count = int(labels.max()) + 1
     if count < 2:
         raise ValueError("Argument `clusters` must name at least two clusters, but names one.")
-    lists, toppled, survived, labels = with_room([acceleration, ratio], toppled, trials - toppled, labels)
-    fit, scores, measures = _fit(*lists, toppled, survived)
+    both, toppled, survived, labels = with_room([acceleration, ratio], toppled, trials - toppled, labels)
+    acceleration, ratio = both
+    fit, scores, measures = _fit(acceleration, ratio, toppled, survived)
     fit = or_separable(fit, measures, toppled, survived)
     if clusters is None:
         return fit
