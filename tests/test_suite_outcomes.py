@@ -1,5 +1,6 @@
 """Suites as recorded and at many scales: every scene against one of its own, and what is made of them."""
 
+import logging
 import xml.etree.ElementTree as ElementTree
 
 import jax
@@ -11,7 +12,6 @@ import scipy.stats
 
 import jaxrock as rk
 from jaxrock.blocks.random import _drawn, _drawn_sides
-from jaxrock.hazard import fragility, probit, surfaces
 from jaxrock.hazard.suites import measures_by_name
 from jaxrock.studies import azimuths, suite_scenes
 from jaxrock.studies.suite_scenes import of_motion, stacked
@@ -219,34 +219,32 @@ def test_a_probit_of_two_measures_by_another_optimiser():
 
 
 FITS = {
-    "of a lognormal fragility": (lambda x, y, fell, labels: rk.hazard.fit_fragility(x, fell), fragility._fit),
-    "of a surface": (lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell), surfaces._fit),
-    "of clusters": (lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell, 1, labels), surfaces._fit),
+    "of a lognormal fragility": lambda x, y, fell, labels: rk.hazard.fit_fragility(x, fell),
+    "of a surface": lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell),
+    "of a surface, of clusters": lambda x, y, fell, labels: rk.hazard.fit_surface(x, y, fell, 1, labels),
 } | {
-    f"of a line, {errors}": (
-        lambda x, y, fell, labels, errors=errors: rk.hazard.fit_probit(
-            {"x": x, "y": y}, fell, clusters=labels, errors=errors
-        ),
-        probit._fit,
+    f"of a line, {errors}": lambda x, y, fell, labels, errors=errors: rk.hazard.fit_probit(
+        {"x": x, "y": y}, fell, clusters=labels, errors=errors
     )
     for errors in ("information", "clusters", "jackknife")
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FITS)
-def test_fits_of_many_sizes_are_one_program(name):
+def test_fits_of_many_sizes_are_one_program(name, caplog):
     """They have room for more rows and clusters, which changes nothing: beside what is traced, which has none."""
-    fit, program = FITS[name]
 
     def of_first(count):
         return *(values[:count] for values in (*MEASURES.values(), FELL)), np.arange(count) // 5
 
-    fit(*of_first(N))
-    before = program._cache_size()
+    FITS[name](*of_first(N))
     *data, labels = of_first(N - 13)
-    found = fit(*data, labels)
-    assert program._cache_size() == before
-    expected = jax.jit(lambda *data: fit(*data, labels))(*data)
+    with jax.log_compiles(), caplog.at_level(logging.WARNING, "jax"):
+        found = FITS[name](*data, labels)
+        again, _ = caplog.text, caplog.clear()
+        expected = jax.jit(lambda *data: FITS[name](*data, labels))(*data)
+    assert "Compiling jit(<lambda>)" in caplog.text
+    assert "_fit)" not in again and "_clustered)" not in again
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
