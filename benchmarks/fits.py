@@ -94,16 +94,16 @@ def main():
         for way, answers in found.items():
             first, other, again = (statistics.median(x) for x in list(zip(*answers, strict=True))[:3])
             rows.append([question, way, f"{first:.2f}", f"{other:.2f}", f"{1e3 * again:.2f}", f"{off:.0e}"])
-    heads = ["question", "compiled", "first [s]", f"of {OTHER} rows then [s]", "again [ms]", "relative difference"]
+    heads = ["question", "compiled", "first [s]", f"next, of {OTHER} rows [s]", "again [ms]", "relative difference"]
     text = f"""# Fits, rates, peaks and estimates
 
 Written by `python benchmarks/fits.py`, {surroundings()}.
 
-Processor seconds of the first answer in a fresh process with nothing kept, and of one to {OTHER} rows of outcomes after
-one to {ROWS}, which have room in one program; the least time of answers after that; medians of {TIMES}, in turns. Of
-known numbers, few and on a CPU, the package has XLA compile such programs quickly (`jaxrock._quickly`): without LLVM's
-effort and XLA's newer emitters; also where such a program follows scenes, if these are machine code. The difference is
-the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb settles at.
+Processor seconds of the first answer in a fresh process with nothing kept, and of the next, in a fit one to
+{OTHER} rows of outcomes after one to {ROWS}, which have room in one program; the least time of answers after that;
+medians of {TIMES}, in turns. Of known numbers, few and on a CPU, the package has XLA compile such programs quickly
+(`jaxrock._quickly`): without LLVM's effort and XLA's newer emitters; also where such a program follows scenes, if these
+are machine code. The difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb settles at.
 
 {table(heads, rows)}
 """

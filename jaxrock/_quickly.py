@@ -13,14 +13,14 @@ from jaxrock._checks import is_traced
 Made = TypeVar("Made", bound=Callable)
 
 _MUCH = 100_000  # numbers, with which a program runs long enough for it to matter how well it was compiled
-# Without LLVM's effort and XLA's newer emitters, which newer jaxlibs cannot do without.
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+_NO_EFFORT = {"xla_backend_optimization_level": 0}  # of LLVM
+_OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False}  # which newer jaxlibs do not have
 
 
 @functools.cache
 def _options() -> dict[str, Any]:
-    """Those options that this jaxlib knows."""
-    for known in (_OPTIONS, dict(list(_OPTIONS.items())[:1])):
+    """Of XLA, as far as this jaxlib knows them."""
+    for known in (_NO_EFFORT | _OLDER_EMITTERS, _NO_EFFORT):
         try:
             jax.jit(lambda x: x + 1, compiler_options=known).lower(1.0).compile()
         except Exception:  # reported by an internal error type
@@ -35,9 +35,9 @@ def _has_machine_code() -> bool:
 
 
 def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: Any) -> Callable[[Made], Made]:
-    """Decorate a function of few numbers: compiled by `jit` with `settings`, on CPUs in a quarter of the time, to what
-    takes three times as long to run: milliseconds (`benchmarks/fits.py`). Within another program it is a part of that,
-    which has options of its own. If it `follows_scenes` only where these are machine code, and not left to XLA, too."""
+    """Decorate a function of few numbers, compiled by `jit` with `settings`: on CPUs in less than half of the time, to
+    what takes up to three times as long to run (`benchmarks/fits.py`). Within another program it is a part of that,
+    which has options of its own. If it `follows_scenes`, only where these are machine code, not XLA's."""
 
     def decorate(function: Made) -> Made:
         whole = jit(function, **settings)
@@ -48,8 +48,8 @@ def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: A
 
         @functools.wraps(function)
         def run(*args: Any, **named: Any) -> Any:
-            by_itself = _are_few((args, named)) and not is_traced(jax.lax.neg(0.0))  # which a program around it traces
-            by_itself = by_itself and (not follows_scenes or _has_machine_code())
+            few = (not follows_scenes or _has_machine_code()) and _are_few((args, named))
+            by_itself = few and not is_traced(jax.lax.neg(0.0))  # as it is while a program around it is traced
             return (at_once() if by_itself else whole)(*args, **named)
 
         return cast(Made, run)

@@ -249,6 +249,14 @@ def test_fits_of_many_sizes_are_one_program(name, caplog):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", FITS)
+def test_fits_stay_where_their_data_were_put(name):
+    *_, device = jax.devices()
+    data = jax.device_put((*MEASURES.values(), FELL), device)
+    found = jax.tree.leaves(FITS[name](*data, np.arange(N) // 5))
+    assert device != jax.devices()[0] and {*found[0].devices()} == {device}
+
+
 @pytest.mark.parametrize("clusters", [None, np.arange(N) // 5])
 def test_against_an_established_package(clusters):
     statsmodels = pytest.importorskip("statsmodels.api")

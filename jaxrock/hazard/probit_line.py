@@ -7,14 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
 
-from jaxrock._checks import is_traced, placed
+from jaxrock._checks import is_at_hand, placed
 from jaxrock.transforms.elementwise import room_for
 
 
 def with_room(lists, toppled, survived, labels=None):
     """Known lists of numbers by row, how many toppled and survived, and labels: followed by rows of which nothing ever
-    came, as many as many fits share, so that a few programs serve all. What is traced is as it was."""
-    if is_traced((lists, toppled, survived)):
+    came, as many as many fits share, so that a few programs serve all. What is traced, or was put on a device, is as it
+    was."""
+    if not is_at_hand((lists, toppled, survived)):
         return lists, toppled, survived, labels
     more = (0, room_for(np.size(toppled)) - np.size(toppled))
     lists = [np.pad(np.asarray(x), more, "edge") for x in lists]

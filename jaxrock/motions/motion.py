@@ -350,7 +350,7 @@ class Summed(_Together):
     @property
     def vertical_bounds(self) -> Inexact[Array, " pieces"] | None:
         spread = self._finer.spread(*(motion.vertical_bounds for motion in self._both), quiet=0.0)
-        found = [values for values in spread if values is not None]
+        found = [bounds for bounds in spread if bounds is not None]
         return functools.reduce(jnp.add, found) if found else None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
