@@ -103,7 +103,8 @@ Processor seconds of the first answer in a fresh process with nothing kept, and 
 {OTHER} rows of outcomes after one to {ROWS}, which have room in one program; the least time of answers after that;
 medians of {TIMES}, in turns. Of known numbers, few and on a CPU, the package has XLA compile such programs quickly
 (`jaxrock._quickly`): without LLVM's effort and XLA's newer emitters; also where such a program follows scenes, if these
-are machine code. The difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb settles at.
+are machine code. The difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is
+what a climb settles at.
 
 {table(heads, rows)}
 """
