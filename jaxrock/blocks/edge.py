@@ -1,8 +1,9 @@
 """Rounded edges: what a block rolls on as it opens, in place of a corner about which it turns."""
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
@@ -10,7 +11,8 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 from jaxrock._checks import Values, checked, not_negative, one_program, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
-from jaxrock.numerics.elementary import sine_cosine, sine_lag
+from jaxrock.numerics.elementary import sine_cosine, sine_cosine_of_any, sine_lag
+from jaxrock.numerics.lookup import count_up_to, pick
 
 Real = Inexact[Array, "..."]
 
@@ -53,34 +55,24 @@ class Edge(eqx.Module):
     @one_program
     def at(self, opening: ArrayLike) -> Real:
         """Radius over R where a block touches the ground that has opened by an angle."""
-        if self.angle is None:
-            return jnp.asarray(self.radius)
-        return self._first + jnp.sum(self._bends * self._beyond(opening), -1)
+        return self._rounded(opening).radius
 
     @one_program
     def rise(self, opening: ArrayLike) -> Real:
         """By how much the centre of mass is higher than over a sharp corner, over R: the integral of
         sin(x - y) radius(y)."""
-        half = sine_cosine(jnp.asarray(opening) / 2)[0]
-        found = self._first * 2 * half**2
-        if self.angle is None:
-            return found
-        beyond = self._beyond(opening)
-        return found + jnp.sum(self._bends * beyond**3 * sine_lag(beyond), -1)  # x - sin(x)
+        return self._rounded(opening).rise
 
     @one_program
     def run(self, opening: ArrayLike) -> Real:
         """By how much the point of contact is farther out than a sharp corner, over R: the integral of
         cos(x - y) radius(y)."""
-        found = self._first * sine_cosine(jnp.asarray(opening))[0]
-        if self.angle is None:
-            return found
-        return found + jnp.sum(self._bends * 2 * sine_cosine(self._beyond(opening) / 2)[0] ** 2, -1)
+        return self._rounded(opening).run
 
+    @one_program
     def length(self, opening: ArrayLike) -> Real:
         """How far it has rolled along the ground, over R: the integral of the radius."""
-        found = self._first * jnp.asarray(opening)
-        return found if self.angle is None else found + jnp.sum(self._bends * self._beyond(opening) ** 2, -1) / 2
+        return self._rounded(opening).length
 
     def place(self, opening: ArrayLike) -> tuple[Real, Real]:
         """Where the edge touches the ground when the block has opened by an angle, from the corner outward and upward
@@ -89,29 +81,87 @@ class Edge(eqx.Module):
         run, rise = self.run(opening), self.rise(opening)
         return cosine * run + sine * rise, sine * run - cosine * rise
 
+    def _rounded(self, opening: ArrayLike) -> "Rounded":
+        told, opening = self.pieces().at, jnp.asarray(opening)
+        for _ in opening.shape:
+            told = jax.vmap(told)
+        return told(opening)
+
+    def pieces(self) -> "EdgePieces":
+        """The edge in pieces on which its radius is linear in the opening angle."""
+        none = jnp.zeros_like(self._first)
+        if self.angle is None:
+            return EdgePieces(None, Rounded(none, none, none, self.radius), none)
+        start, radius = (
+            jnp.concatenate([first[None], x]) for first, x in ((none, self.angle), (self._first, self.radius))
+        )
+        slope = jnp.diff(radius[1:]) / jnp.diff(self.angle)
+        slope = jnp.concatenate([none[None], slope, none[None]])
+        # What a piece adds stays the same vector on a block that goes on turning.
+        added = _added(jnp.diff(start), radius[:-1], slope[:-1])
+        sine, cosine = sine_cosine_of_any(start)
+        out = jnp.cumsum(cosine[1:] * added.run + sine[1:] * added.rise)
+        up = jnp.cumsum(cosine[1:] * added.rise - sine[1:] * added.run)
+        out, up, length = (jnp.concatenate([none[None], x]) for x in (out, up, jnp.cumsum(added.length)))
+        before = Rounded(cosine * up + sine * out, cosine * out - sine * up, length, radius)
+        return EdgePieces(start, before, slope)
+
     @property
     def _first(self) -> Real:
         return self.radius if self.angle is None else self.radius[0]
-
-    @property
-    def _bends(self) -> Real:
-        """By how much the slope of the radius changes at every angle."""
-        none = jnp.zeros_like(self.radius[:1])
-        slopes = jnp.concatenate([none, jnp.diff(self.radius) / jnp.diff(self._angles), none])
-        return jnp.diff(slopes)
-
-    def _beyond(self, opening: ArrayLike) -> Real:
-        return jnp.maximum(jnp.asarray(opening)[..., None] - self._angles, 0.0)
-
-    @property
-    def _angles(self) -> Real:
-        return cast(Array, self.angle)  # asked where there are some
 
     def with_angles(self, angle: Real) -> "Edge":
         """The same edge by a longer list of angles, whose first are its own."""
         if self.angle is None:
             return Edge(jnp.broadcast_to(self.radius, angle.shape), angle)
         return Edge(jnp.concatenate([self.radius, jnp.full(angle.size - self.angle.size, self.radius[-1])]), angle)
+
+
+class Rounded(NamedTuple):
+    """What an edge has added when the block has opened by an angle x, over R: by how much the centre of mass is higher
+    (the integral of sin(x - y) radius(y)) and the point of contact farther out (of cos(x - y) radius(y)) than of a
+    sharp corner, how far the block has rolled, and the radius there."""
+
+    rise: Real
+    run: Real
+    length: Real
+    radius: Real
+
+
+class EdgePieces(eqx.Module):
+    """An edge in pieces on which its radius is linear in the opening angle: where they start (None: a circle, which is
+    one), what the edge has added before, and the slope of its radius."""
+
+    start: Real | None
+    before: Rounded
+    slope: Real
+
+    def at(self, opening: Real) -> Rounded:
+        """What the edge has added at one opening angle."""
+        if self.start is None:
+            return _added(opening, self.before.radius, self.slope)
+        piece = jnp.maximum(count_up_to(self.start, opening) - 1, 0)
+        start, slope, *numbers = (pick(x, piece) for x in (self.start, self.slope, *self.before))
+        before, beyond = Rounded(*numbers), opening - start
+        sine, cosine = sine_cosine(beyond)
+        added = _added(beyond, before.radius, slope)
+        return Rounded(
+            before.rise * cosine + before.run * sine + added.rise,
+            before.run * cosine - before.rise * sine + added.run,
+            before.length + added.length,
+            added.radius,
+        )
+
+
+def _added(angle: Real, radius: Real, slope: Real) -> Rounded:
+    """What a piece adds that starts with a radius and a slope of it, when it has turned by an angle."""
+    lifted = 2 * sine_cosine(angle / 2)[0] ** 2  # 1 - cos(x)
+    return Rounded(
+        radius * lifted + slope * angle**3 * sine_lag(angle),  # x - sin(x)
+        radius * sine_cosine(angle)[0] + slope * lifted,
+        angle * (radius + slope * angle / 2),
+        radius + slope * angle,
+    )
 
 
 def _grows(angle):

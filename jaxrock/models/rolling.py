@@ -11,7 +11,7 @@ from jaxrock._checks import one_program
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.asymmetric import AsymmetricBlock
-from jaxrock.blocks.edge import Edge
+from jaxrock.blocks.edge import Edge, EdgePieces
 from jaxrock.blocks.restitution import ratio_of_inertia
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Rolled, first_zero, last_rise
@@ -88,7 +88,7 @@ class RollingMoments(AbstractMoments):
 
     slenderness: Angle
     ratio: Scalar
-    edge: Edge
+    edge: EdgePieces
     factor: Scalar  # of all accelerations (see `times`)
     saddle: Scalar
     firm: Scalar | None = None  # up to where it may right itself again (`last_rise`); None: nowhere, on a circle
@@ -96,7 +96,7 @@ class RollingMoments(AbstractMoments):
     @classmethod
     def of(cls, alpha: Scalar, ratio: Scalar, edge: Edge) -> "RollingMoments":
         """Of a block, or a side."""
-        made = cls(Angle.of(alpha), ratio, edge, jnp.ones_like(alpha), alpha)
+        made = cls(Angle.of(alpha), ratio, edge.pieces(), jnp.ones_like(alpha), alpha)
         firm = None if edge.angle is None else _firm(made)
         return replace(made, saddle=_balance(made), firm=firm)
 
@@ -107,10 +107,11 @@ class RollingMoments(AbstractMoments):
     def rolled(self, angle: Angle) -> Rolled:
         """Where the centre of mass is over the point of contact."""
         sine, cosine = self.slenderness.sine, self.slenderness.cosine
+        added = self.edge.at(angle.value)
         return Rolled(
-            cosine * angle.cosine + sine * angle.sine + self.edge.rise(angle.value),
-            sine * angle.cosine - cosine * angle.sine + self.edge.run(angle.value),
-            self.edge.at(angle.value),
+            cosine * angle.cosine + sine * angle.sine + added.rise,
+            sine * angle.cosine - cosine * angle.sine + added.run,
+            added.radius,
         )
 
     def _inertia(self, at: Rolled) -> Scalar:
@@ -143,7 +144,7 @@ class RollingMoments(AbstractMoments):
         """By how much the centre of mass rises: the moment of inertia there does not matter."""
         half, (_, sine, cosine) = Angle.of(opening / 2), self.slenderness
         over_a_corner = 2 * half.sine * (sine * half.cosine - cosine * half.sine)  # cos(alpha - x) - cos(alpha)
-        return self.factor * (over_a_corner + self.edge.rise(opening))
+        return self.factor * (over_a_corner + self.edge.at(opening).rise)
 
     @property
     def restoring_at_rest(self) -> Scalar:

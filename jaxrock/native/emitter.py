@@ -18,7 +18,7 @@ from llvmlite import ir
 from jaxrock._programs import programs_of
 from jaxrock.native.arrays import OF_FEW, is_one_place
 from jaxrock.native.in_numpy import MOVES
-from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
+from jaxrock.native.lists import Memory, boxed, for_each, of_memory, one_of_two, unboxed
 from jaxrock.native.operations import OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
@@ -183,6 +183,8 @@ class Emitter:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
         if isinstance(inputs[0] if inputs else None, Memory):
             return [unboxed(of_memory(self, equation, *inputs))]
+        if name == "select_n" and [type(x) for x in inputs[1:]] == [Memory, Memory]:
+            return [one_of_two(self, *inputs)]
         if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > _ARRAY:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
@@ -301,8 +303,9 @@ def flat(values: list) -> list:
 
 
 def _loose(values: list) -> list:
-    """The single vectors, but for those in long lists."""
-    return flat([value for value in values if not isinstance(value, Memory)])
+    """The single vectors, and where lanes' long lists begin."""
+    starts = [start for value in values if isinstance(value, Memory) for start in value.starts or ()]
+    return starts + flat([value for value in values if not isinstance(value, Memory)])
 
 
 def like(values: list, vectors: list) -> list:

@@ -75,6 +75,21 @@ def of_memory(e, equation, memory: Memory, *more):
     raise Unsupported(f"{name} of a long list")
 
 
+def one_of_two(e, which, other: Memory, one: Memory) -> Memory:
+    """The list that a lane's flag chooses: where it begins, told from where the first list does."""
+    like = [(x.size, x.rows, x.stride, x.pointer.type) for x in (other, one)]
+    if like[0] != like[1]:
+        raise Unsupported("a choice of lists of other shapes")
+    kind, none = one.pointer.type.pointee, [_I64(0)] * e.lanes
+    size = {ir.DoubleType(): 8, ir.FloatType(): 4}.get(kind) or kind.width // 8
+    places = [e.b.ptrtoint(x.pointer, _I64) for x in (one, other)]
+    away = e.b.sdiv(e.b.sub(*places), _I64(size))
+    starts = []
+    for i, (here, there) in enumerate(zip(other.starts or none, one.starts or none)):
+        starts.append(e.b.select(e.lane(which, i), e.b.add(there, away), here))
+    return other._replace(starts=starts)
+
+
 def _looked_up(e, memory: Memory, index) -> np.ndarray:
     """One number of each list."""
     if memory.rows is None:

@@ -11,8 +11,8 @@ from jaxrock.numerics.typed import common_type, typed
 
 def where(condition: Any, one: Any, other: Any) -> jax.Array:
     """`one` where a condition holds, else `other`, as `jnp.where` has it."""
-    shape = np.shape(condition)
-    if shape != np.shape(one) or shape != np.shape(other) or (_yields(one) and _yields(other)):
+    shape = np.shape(one)  # of which one flag may choose the whole
+    if shape != np.shape(other) or np.shape(condition) not in (shape, ()) or (_yields(one) and _yields(other)):
         return jnp.where(condition, one, other)
     dtype = common_type(one, other)
     return jax.lax.select_n(jnp.asarray(condition), typed(other, dtype), typed(one, dtype))
