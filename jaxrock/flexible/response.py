@@ -1,6 +1,5 @@
 """What a flexible block does under a motion: `simulate_flexible` gives its history, `outcome_flexible` the outcome."""
 
-import functools
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -12,6 +11,7 @@ from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, at_times, followed, times_of
@@ -228,7 +228,7 @@ def _budget(block: FlexibleBlock, motion: AbstractMotion, max_steps: int | None)
     return (max_steps or usual) + 4 * motion.knots.size
 
 
-@eqx.filter_jit
+@quickly(static_argnames="budget")
 def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
     def run(given):
         scene = scene_of(*given)
@@ -238,7 +238,7 @@ def _outcome(block, motion, stop, budget: int) -> FlexibleOutcome:
     return differentiable(run)((block, motion, stop))
 
 
-@eqx.filter_jit
+@quickly(static_argnames="budget")
 def _simulate(block, motion, stop, budget: int) -> tuple[FlexibleOutcome, Trajectory]:
     def loop(unfinished, step, carry, budget):
         return jax.lax.while_loop(unfinished, step, carry)
@@ -260,7 +260,7 @@ def _at_times(path: Trajectory, time, what: str):
     return _after_nodes(path.stepper, *path.before(time, path.nodes), path.duration, time.shape, what)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "what"))
+@quickly(static_argnames=("shape", "what"))
 def _after_nodes(scene, node, elapsed, duration, shape, what: str):
     reach = jnp.cos(scene.numbers.alpha) * scene.block.length
     scales = jnp.array([1.0, 0, 0, 1.0]) + jnp.array([0.0, 1, 1, 0]) * reach

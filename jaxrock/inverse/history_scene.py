@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jaxrock._checks import put_down
 from jaxrock._parameters import Parameter, check_single
+from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.scene import peak_bound
@@ -151,7 +152,7 @@ def _given(block: Block | AsymmetricBlock, names: Sequence[str]) -> Block | Asym
     return AsymmetricBlock(block.alpha1, block.alpha2, block.p1, block.inertia_ratio, radii, law)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def history(point, time, until, scene: FittedScene):
     """Of one point: rotations, their derivatives by the coordinates, and whether there is a history."""
 

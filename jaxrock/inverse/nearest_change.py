@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxrock._parameters import one_of_many, shared
+from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -63,7 +64,7 @@ class Site(eqx.Module):
         return margins, known
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _margins(
     site: Site, changes: Float[ArrayLike, "lanes n"]
 ) -> tuple[Float[Array, "lanes blocks"], Bool[Array, "lanes blocks"]]:
@@ -72,7 +73,7 @@ def _margins(
     return jax.vmap(lambda change: of_all(site.blocks, change))(changes)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit, follows_scenes=True)
 def _margins_and_slopes(site: Site, change: Float[ArrayLike, " n"]):
     """Margins of all blocks, (blocks,), and their derivatives by the change, (blocks, n)."""
 

@@ -18,7 +18,7 @@ from llvmlite import ir
 from jaxrock._programs import programs_of
 from jaxrock.native.arrays import OF_FEW, is_one_place
 from jaxrock.native.in_numpy import MOVES
-from jaxrock.native.lists import Memory, boxed, for_each, of_memory, one_of_two, unboxed
+from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
 from jaxrock.native.operations import OPERATIONS, SUMS, Unsupported
 from jaxrock.numerics.compound import is_compound, written
 
@@ -181,11 +181,9 @@ class Emitter:
             return self._branch(parameters["branches"], inputs, active)
         if name in WITH_PROGRAMS:
             return self.run(parameters.get("jaxpr") or parameters["call_jaxpr"], inputs, active)
-        if isinstance(inputs[0] if inputs else None, Memory):
+        if any(isinstance(x, Memory) for x in inputs):
             return [unboxed(of_memory(self, equation, *inputs))]
-        if name == "select_n" and [type(x) for x in inputs[1:]] == [Memory, Memory]:
-            return [one_of_two(self, *inputs)]
-        if any(isinstance(x, Memory) for x in inputs) or math.prod(equation.outvars[0].aval.shape) > _ARRAY:
+        if math.prod(equation.outvars[0].aval.shape) > _ARRAY:
             raise Unsupported(f"{name} of a long list")
         if name in MOVES:
             moved = MOVES[name](parameters, *map(boxed, inputs))

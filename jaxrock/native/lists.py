@@ -56,9 +56,13 @@ def for_each(function: Callable, *inputs):
     return results
 
 
-def of_memory(e, equation, memory: Memory, *more):
-    """What an operation makes of a long list."""
+def of_memory(e, equation, memory: Any, *more):
+    """What an operation makes of a long list, or of two of which a flag before them chooses one."""
     name, parameters = equation.primitive.name, equation.params
+    if name == "select_n" and [type(x) for x in more] == [Memory, Memory]:
+        return _one_of_two(e, memory, *more)
+    if not isinstance(memory, Memory):
+        raise Unsupported(f"{name} of a long list")
     sizes = parameters.get("slice_sizes", ())
     if name == "slice" and not parameters["strides"]:
         (*first, start), (*last, stop) = parameters["start_indices"], parameters["limit_indices"]
@@ -75,8 +79,8 @@ def of_memory(e, equation, memory: Memory, *more):
     raise Unsupported(f"{name} of a long list")
 
 
-def one_of_two(e, which, other: Memory, one: Memory) -> Memory:
-    """The list that a lane's flag chooses: where it begins, told from where the first list does."""
+def _one_of_two(e, which, other: Memory, one: Memory) -> Memory:
+    """The list that each lane's flag chooses: where it begins, told from where the first list does."""
     like = [(x.size, x.rows, x.stride, x.pointer.type) for x in (other, one)]
     if like[0] != like[1]:
         raise Unsupported("a choice of lists of other shapes")

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import is_traced, scalar, shown
 from jaxrock._parameters import check_single
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Housner, ratio_of_inertia
@@ -107,7 +108,7 @@ def _ratio_of(scene: Scene, block: Block | AsymmetricBlock, given: ArrayLike | N
     return given
 
 
-@jax.jit
+@quickly()
 def _contact(response: Response, block: Block | AsymmetricBlock, ratio: Scalar) -> Contact:
     if isinstance(block, Block):
         ratios, alphas, radii = (ratio, ratio), (block.alpha, block.alpha), (jnp.ones_like(block.p),) * 2

@@ -1,6 +1,5 @@
 """The history of a block under a motion."""
 
-import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, overload
@@ -13,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, Int
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
 from jaxrock._precision import say_if_single
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -229,14 +229,15 @@ def simulate(
     given = block, motion, model, start_of(initial, throw), duration
     block, motion, model, start, duration = given if throw else still_if_none(given)
     given = standing(block, model, engine, throw), padded(motion), model, start, duration
-    summary, path = _simulate(*(given if throw else still_if_none(given)), engine)
+    block, motion, model, start, duration = given if throw else still_if_none(given)
+    summary, path = _simulate(block, motion, model, start, duration, engine)
     time = path.equally_spaced(samples)
     rotation, velocity = _evaluate(path, time)
     response = Response(time, rotation, velocity, summary, path)
     return response if throw else marked_result(response, given)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _simulate(block, motion, model, initial, duration, engine) -> tuple[Summary, Trajectory]:
     p = block.p if isinstance(block, Block) else block.p1
     stop = motion.end + 10 / p if duration is None else jnp.asarray(duration)
@@ -255,7 +256,7 @@ def _evaluate(path: Trajectory, time):
     return _after_nodes(path.stepper, *path.before(time, path.nodes.start), path.duration, time.shape)
 
 
-@functools.partial(jax.jit, static_argnames="shape")
+@quickly(follows_scenes=True, static_argnames="shape")
 def _after_nodes(stepper: AbstractStepper, node, elapsed, duration, shape):
     return at_times(evaluation(stepper), node, elapsed, duration, shape)
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import if_traced, is_traced, of_each, one_program, placed, ratio, scalar, watched
 from jaxrock._parameters import broadcast, leaves_of, one_of_many
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -197,7 +198,7 @@ class _Scenes(eqx.Module):
         return cls(both, threshold, amplitude, least, single=not shape)
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit)
 def _facts(both: PyTree, model: AbstractEquation, size: int) -> tuple[Array, Array, Array, Array]:
     """Threshold, peak and amplitude of so many scenes, and the least factor of their motions that moves them."""
 
@@ -313,7 +314,7 @@ def _lowest(scenes: _Scenes, grid, kind: AbstractVaried, names: tuple[str, ...],
     return surface(_lowest_of_one, (jnp.arange(grid.shape[0]),), scene, "critical", progress)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def _lowest_of_one(index, scene) -> dict:
     """Ends are found without derivatives, and get those of the implicit function."""
     wanted, kind, scenes, grid = scene

@@ -9,6 +9,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, as_real, not_nan, scalar
 from jaxrock._described import described
 from jaxrock._parameters import check_single, in_real_numbers
+from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -136,10 +137,11 @@ def sensitivity(
 
     **Raises:** ValueError for arguments outside their ranges.
     """
-    return _sensitivity(*in_real_numbers(block, motion), current_model(model, block, motion), engine)
+    block, motion = in_real_numbers(block, motion)
+    return _sensitivity(block, motion, current_model(model, block, motion), engine)
 
 
-@jax.jit  # one program: the operations are many
+@quickly(follows_scenes=True)  # one program: the operations are many
 def _sensitivity(block, motion, model, engine) -> Sensitivity:
     parameters = named(block, motion)
     names, values = tuple(parameters), jnp.stack([jnp.asarray(v) for v in parameters.values()])

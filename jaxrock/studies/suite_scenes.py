@@ -15,6 +15,7 @@ from jaxtyping import ArrayLike
 from jaxrock._checks import Values, placed, shown, size
 from jaxrock._parameters import leaves_of, one_of_many, shared
 from jaxrock._progress import Progress
+from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import tells_sides
 from jaxrock.blocks.rigid import Block
@@ -116,7 +117,7 @@ def scenes(
     return Scenes(*parts)
 
 
-@jax.jit
+@quickly(follows_scenes=True)
 def of_motion(motion, blocks, factors, model, engine) -> Scenes:
     """All scenes of one motion, side by side: stacked blocks, each with its factor."""
 

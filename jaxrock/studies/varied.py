@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxrock._checks import is_traced
 from jaxrock._parameters import is_ours, one_of_many
+from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -128,7 +129,7 @@ class Duration(AbstractVaried):
         return name not in ("duration", "period", "dt")
 
 
-@eqx.filter_jit
+@quickly(eqx.filter_jit)
 def _ends(both, size: int):
     """Of the motions of so many scenes."""
     return jax.vmap(lambda index: one_of_many(both, index)[1].end)(jnp.arange(size))
@@ -160,7 +161,7 @@ def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> N
         raise ValueError("Argument `model` must not depend on the block's p: a longer motion is taken as a larger p.")
 
 
-@jax.jit
+@quickly()
 def _accelerations(model: AbstractEquation, block: Block | AsymmetricBlock):
     """Some accelerations of each side, over its p squared."""
     found = []
