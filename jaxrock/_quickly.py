@@ -12,14 +12,14 @@ from jaxrock._checks import is_traced
 
 Made = TypeVar("Made", bound=Callable)
 
-_MUCH = 100_000  # numbers, with which a program runs long enough for it to matter how well it was compiled
+MUCH = 100_000  # numbers, with which a program runs long enough for it to matter how well it was compiled
 _NO_EFFORT = {"xla_backend_optimization_level": 0}  # of LLVM
 _OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False}  # which newer jaxlibs do not have
 
 
 @functools.cache
-def _options() -> dict[str, Any]:
-    """Of XLA, as far as this jaxlib knows them."""
+def options() -> dict[str, Any]:
+    """XLA's options by which it compiles in the least time on CPUs, as far as this jaxlib knows them."""
     for known in (_NO_EFFORT | _OLDER_EMITTERS, _NO_EFFORT):
         try:
             jax.jit(lambda x: x + 1, compiler_options=known).lower(1.0).compile()
@@ -44,7 +44,7 @@ def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: A
 
         @functools.cache
         def at_once() -> Callable:
-            return jit(function, compiler_options=_options(), **settings)
+            return jit(function, compiler_options=options(), **settings)
 
         @functools.wraps(function)
         def run(*args: Any, **named: Any) -> Any:
@@ -60,7 +60,7 @@ def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: A
 def _are_few(tree: Any) -> bool:
     """Whether all arrays in it are known, small, and on a CPU."""
     arrays = [x for x in jax.tree.leaves(tree) if isinstance(x, (jax.Array, np.ndarray))]
-    if is_traced(tree) or sum(x.size for x in arrays) > _MUCH:
+    if is_traced(tree) or sum(x.size for x in arrays) > MUCH:
         return False
     platforms = {device.platform for x in arrays if isinstance(x, jax.Array) for device in x.devices()}
     return platforms == {"cpu"}

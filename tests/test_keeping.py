@@ -18,7 +18,7 @@ import pytest
 import jaxrock as rk
 from jaxrock import _quickly
 from jaxrock._arguments import path_of
-from jaxrock._quickly import _MUCH, _options, quickly
+from jaxrock._quickly import MUCH, options, quickly
 from jaxrock.command_line.main import main
 from jaxrock.engines import scene
 from jaxrock.keeping import changes, facts, folder
@@ -415,7 +415,7 @@ def test_programs_of_a_moment():
     np.testing.assert_array_equal(jax.vmap(lambda x: x * total(known, power=2))(known), 5 * known)
     np.testing.assert_array_equal(jax.grad(lambda x: total(x, power=2))(known), 2 * known)
     np.testing.assert_array_equal(jax.jit(jax.vmap(lambda x: total(x * known, power=2)))(known), 5 * known**2)
-    assert float(total(jnp.ones(_MUCH + 1), power=3)) == _MUCH + 1
+    assert float(total(jnp.ones(MUCH + 1), power=3)) == MUCH + 1
     assert total(jax.device_put(known, jax.devices()[-1]), power=2).devices() == {jax.devices()[-1]}
     with jax.disable_jit():
         assert float(total(known, power=2)) == 5.0
@@ -423,8 +423,8 @@ def test_programs_of_a_moment():
 
 def test_options_of_programs_of_a_moment():
     """What this jaxlib knows of them: LLVM's effort always, XLA's emitters as long as there are others."""
-    assert {"xla_backend_optimization_level": 0} == {k: v for k, v in _options().items() if "emitters" not in k}
-    assert ("xla_cpu_use_fusion_emitters" in _options()) or jaxlib.version.__version_info__[:2] > (0, 10)
+    assert {"xla_backend_optimization_level": 0} == {k: v for k, v in options().items() if "emitters" not in k}
+    assert ("xla_cpu_use_fusion_emitters" in options()) or jaxlib.version.__version_info__[:2] > (0, 10)
 
 
 def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):

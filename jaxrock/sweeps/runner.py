@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxrock._quickly import MUCH, options as quick_options
 from jaxrock.sweeps.devices import compiler_options, local_devices
 from jaxrock.sweeps.plan import deal, dealt_to, layout
 from jaxrock.transforms.fingerprint import Checked, Program, with_checks
@@ -29,7 +30,7 @@ class Runner:
         self._scene = structure.unflatten(leaves)
         kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
         self._call, self._messages, self.tree, self.shapes = _compiled(
-            function, self._mesh, self._layout, kinds, structure, like
+            function, self._mesh, self._layout, kinds, structure, like, few=points <= MUCH
         )
 
     def __call__(
@@ -114,19 +115,37 @@ class _Compiled(NamedTuple):
 # the scene, a pytree, by whose structure `jax.jit` tells programs apart.
 @functools.lru_cache(maxsize=64)
 def _compiled(
-    function: Callable, mesh: Mesh, shape: tuple[int, int], kinds: tuple, structure, scene: tuple
+    function: Callable, mesh: Mesh, shape: tuple[int, int], kinds: tuple, structure, scene: tuple, few: bool
 ) -> _Compiled:
     """`function(*point, scene)` at a batch of points of these kinds of numbers, and what is known of it beforehand."""
-    call = _call_of(function, mesh)
+    at_first = few and mesh.size == 1
+    call = _call_of(function, mesh, at_first)
     like = [jax.ShapeDtypeStruct((math.prod(shape),), kind) for kind in kinds]
     told = jax.eval_shape(call, like, structure.unflatten(scene))
     results, tree = jax.tree.flatten(told.results)
-    return _Compiled(call, told.messages, tree, [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in results])
+    shapes = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in results]
+    return _Compiled(_AtFirst(call, mesh) if at_first else call, told.messages, tree, shapes)
+
+
+class _AtFirst:
+    """A function of a batch of few points on one device, compiled for its first batch as what is in it wants it."""
+
+    def __init__(self, function: Any, mesh: Mesh):
+        self._function, self._platform, self._compiled = function, mesh.devices.flat[0].platform, None
+
+    def __call__(self, *batch):
+        if self._compiled is None:
+            lowered = self._function.lower(*batch)
+            # Where no loop is left, scenes are machine code of their own, and what is around them takes a moment.
+            quick = self._platform == "cpu" and "stablehlo.while" not in lowered.as_text()
+            self._compiled = lowered.compile(quick_options() if quick else compiler_options(self._platform))
+        return self._compiled(*batch)
 
 
 @functools.lru_cache(maxsize=32)
-def _call_of(function: Callable, mesh: Mesh) -> Callable:
-    """`function(*point, scene)` over points that are dealt to devices, `_Checked`."""
+def _call_of(function: Callable, mesh: Mesh, at_first: bool) -> Callable:
+    """`function(*point, scene)` over points that are dealt to devices, `_Checked`; XLA's options are told now, or where
+    it is compiled `at_first`."""
 
     def on_one(points, scene):
         def one(*point):
@@ -136,7 +155,7 @@ def _call_of(function: Callable, mesh: Mesh) -> Callable:
 
         return jax.vmap(one)(*points)
 
-    options = compiler_options(mesh.devices.flat[0].platform)
+    options = None if at_first else compiler_options(mesh.devices.flat[0].platform)
     if mesh.size == 1:
         return jax.jit(on_one, compiler_options=options)
     spread = jax.shard_map(on_one, mesh=mesh, in_specs=(_DEALT, _EVERYWHERE), out_specs=_DEALT, check_vma=False)
