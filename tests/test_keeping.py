@@ -22,6 +22,7 @@ from jaxrock._quickly import MUCH, options, quickly
 from jaxrock.command_line.main import main
 from jaxrock.engines import scene
 from jaxrock.keeping import changes, facts, folder
+from jaxrock.sweeps import runner
 from jaxrock.sweeps.store import local
 
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
@@ -443,3 +444,30 @@ def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
         monkeypatch.setattr(_quickly, "_has_machine_code", lambda has=has: has)
         assert float(total(jnp.arange(3.0))) == 3.0
     assert ways == ["quickly", "well", "quickly"]
+
+
+def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
+    """What has no loops, and is not done for many points, in the least time; all else as well as XLA can."""
+    ways = []
+    compiled = jax.stages.Lowered.compile
+
+    def compile_(lowered, options=None):
+        ways.append("quickly" if options and "xla_backend_optimization_level" in options else "well")
+        return compiled(lowered, options)
+
+    def straight(x):
+        return 2 * x
+
+    def halved(x):
+        return jax.lax.while_loop(lambda x: x > 1, lambda x: x / 2, x)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", compile_)
+    x = np.arange(5.0)
+    with jax.default_device(jax.devices()[-1]):
+        for function, expected in ((straight, 2 * x), (halved, [0, 1, 1, 0.75, 1])):
+            for _ in range(2):
+                np.testing.assert_array_equal(rk.sweep(function, x=x, progress=False).values, expected)
+        assert ways == ["quickly", "well"]
+        monkeypatch.setattr(runner, "MUCH", 4)
+        np.testing.assert_array_equal(rk.sweep(straight, x=x, progress=False).values, 2 * x)
+    assert len(ways) == 2  # of many points, and on many devices, with the options of `jax.jit`

@@ -26,6 +26,7 @@ from jaxrock._programs import programs_of  # noqa: E402
 from jaxrock.closed_form import single_lobe  # noqa: E402
 from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
 from jaxrock.native.builder import Builder  # noqa: E402
+from jaxrock.native.lists import Memory, _one_of_two  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.numerics.apart import apart  # noqa: E402
 from jaxrock.transforms import batching, recipe  # noqa: E402
@@ -101,6 +102,28 @@ def test_lists_in_order():
     values = np.stack([np.roll(np.array([0.5, -np.inf, np.nan, 3.0, -2.0, np.inf, 3.0]), k) for k in range(7)])
     agree(lambda x: [jnp.sort(x)], values)
     agree(lambda x: [jnp.sort(x)], np.arange(24, dtype=np.int32).reshape(6, 4)[:, ::-1] % 7)
+
+
+def test_one_of_two_long_lists():
+    """Which list a lane looks into may change from turn to turn, and with it where what comes out of a loop points."""
+
+    def function(x, here, there):
+        def turn(carry):
+            k, sums = carry
+            flag = jnp.sin(5 * x + k) < 0.2
+            chosen = jax.lax.select_n(flag, there, here)
+            again = jax.lax.select_n(x > 0, chosen, there)
+            return k + 1, sums + chosen[k] * x + again[2 * k]
+
+        return [jax.lax.while_loop(lambda carry: carry[0] < 9, turn, (jnp.int32(0), x))[1]]
+
+    x, lists = np.linspace(-1, 1, 33), np.random.default_rng(1).normal(size=(2, 33, 20))
+    agree(function, x, lists[0, 0], lists[1, 0], shared=(1, 2), rtol=1e-13)
+    agree(function, x, *lists, rtol=1e-13)
+    agree(function, x, lists[0], lists[1, 0], shared=(2,), rtol=1e-13)
+    place = ir.Constant(ir.IntType(64).as_pointer(), None)
+    with pytest.raises(Unsupported, match="other shapes"):
+        _one_of_two(None, None, *(Memory(place, size, None) for size in (9, 8)))
 
 
 def test_a_number_of_a_few():
@@ -779,6 +802,14 @@ def by_diffrax(a, u, motion=rk.SinePulse(1.0, 1.0), model=rk.Housner(), **settin
     return rk.outcome(rk.Block(a, 2.0, 0.9), u * motion, model, engine=rk.Diffrax(**settings))
 
 
+def rolled(a, u):
+    """Whose radii are told at more angles than registers keep."""
+    angles = jnp.linspace(0.0, 0.5, 10)
+    edges = rk.blocks.Edge(0.3 * jnp.cos(angles), angles), rk.blocks.Edge(0.1 + 0.2 * angles[:7], angles[:7])
+    block = rk.blocks.AsymmetricBlock(a, 1.2 * a, 2.0)
+    return rk.outcome(block, rk.SinePulse(u, 0.6), rk.models.Rolling(*edges), engine=rk.Diffrax(rtol=1e-4)).margin
+
+
 SHORT_SERIES = {"engine": rk.Series(order=4)}  # of the same operations, and compiled in half the time
 SHORT = rk.Record(rk.example_record().samples[500:2500], 0.005)
 STRONGEST = rk.Record(rk.example_record().samples[320:620], 0.005)
@@ -808,6 +839,7 @@ SCENES = {
     "a plastic spring": lambda a, u: (
         rk.outcome(rk.Block(a, 2.0), rk.SinePulse(u, 1.0), rk.Spring("SM3", "plastic"), **SHORT_SERIES).margin
     ),
+    "rolling on edges of two sides": rolled,
     "an equation with a damper": damped,
     "its derivatives by diffrax": jax.grad(damped, (0, 1)),
     "another solver of diffrax": lambda a, u: by_diffrax(a, u, solver=diffrax.Dopri8()).margin,

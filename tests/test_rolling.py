@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import mpmath as mp
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
@@ -315,6 +316,68 @@ def test_what_an_edge_adds(edge, radius, opening):
         known = quad(lambda y, f=weight: f(opening - y) * radius(y), 0, opening, points=(0.05, 0.2, 0.4))[0]
         assert float(told(opening)) == pytest.approx(known, abs=1e-12)
     assert float(edge.at(opening)) == pytest.approx(radius(opening), abs=1e-14)
+
+
+def piecewise(weight, radius, angle, opening):
+    """The integral of weight(y) times radii on straight lines between angles, in 30 digits."""
+    knots = [mp.mpf(0), *(mp.mpf(a) for a in angle if 0 < a < opening), mp.mpf(opening)]
+
+    def at(y):
+        k = int(np.clip(np.searchsorted(angle, float(y), side="right") - 1, 0, len(angle) - 2))
+        share = (min(max(y, angle[0]), angle[-1]) - mp.mpf(angle[k])) / (mp.mpf(angle[k + 1]) - mp.mpf(angle[k]))
+        return radius[k] + share * (mp.mpf(radius[k + 1]) - mp.mpf(radius[k]))
+
+    return sum(mp.quad(lambda y: weight(y) * at(y), ends) for ends in zip(knots, knots[1:]))
+
+
+@pytest.mark.parametrize("count", [2, 5, 30])
+@pytest.mark.parametrize("first", [0.0, 0.05])
+def test_an_edge_of_many_angles_is_exact(count, first):
+    """From tiny openings to a lying block, at and between its angles: to rounding of each number itself."""
+    random = np.random.default_rng(count)
+    angle = first + np.concatenate([[0.0], np.cumsum(random.uniform(0.002, 2.4 / count, count - 1))])
+    radius = random.uniform(0.0, 0.8, count)
+    edge, openings = rk.blocks.Edge(radius, angle), np.array([1e-9, 1e-3, angle[1], 0.3, 0.9, 1.57])
+    with mp.workdps(30):
+        for told, weight in ((edge.rise, mp.sin), (edge.run, mp.cos), (edge.length, lambda x: mp.mpf(1))):
+            known = [float(piecewise(lambda y, f=weight, x=x: f(x - y), radius, angle, x)) for x in openings]
+            np.testing.assert_allclose(told(openings), known, rtol=2e-15)
+    np.testing.assert_allclose(edge.at(openings), np.interp(openings, angle, radius), rtol=1e-14)
+
+
+def test_slopes_by_the_numbers_of_an_edge():
+    """By radii, by angles and by the opening, forward and in reverse; the second of a rise is its equation."""
+    radius, angle = jnp.array([0.5, 0.1, 0.3, 0.2]), jnp.array([0.05, 0.2, 0.4, 0.9])
+
+    def told(radius, angle, opening):
+        edge = rk.blocks.Edge(radius, angle)
+        return jnp.stack([edge.rise(opening), edge.run(opening), edge.length(opening)])
+
+    for opening in (0.03, 0.3, 1.2):
+        at = radius, angle, jnp.asarray(opening)
+        forward, back = (f(told, (0, 1, 2))(*at) for f in (jax.jacfwd, jax.jacrev))
+        for k, (one, other) in enumerate(zip(forward, back)):
+            np.testing.assert_allclose(one, other, atol=1e-15)
+            for place in np.ndindex(at[k].shape):
+                ends = [told(*(x.at[place].add(d) if i == k else x for i, x in enumerate(at))) for d in (1e-5, -1e-5)]
+                np.testing.assert_allclose(one[(..., *place)], (ends[0] - ends[1]) / 2e-5, atol=2e-9)
+        edge = rk.blocks.Edge(radius, angle)
+        bend = jax.grad(jax.grad(edge.rise))(opening)
+        np.testing.assert_allclose(bend, edge.at(opening) - edge.rise(opening), rtol=1e-14)
+
+
+def test_slopes_of_an_outcome_by_a_radius_of_many():
+    """Of a block with different edges, as differences have it."""
+    angle, block = np.linspace(0.0, 0.5, 10), rk.blocks.AsymmetricBlock(0.25, 0.3, 2.5)
+
+    @jax.jit
+    def peak(scale):
+        edges = (rk.blocks.Edge(scale * 0.3 * np.cos(k * angle), angle) for k in (1, 2))
+        return rk.outcome(block, SINE, rk.models.Rolling(*edges), **EXACT).max_rotation
+
+    value, slope = jax.value_and_grad(peak)(1.0)
+    assert 0.005 < float(value) < 0.2
+    assert float(slope) == pytest.approx(float(peak(1.0005) - peak(0.9995)) / 1e-3, rel=1e-5)
 
 
 trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
