@@ -125,8 +125,8 @@ def _product(e, equation, x, y) -> np.ndarray:
         pairs = list(zip(first[place[0]], second[place[1]], strict=True))
         # What no step has filled yet counts nothing.
         pairs = [pair for pair in pairs if not all(map(_is_zero, pair))] or pairs
-        products = [OPERATIONS["mul"](e, equation, *p) for p in pairs] or [none]
-        results[place] = functools.reduce(lambda a, b: OPERATIONS["add"](e, equation, a, b), products)
+        found = OPERATIONS["mul"](e, equation, *pairs[0]) if pairs else none
+        results[place] = functools.reduce(lambda total, pair: e.multiply_add(*pair, total), pairs[1:], found)
     return results.reshape([*shape, *more])
 
 

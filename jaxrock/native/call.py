@@ -17,6 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxrock.native.emitter import SMALL, is_known
+from jaxrock.native.fused import fused
 from jaxrock.native.hoisting import hoisted
 from jaxrock.native.kernels import emit, emit_loop, is_long
 from jaxrock.native.machine import (
@@ -62,7 +63,7 @@ class Plan:
         alone: bool = False,
         lanes: int | None = None,
     ):
-        program = unmarked(plain(program) if has_foreign(program.jaxpr) else program)
+        program = fused(unmarked(plain(program) if has_foreign(program.jaxpr) else program))
         program = hoisted(program, _is_before_loops)
         self._inputs, self._outputs = program.jaxpr.invars, program.jaxpr.outvars
         self._shared, self._alone, self._lanes = shared, alone, lanes or lanes_of()

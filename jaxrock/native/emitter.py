@@ -17,6 +17,7 @@ from llvmlite import ir
 
 from jaxrock._programs import programs_of
 from jaxrock.native.arrays import OF_FEW, is_one_place
+from jaxrock.native.fused import kept_fused
 from jaxrock.native.in_numpy import MOVES
 from jaxrock.native.lists import Memory, boxed, for_each, of_memory, unboxed
 from jaxrock.native.operations import OPERATIONS, SUMS, Unsupported
@@ -75,6 +76,12 @@ class Emitter:
         kind = values[0].type
         short = "f64" if isinstance(kind.element, ir.DoubleType) else "f32"
         return self.b.call(self._declared(f"llvm.{name}.v{self.lanes}{short}", kind, len(values)), values)
+
+    def multiply_add(self, x, y, z):
+        """x y + z, rounded once where the processor does so."""
+        kind = x.type
+        short = "f64" if isinstance(kind.element, ir.DoubleType) else "f32"
+        return self.b.multiply_add(self._declared(f"llvm.fmuladd.v{self.lanes}{short}", kind, 3), x, y, z)
 
     def each(self, name: str, *values):
         """A function of the mathematical library, lane by lane."""
@@ -156,8 +163,9 @@ class Emitter:
         name = equation.primitive.name
         if name in WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
-        if is_compound(name):
-            return self.run(written(name, [x.aval for x in equation.invars], equation.params), inputs, active)
+        if is_compound(name) and name not in OPERATIONS:
+            program = written(name, [x.aval for x in equation.invars], equation.params)
+            return self.run(kept_fused(program), inputs, active)
         depth = max(map(_depth_of, inputs), default=0)
         results = self._in_loops(depth, equation, lambda: self._apply(equation, inputs, active))
         given = set(map(id, _loose(inputs)))  # what is passed on is not made here

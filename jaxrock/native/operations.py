@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
+from jaxrock.native.fused import fused
 from jaxrock.numerics.elementary import (
     arcsine,
     arctangent_of,
@@ -28,7 +29,6 @@ from jaxrock.numerics.elementary import (
 )
 
 _BOOL = np.dtype(bool)
-_CONTRACT = ("contract",)  # a product and a sum may be rounded once
 
 
 class Unsupported(Exception):
@@ -46,7 +46,7 @@ def _is_flag(x) -> bool:
 
 def _arithmetic(of_floats: str, of_integers: str):
     def operation(e, _, x, y):
-        return getattr(e.b, of_floats)(x, y, flags=_CONTRACT) if is_float(x) else getattr(e.b, of_integers)(x, y)
+        return getattr(e.b, of_floats if is_float(x) else of_integers)(x, y)
 
     return operation
 
@@ -223,7 +223,7 @@ def _by(function: Callable):
 
     def operation(e, equation, *values):
         like = [jax.ShapeDtypeStruct((), v.aval.dtype) for v in equation.invars]
-        (result,) = e.run(jax.make_jaxpr(function)(*like), list(values), None)
+        (result,) = e.run(fused(jax.make_jaxpr(function)(*like)), list(values), None)
         return result
 
     return operation
@@ -233,8 +233,14 @@ def _polynomial(e, equation, x, *coefficients):
     """Of JAX 0.12 and later, where interpolants are made of it: from the lowest degree on."""
     *lower, found = coefficients
     for each in reversed(lower):
-        found = OPERATIONS["add"](e, equation, OPERATIONS["mul"](e, equation, found, x), each)
+        found = e.multiply_add(found, x, each)
     return found
+
+
+def _multiply_add(e, equation, x, y, z):
+    """A product and a sum; of those of `fused`."""
+    x = e.b.fneg(x) if equation.params["minus"] else x
+    return e.multiply_add(x, y, e.b.fneg(z) if equation.params["less"] else z)
 
 
 def _logarithm_of_any(x, positive=logarithm, border=0):
@@ -257,6 +263,7 @@ OPERATIONS: dict[str, Callable] = {
     "abs": _size,
     "sign": _sign,
     "square": lambda e, q, x: _arithmetic("fmul", "mul")(e, q, x, x),
+    "compound_multiply_add": _multiply_add,
     "integer_pow": _power,
     "pow": _any_power,
     "polynomial": _polynomial,

@@ -8,6 +8,8 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jaxrock._programs import with_programs
+
 _MARKS = {"fixed", "given", "stop_gradient", "keep"}
 
 
@@ -28,19 +30,8 @@ def _without(jaxpr) -> Any:
         if equation.primitive.name in _MARKS:
             names.update(zip(equation.outvars, given))  # what tells of a mark comes after the value
         else:
-            inner = {key: new for key, old in equation.params.items() if (new := _inside(old)) is not old}
-            if inner or not all(map(is_, given, equation.invars)):
-                equation = equation.replace(invars=given, params=equation.params | inner)
+            equation = with_programs(equation, _without)
+            if not all(map(is_, given, equation.invars)):
+                equation = equation.replace(invars=given)
             equations.append(equation)
     return jaxpr.replace(eqns=equations, outvars=[read(x) for x in jaxpr.outvars])
-
-
-def _inside(value: Any) -> Any:
-    """A parameter of an operation, which may be a program, or several."""
-    if isinstance(value, ClosedJaxpr):
-        return unmarked(value)
-    if hasattr(value, "eqns"):
-        return _without(value)
-    if isinstance(value, (tuple, list)) and any(isinstance(x, ClosedJaxpr) for x in value):
-        return tuple(map(_inside, value))
-    return value

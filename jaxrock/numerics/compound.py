@@ -36,7 +36,7 @@ class Compound:
         self._function, self.change, self._results = function, change, results
         # JAX 0.12 has a `polynomial` of its own: in programs they are told by their names.
         name = f"compound_{name}"
-        self._primitive = primitive = Primitive(name)
+        self.primitive = primitive = Primitive(name)
         primitive.multiple_results = True
         primitive.def_impl(self._alone)
         primitive.def_abstract_eval(self._types)
@@ -48,7 +48,7 @@ class Compound:
 
     def __call__(self, *numbers, **settings) -> list:
         dtype = common_type(*numbers)
-        return self._primitive.bind(*(typed(x, dtype) for x in numbers), **settings)
+        return self.primitive.bind(*(typed(x, dtype) for x in numbers), **settings)
 
     def written(self, *numbers, **settings) -> list:
         """The results, in the operations that it consists of."""
@@ -62,7 +62,7 @@ class Compound:
 
     def _alone(self, *numbers, **settings) -> list:
         with jax.disable_jit(False):
-            return _compiled(self._primitive, tuple(settings.items()))(*numbers)
+            return _compiled(self.primitive, tuple(settings.items()))(*numbers)
 
     def _of_some(self, numbers, chosen: list[bool], settings: dict) -> Callable:
         """The function of some of the numbers."""
