@@ -2,7 +2,9 @@
 
 import ctypes
 import functools
+import itertools
 import logging
+import platform
 import re
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from jaxrock._programs import programs_of  # noqa: E402
 from jaxrock.closed_form import single_lobe  # noqa: E402
 from jaxrock.native import kernels, plain as plain_programs  # noqa: E402
 from jaxrock.native.builder import Builder  # noqa: E402
+from jaxrock.native.fused import fused  # noqa: E402
 from jaxrock.native.lists import Memory, _one_of_two  # noqa: E402
 from jaxrock.native.operations import Unsupported  # noqa: E402
 from jaxrock.numerics.apart import apart  # noqa: E402
@@ -102,6 +105,52 @@ def test_lists_in_order():
     values = np.stack([np.roll(np.array([0.5, -np.inf, np.nan, 3.0, -2.0, np.inf, 3.0]), k) for k in range(7)])
     agree(lambda x: [jnp.sort(x)], values)
     agree(lambda x: [jnp.sort(x)], np.arange(24, dtype=np.int32).reshape(6, 4)[:, ::-1] % 7)
+
+
+FUSED = {
+    "a sum": (lambda x, y, z: x * y + z, 1),
+    "a sum before": (lambda x, y, z: z + x * y, 1),
+    "less a number": (lambda x, y, z: x * y - z, 1),
+    "less a product": (lambda x, y, z: z - x * y, 1),
+    "two products": (lambda x, y, z: x * y + y * z, 1),
+    "a square": (lambda x, y, z: jax.lax.square(x) + z**2, 1),
+    "a few": (lambda x, y, z: jnp.sum(jnp.stack([x, y]) * z - jnp.stack([y, z])), 1),
+    "in a loop": (lambda x, y, z: jax.lax.fori_loop(0, 5, lambda _, s: s * x + z, y), 1),
+    "of use elsewhere": (lambda x, y, z: (x * y + z) / (2.0 + jnp.abs(x * y)), 1),
+    "used twice": (lambda x, y, z: (p := x * y, (p + z) * jnp.cos(p))[1], 0),
+    "a result": (lambda x, y, z: jnp.stack([p := x * y, p + z])[0], 0),
+    "whole numbers": (lambda x, y, z: (jnp.int32(9 * x) * jnp.int32(9 * y) + 4) * z, 0),
+}
+
+
+@pytest.mark.parametrize("name", FUSED)
+def test_products_that_are_added_to_something(name):
+    """What is one operation then, as machine code, as XLA has it, and with the signs of zeros."""
+    function, count = FUSED[name]
+    values = np.random.default_rng(4).normal(size=(3, 20))
+    values[:, -8:] = np.array(list(itertools.product([0.0, -0.0], repeat=3))).T
+    program = fused(jax.make_jaxpr(lambda *v: [function(*v)])(*values[:, 0]))
+
+    def number_of(jaxpr):
+        here = sum(equation.primitive.name == "compound_multiply_add" for equation in jaxpr.eqns)
+        return here + sum(map(number_of, (inner for equation in jaxpr.eqns for inner in programs_of(equation))))
+
+    assert number_of(program.jaxpr) == count
+    by_xla = jax.jit(jax.vmap(jax.extend.core.jaxpr_as_fun(program)))(*values)[0]
+    by_machine, expected = (x[0] for x in both(lambda *v: [function(*v)], *values))
+    for found in (by_xla, by_machine):
+        np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
+        if name in ("a sum", "a sum before", "less a number", "less a product"):
+            np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
+
+
+def test_they_are_rounded_once():
+    """Where the processor does so."""
+    x, y, z = np.full((3, 9), [[1 + 2.0**-30], [1 - 2.0**-30], [-1.0]])
+    (found,) = run(lambda leaves: [leaves[0] * leaves[1] + leaves[2]], [x, y, z], [False] * 3)
+    is_arm = platform.machine().lower() in ("arm64", "aarch64")
+    once = is_arm or binding.get_host_cpu_features().get("fma", False)
+    np.testing.assert_array_equal(found, -(2.0**-60) if once else 0.0)
 
 
 def test_one_of_two_long_lists():
@@ -893,6 +942,31 @@ def test_at_any_effort(name, count, monkeypatch):
     for quickly, carefully in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_array_equal(quickly, carefully)
         assert np.isfinite(quickly).mean() > 0.3
+
+
+def all_of_it(_, u):
+    """Errors have the most digits that may differ."""
+    return rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(u, 0.8))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["all of it", "derivatives", *(pytest.param(x, marks=pytest.mark.slow) for x in SCENES if x != "derivatives")],
+)
+def test_a_scene_has_one_answer(name, monkeypatch):
+    """Alone, within `jit`, among few others that share a number with it or do not, and among many that are taken a few
+    at a time: the same to the bit, with LLVM's efforts as users have them."""
+    with_effort(3, monkeypatch)
+    monkeypatch.setitem(machine.EFFORT, "in a moment", 0)
+    scene, u = SCENES.get(name, all_of_it), np.concatenate([np.linspace(0.2, 0.3, 40), np.linspace(0.3, 0.9, 10)])
+    found = [[scene(0.2, x) for x in u], [jax.jit(scene)(0.2, x) for x in u]]
+    found = [jax.tree.map(lambda *each: np.stack(each), *each) for each in found]
+    found.append(jax.vmap(scene, (None, 0))(0.2, u))
+    found.append(jax.vmap(scene)(np.full(50, 0.2), u))
+    found.append(jax.lax.map(lambda x: scene(0.2, x), np.tile(u, 2), batch_size=50))
+    for alone, *others in zip(*map(jax.tree.leaves, found), strict=True):
+        for each in others:
+            np.testing.assert_array_equal(each[:50], alone)
 
 
 def with_effort(effort: int, monkeypatch):

@@ -41,7 +41,7 @@ def _fused(jaxpr) -> Any:
     uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
     products, equations = {}, {}  # by their results: factors; by number, in order
     for number, equation in enumerate(jaxpr.eqns):
-        name, (result, *_) = equation.primitive.name, equation.outvars or (None,)
+        name, made = equation.primitive.name, equation.outvars
         equations[number] = equation = with_programs(equation, _fused)
         if name in _SUMS:
             x, y = equation.invars
@@ -53,11 +53,11 @@ def _fused(jaxpr) -> Any:
                 equations[number] = equation.replace(
                     primitive=_multiply_add.primitive, invars=[*factors, y if ours is x else x], params=signs
                 )
-        elif uses[result] == 1 and _is_fit(result.aval):
+        elif len(made) == 1 and uses[made[0]] == 1 and _is_fit(made[0].aval):
             if name == "mul":
-                products[result] = number, equation.invars
+                products[made[0]] = number, equation.invars
             elif name == "square" or (name == "integer_pow" and equation.params["y"] == 2):
-                products[result] = number, equation.invars * 2
+                products[made[0]] = number, equation.invars * 2
     return jaxpr.replace(eqns=list(equations.values()))
 
 
