@@ -949,9 +949,12 @@ def all_of_it(_, u):
     return rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(u, 0.8))
 
 
+# Of edges that are lists XLA computes what comes first, and rounds it as it finds best.
+ONE_ANSWER = [x for x in SCENES if x not in ("derivatives", "rolling on edges of two sides")]
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["all of it", "derivatives", *(pytest.param(x, marks=pytest.mark.slow) for x in SCENES if x != "derivatives")],
+    "name", ["all of it", "derivatives", *(pytest.param(x, marks=pytest.mark.slow) for x in ONE_ANSWER)]
 )
 def test_a_scene_has_one_answer(name, monkeypatch):
     """Alone, within `jit`, among few others that share a number with it or do not, and among many that are taken a few
