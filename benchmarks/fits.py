@@ -1,4 +1,4 @@
-"""First fits, rates, peaks and estimates, and fits of another size: `python benchmarks/fits.py` writes `fits.md`.
+"""First fits, rates, peaks, estimates, histories and columns: `python benchmarks/fits.py` writes `fits.md`.
 
 Fresh processes, with nothing kept and XLA's own settings, in turns: compiled quickly (`jaxrock._quickly`), and as XLA
 compiles by itself.
@@ -34,6 +34,13 @@ QUESTIONS = {
     "`estimate_motion`, 8 starts": "rk.inverse.estimate_motion(*asked, starts=8, progress=False).values",
     "`feasible_region`, 12 x 12": "rk.inverse.feasible_region(rk.inverse.Likelihood(*asked[:2]), grid, progress=False)",
     "`peak_velocity` of a pulse": "rk.intensity.peak_velocity(rk.RickerPulse(0.5, 0.6))",
+    "`simulate`, a pulse": "rk.simulate(block, pulse).rotation",
+    "`simulate`, a record": "rk.simulate(block, 1.5 * rk.example_record()).rotation",
+    "`contact_forces` of a history": "rk.responses.contact_forces(rk.simulate(block, pulse), block)",
+    "flexible column, `outcome`": "rk.outcome(column, rk.SinePulse(0.5, 1.6))",
+    "its history": "rk.simulate(column, rk.SinePulse(0.5, 1.6)).rotation",
+    "`sensitivity`": "rk.sensitivity(block, pulse)",
+    "map of 64 x 64": "rk.overturning_map(np.linspace(1, 8, 64), np.linspace(1, 10, 64), progress=False).margin",
 }
 
 
@@ -46,9 +53,10 @@ def ask(question, way):
     jax.config.update("jax_enable_x64", True)
     import jaxrock as rk
     from jaxrock import _quickly
+    from jaxrock.sweeps import runner
 
     if way != WAYS[0]:
-        _quickly._MUCH = -1
+        _quickly.MUCH = runner.MUCH = -1
     draw = np.random.default_rng(1)
     x, y = (np.exp(draw.normal(mean, 0.5, ROWS)) for mean in (-1, -2))
     alpha, p = np.array([0.10, 0.13, 0.16, 0.20, 0.24]), np.array([3.0, 2.6, 3.4, 2.8, 3.2])
@@ -60,6 +68,8 @@ def ask(question, way):
         "fragility": rk.hazard.LogNormalFragility(0.3, 0.4, "PGA"),
         "asked": (rocks, rk.SinePulse, unknowns), "points": draw.normal(0, 1, (64, 2)),
         "grid": {"amplitude": np.geomspace(0.1, 1.5, 12), "period": np.geomspace(0.3, 2.0, 12)},
+        "block": rk.Block(0.2, 2.0), "pulse": rk.SinePulse(0.3, 0.8),
+        "column": rk.blocks.FlexibleBlock(5.0, 50.0, 30e9, 2500.0, 0.01, 6),
         "curve": rk.hazard.HazardCurve([0.1, 0.2, 0.4, 0.8], [1e-2, 1e-3, 1e-4, 1e-5]),
     }  # fmt: skip
 
@@ -95,7 +105,7 @@ def main():
             first, other, again = (statistics.median(x) for x in list(zip(*answers, strict=True))[:3])
             rows.append([question, way, f"{first:.2f}", f"{other:.2f}", f"{1e3 * again:.2f}", f"{off:.0e}"])
     heads = ["question", "compiled", "first [s]", f"next, of {OTHER} rows [s]", "again [ms]", "relative difference"]
-    text = f"""# Fits, rates, peaks and estimates
+    text = f"""# Fits, rates, peaks, estimates, histories and columns
 
 Written by `python benchmarks/fits.py`, {surroundings()}.
 
@@ -103,8 +113,9 @@ Processor seconds of the first answer in a fresh process with nothing kept, and 
 {OTHER} rows of outcomes after one to {ROWS}, which have room in one program; the least time of answers after that;
 medians of {TIMES}, in turns. Of known numbers, few and on a CPU, the package has XLA compile such programs quickly
 (`jaxrock._quickly`): without LLVM's effort and XLA's newer emitters; also where such a program follows scenes, if these
-are machine code. The difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is
-what a climb settles at.
+are machine code, of flexible columns, which are not, and of sweeps of few points on one device that have no loops. The
+difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb
+settles at.
 
 {table(heads, rows)}
 """

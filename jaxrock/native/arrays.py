@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir
 
 from jaxrock.native.lists import boxed, for_each, sorted_list
-from jaxrock.native.operations import OPERATIONS, Unsupported, is_float
+from jaxrock.native.operations import OPERATIONS, Unsupported, is_float, multiply_add
 
 
 def _number(index) -> int | None:
@@ -126,7 +126,9 @@ def _product(e, equation, x, y) -> np.ndarray:
         # What no step has filled yet counts nothing.
         pairs = [pair for pair in pairs if not all(map(_is_zero, pair))] or pairs
         found = OPERATIONS["mul"](e, equation, *pairs[0]) if pairs else none
-        results[place] = functools.reduce(lambda total, pair: e.multiply_add(*pair, total), pairs[1:], found)
+        results[place] = functools.reduce(
+            lambda total, pair: multiply_add(e, pair[0], pair[1], total), pairs[1:], found
+        )
     return results.reshape([*shape, *more])
 
 

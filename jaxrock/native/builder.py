@@ -69,10 +69,10 @@ class Builder(ir.IRBuilder):
     def fneg(self, x, name: str = "", flags: tuple[str, ...] = ()):
         return self._add(x.type, f"{' '.join(('fneg', *flags))} {x.type} {x.get_reference()}")
 
-    def multiply_add(self, function, x, y, z):
-        """x y + z, by a function of LLVM that is one instruction where the processor has it."""
-        operands = ", ".join(f"{value.type} {value.get_reference()}" for value in (x, y, z))
-        return self._add(x.type, f"call {x.type} {function.get_reference()}({operands})")
+    def called(self, function: ir.Function, values) -> Line:
+        """What a function makes of values of its types."""
+        kind, operands = function.ftype.return_type, ", ".join(f"{x.type} {x.get_reference()}" for x in values)
+        return self._add(kind, f"call {kind} {function.get_reference()}({operands})")
 
     def extract_element(self, vector, index, name: str = ""):
         kind = vector.type

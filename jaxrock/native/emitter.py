@@ -75,13 +75,7 @@ class Emitter:
         """One of LLVM's own functions."""
         kind = values[0].type
         short = "f64" if isinstance(kind.element, ir.DoubleType) else "f32"
-        return self.b.call(self._declared(f"llvm.{name}.v{self.lanes}{short}", kind, len(values)), values)
-
-    def multiply_add(self, x, y, z):
-        """x y + z, rounded once where the processor does so."""
-        kind = x.type
-        short = "f64" if isinstance(kind.element, ir.DoubleType) else "f32"
-        return self.b.multiply_add(self._declared(f"llvm.fmuladd.v{self.lanes}{short}", kind, 3), x, y, z)
+        return self.b.called(self._declared(f"llvm.{name}.v{self.lanes}{short}", kind, len(values)), values)
 
     def each(self, name: str, *values):
         """A function of the mathematical library, lane by lane."""
@@ -164,8 +158,7 @@ class Emitter:
         if name in WITH_PROGRAMS:
             return self._apply(equation, inputs, active)
         if is_compound(name) and name not in OPERATIONS:
-            program = written(name, [x.aval for x in equation.invars], equation.params)
-            return self.run(kept_fused(program), inputs, active)
+            return self.run(_parts_of(equation), inputs, active)
         depth = max(map(_depth_of, inputs), default=0)
         results = self._in_loops(depth, equation, lambda: self._apply(equation, inputs, active))
         given = set(map(id, _loose(inputs)))  # what is passed on is not made here
@@ -267,6 +260,11 @@ class Emitter:
             phi.add_incoming(old, before)
         remember(joined, len(self.before))
         return like(results, joined)
+
+
+def _parts_of(equation):
+    """What a compound operation consists of."""
+    return kept_fused(written(equation.primitive.name, [x.aval for x in equation.invars], equation.params))
 
 
 def remember(values: Sequence, depth: int) -> None:

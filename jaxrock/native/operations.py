@@ -229,18 +229,23 @@ def _by(function: Callable):
     return operation
 
 
+def multiply_add(e, x, y, z):
+    """x y + z of real numbers, rounded once where the processor does so."""
+    return e.intrinsic("fmuladd", x, y, z)
+
+
 def _polynomial(e, equation, x, *coefficients):
     """Of JAX 0.12 and later, where interpolants are made of it: from the lowest degree on."""
     *lower, found = coefficients
     for each in reversed(lower):
-        found = e.multiply_add(found, x, each)
+        found = multiply_add(e, found, x, each)
     return found
 
 
 def _multiply_add(e, equation, x, y, z):
     """A product and a sum; of those of `fused`."""
     x = e.b.fneg(x) if equation.params["minus"] else x
-    return e.multiply_add(x, y, e.b.fneg(z) if equation.params["less"] else z)
+    return multiply_add(e, x, y, e.b.fneg(z) if equation.params["less"] else z)
 
 
 def _logarithm_of_any(x, positive=logarithm, border=0):

@@ -65,7 +65,7 @@ class Diffrax(AbstractEngine):
 
     - `solver`: any diffrax solver of ordinary differential equations.
     - `rtol`: tolerance of a step relative to the state, in (0, 1); 1e-12 is about the tightest in double precision,
-      2e-6 in single, where less is taken for that, and some scenes use their budget up.
+      2e-6 in single, where less is taken for that.
     - `atol`: absolute tolerance over alpha; None takes 1e-8 rtol, so that small hops keep their digits. For solvers of
       low order, whose steps that makes very short, give some 1e-2 rtol.
     - `controller`: a step-size controller instead of the PID controller with these tolerances; `rtol` then is

@@ -39,6 +39,7 @@ class Policy(NamedTuple):
 
 
 POLICY = Policy()
+_NOISE = 64  # units of rounding that an acceleration may be off by
 
 
 class Forcing(eqx.Module):
@@ -127,7 +128,7 @@ class Arc(eqx.Module):
         acceleration, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
         pull = scene.moments.restoring_at_rest + jnp.abs(forcing(zero)[0]) * scene.moments.arm_at_rest
-        noise = 64 * jnp.finfo(acceleration.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
+        noise = _NOISE * jnp.finfo(acceleration.dtype).eps * (pull + jnp.abs(jerk) * scene.p * start.local)
         leaving = (start.opening == 0) & (start.velocity == 0)
         acceleration = jnp.where(start.uplifting | (leaving & (jnp.abs(acceleration) <= noise)), 0.0, acceleration)
         noise = jax.lax.stop_gradient(noise)
@@ -168,11 +169,12 @@ class Arc(eqx.Module):
         jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
         # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
         rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
+        most = self.noise / (_NOISE * jnp.finfo(self.noise.dtype).eps)
         directed = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
         guards = Events(
             impact=_guard(time, y[0], [jets[0], jets[1], jets[2] / 2, jets[3] / 6], True),
             turning=_guard(time, y[1], [jets[1], jets[2], jets[3] / 2], ~self.hop),
-            extremum=jnp.where(self.hop, 1.0, directed / (1e14 * self.noise)),
+            extremum=jnp.where(self.hop, 1.0, directed / most),
             saddle=_guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), jets[1]], True),
             flat=_guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat),
         )
