@@ -98,8 +98,7 @@ Written by `python benchmarks/effort.py`, {surroundings()}.
 
 Machine code of one program, compiled by LLVM with effort 0 and 3: processor seconds of the first answer in a fresh
 process with nothing kept, of LLVM within it, and the least time of the answers after it; medians of {TIMES}, in turns.
-The package compiles closed forms of one number with effort 0, all else with 3 (`jaxrock.native.machine.EFFORT`). Of one
-number the last bit may differ: effort 3 computes the last operations for one lane only, and rounds them otherwise.
+The package compiles what is of one lane with effort 0, all else with 3 (`jaxrock.native.machine.EFFORT`).
 
 {table(heads, rows)}
 """
