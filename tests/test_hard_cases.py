@@ -207,6 +207,21 @@ def test_uplift_at_the_peak(model, excess):
     assert result["max_rotation"] > 0 or excess < 1e-12
 
 
+def test_the_threshold_is_touched():
+    """At the peak of a pulse, and passed by a digit or two: of a hundred blocks one is lifted by 1e-32 rad and stands
+    still where its acceleration cancels to nothing, which is no reason for its steps to be used up."""
+    random, digit = np.random.default_rng(7), np.finfo(float).eps
+    alpha, p, period = random.uniform([[0.03], [0.5], [0.1]], [[0.6], [5.0], [3.0]], (3, 3000))
+
+    def touched(factor, alpha, p, period):
+        return rk.outcome(rk.Block(alpha, p, 0.9), rk.SinePulse(factor * jnp.tan(alpha), period))
+
+    for factor in (1.0, 1.0 + digit, 1.0 + 4 * digit):
+        found = jax.jit(jax.vmap(touched, (None, 0, 0, 0)))(factor, alpha, p, period)
+        assert (found.status == rk.Status.successful).all() and not found.overturned.any()
+        assert np.max(found.max_rotation) < 1e-25 and np.max(np.abs(found.margin - 1)) < 1e-12
+
+
 def test_block_that_never_uplifts():
     share = np.array([0.0, 0.5, 0.999])
     result = under_sines("nonlinear", share * np.tan(0.2), 2.0)

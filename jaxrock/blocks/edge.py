@@ -136,6 +136,11 @@ class EdgePieces(eqx.Module):
     before: Rounded
     slope: Real
 
+    @property
+    def edge(self) -> Edge:
+        """The whole."""
+        return Edge(self.before.radius) if self.start is None else Edge(self.before.radius[1:], self.start[1:])
+
     def at(self, opening: Real) -> Rounded:
         """What the edge has added at one opening angle."""
         if self.start is None:

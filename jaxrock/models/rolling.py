@@ -88,7 +88,7 @@ class RollingMoments(AbstractMoments):
 
     slenderness: Angle
     ratio: Scalar
-    edge: EdgePieces
+    pieces: EdgePieces
     factor: Scalar  # of all accelerations (see `times`)
     saddle: Scalar
     firm: Scalar | None = None  # up to where it may right itself again (`last_rise`); None: nowhere, on a circle
@@ -107,7 +107,7 @@ class RollingMoments(AbstractMoments):
     def rolled(self, angle: Angle) -> Rolled:
         """Where the centre of mass is over the point of contact."""
         sine, cosine = self.slenderness.sine, self.slenderness.cosine
-        added = self.edge.at(angle.value)
+        added = self.pieces.at(angle.value)
         return Rolled(
             cosine * angle.cosine + sine * angle.sine + added.rise,
             sine * angle.cosine - cosine * angle.sine + added.run,
@@ -144,7 +144,7 @@ class RollingMoments(AbstractMoments):
         """By how much the centre of mass rises: the moment of inertia there does not matter."""
         half, (_, sine, cosine) = Angle.of(opening / 2), self.slenderness
         over_a_corner = 2 * half.sine * (sine * half.cosine - cosine * half.sine)  # cos(alpha - x) - cos(alpha)
-        return self.factor * (over_a_corner + self.edge.at(opening).rise)
+        return self.factor * (over_a_corner + self.pieces.at(opening).rise)
 
     @property
     def restoring_at_rest(self) -> Scalar:

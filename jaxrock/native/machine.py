@@ -18,8 +18,8 @@ from jaxrock.native.interface import add_handler
 from jaxrock.native.operations import Unsupported
 
 # LLVM's effort, 0 to 3: at what runs for microseconds, in one lane, and at all else (see `Plan`). With 0 it takes a
-# third to two thirds of the time, and on x86, where this was measured (`benchmarks/effort.py`), the numbers are the same
-# to the bit. The code takes up to three times as long.
+# third to two thirds of the time, and on x86, where this was measured (`benchmarks/effort.py`), numbers are the same to
+# the bit. The code takes up to three times as long.
 EFFORT = {"in a moment": 0 if platform.machine() in ("x86_64", "AMD64") else 3, "for long": 3}
 
 

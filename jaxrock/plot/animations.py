@@ -101,7 +101,7 @@ def _edges(response: Response | FlexibleResponse) -> tuple[Edge, Edge] | None:
         return None
     moments: Any = response.scene.both_moments
     here, there = moments
-    return here.edge, there.edge
+    return here.pieces.edge, there.pieces.edge
 
 
 def _room(body: Body, rotation: np.ndarray) -> tuple[float, float, float]:

@@ -28,7 +28,7 @@ from jaxrock.engines.scene import Scene
 from jaxrock.engines.state import Node, State, surpasses
 from jaxrock.engines.stepper import AbstractEngine, AbstractStepper
 from jaxrock.engines.taylor.expansion import End, Start, arrive, expand, extreme_speed
-from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start
+from jaxrock.engines.taylor.outset import clear_start, overshoot, signs_at_start, unbalanced
 from jaxrock.engines.taylor.policy import POLICY, exact
 from jaxrock.engines.taylor.tape import end_on_tape, on_tape
 from jaxrock.models.coefficients import Coefficients
@@ -358,7 +358,7 @@ class _Step(NamedTuple):
     def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
         """The step from a state on."""
         scene, order = stepper.scene, stepper.order
-        coefficients = expand(start, order).opening
+        coefficients = unbalanced(state, expand(start, order).opening)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)

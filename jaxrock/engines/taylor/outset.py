@@ -1,5 +1,7 @@
 """What is known of a step beforehand: its first signs, from where on events may come, how fast the block may be."""
 
+import functools
+
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -13,6 +15,15 @@ Scalar = Inexact[Array, ""]
 def first_sign(value: Scalar, following: Scalar) -> Scalar:
     """Sign with which a value starts; where it is zero, that of its derivative."""
     return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
+
+
+def unbalanced(state: State, coefficients: list[Scalar]) -> list[Scalar]:
+    """The series of a block that stands still, lifted, where its acceleration cancels to nothing: within the rounding
+    of that it goes where the change of the acceleration will take it. Of two zeros at once no event is told apart."""
+    rest = [jnp.abs(c) for c in coefficients[3:]]
+    digit = jnp.finfo(state.opening.dtype).eps * functools.reduce(jnp.maximum, rest)
+    still = (state.opening > 0) & (state.velocity == 0) & (coefficients[2] == 0) & ~state.uplifting
+    return [*coefficients[:2], where(still, jnp.sign(coefficients[3]) * digit, coefficients[2]), *coefficients[3:]]
 
 
 def signs_at_start(state: State, coefficients) -> tuple[Scalar, Scalar]:
