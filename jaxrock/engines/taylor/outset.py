@@ -1,7 +1,5 @@
 """What is known of a step beforehand: its first signs, from where on events may come, how fast the block may be."""
 
-import functools
-
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -20,8 +18,7 @@ def first_sign(value: Scalar, following: Scalar) -> Scalar:
 def unbalanced(state: State, coefficients: list[Scalar]) -> list[Scalar]:
     """The series of a block that stands still, lifted, where its acceleration cancels to nothing: within the rounding
     of that it goes where the change of the acceleration will take it. Of two zeros at once no event is told apart."""
-    rest = [jnp.abs(c) for c in coefficients[3:]]
-    digit = jnp.finfo(state.opening.dtype).eps * functools.reduce(jnp.maximum, rest)
+    digit = jnp.finfo(state.opening.dtype).eps * (jnp.abs(coefficients[3]) + jnp.abs(coefficients[4]))
     still = (state.opening > 0) & (state.velocity == 0) & (coefficients[2] == 0) & ~state.uplifting
     return [*coefficients[:2], where(still, jnp.sign(coefficients[3]) * digit, coefficients[2]), *coefficients[3:]]
 
