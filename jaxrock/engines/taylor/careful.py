@@ -358,7 +358,7 @@ class _Step(NamedTuple):
     def of(cls, stepper: TaylorStepper, state: State, start: Start, room: Scalar, rocking: Flag) -> "_Step":
         """The step from a state on."""
         scene, order = stepper.scene, stepper.order
-        coefficients = unbalanced(state, expand(start, order).opening)
+        coefficients = unbalanced(expand(start, order).opening)
         # Relative to the motion itself while it is small: tiny rotations keep their digits too.
         size = functools.reduce(jnp.maximum, [jnp.abs(c) for c in coefficients[: max(order // 2, 4)]])
         size = jnp.minimum(scene.alpha, size)

@@ -15,12 +15,12 @@ def first_sign(value: Scalar, following: Scalar) -> Scalar:
     return where(value != 0, jnp.sign(value), where(following < 0, -1.0, 1.0))
 
 
-def unbalanced(state: State, coefficients: list[Scalar]) -> list[Scalar]:
-    """The series of a block that stands still, lifted, where its acceleration cancels to nothing: within the rounding
-    of that it goes where the change of the acceleration will take it. Of two zeros at once no event is told apart."""
-    digit = jnp.finfo(state.opening.dtype).eps * (jnp.abs(coefficients[3]) + jnp.abs(coefficients[4]))
-    still = (state.opening > 0) & (state.velocity == 0) & (coefficients[2] == 0) & ~state.uplifting
-    return [*coefficients[:2], where(still, jnp.sign(coefficients[3]) * digit, coefficients[2]), *coefficients[3:]]
+def unbalanced(coefficients: list[Scalar]) -> list[Scalar]:
+    """The series of a block whose acceleration cancels to nothing: within the rounding of that it goes where the change
+    of the acceleration takes it. Where it stands still, too, every event would be at once."""
+    second, third = coefficients[2:4]
+    digit = jnp.finfo(third.dtype).eps * third
+    return [*coefficients[:2], where(second == 0, digit, second), *coefficients[3:]]
 
 
 def signs_at_start(state: State, coefficients) -> tuple[Scalar, Scalar]:
