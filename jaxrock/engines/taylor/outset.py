@@ -16,11 +16,11 @@ def first_sign(value: Scalar, following: Scalar) -> Scalar:
 
 
 def unbalanced(coefficients: list[Scalar]) -> list[Scalar]:
-    """The series of a block whose acceleration cancels to nothing: within the rounding of that it goes where the change
+    """The series of a block whose acceleration cancels to nothing: it goes, by far less than rounding, where the change
     of the acceleration takes it. Where it stands still, too, every event would be at once."""
     second, third = coefficients[2:4]
-    digit = jnp.finfo(third.dtype).eps * third
-    return [*coefficients[:2], where(second == 0, digit, second), *coefficients[3:]]
+    nearly_nothing = float(jnp.finfo(third.dtype).eps) ** 2 * third
+    return [*coefficients[:2], where(second == 0, nearly_nothing, second), *coefficients[3:]]
 
 
 def signs_at_start(state: State, coefficients) -> tuple[Scalar, Scalar]:
