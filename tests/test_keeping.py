@@ -470,5 +470,6 @@ def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
                 np.testing.assert_array_equal(rk.sweep(function, x=x, progress=False).values, expected)
         assert ways == ["quickly", "well"]
         monkeypatch.setattr(runner, "MUCH", 4)
-        np.testing.assert_array_equal(rk.sweep(straight, x=x, progress=False).values, 2 * x)
+        for block in (None, 2):  # of few points, of many in all
+            np.testing.assert_array_equal(rk.sweep(straight, x=x, block=block, progress=False).values, 2 * x)
     assert len(ways) == 2  # of many points, and on many devices, with the options of `jax.jit`

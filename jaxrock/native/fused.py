@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jaxrock._programs import with_programs
 from jaxrock.numerics.compound import Compound
 
-_MOST = 8  # numbers of an array; larger ones are XLA's
+_MOST = 8  # numbers of an array: longer ones are mostly XLA's, which knows no such operation
 _SUMS = {"add", "add_any", "sub"}
 
 

@@ -19,9 +19,10 @@ _EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
 
 
 class Runner:
-    """One compiled function of a batch of points; call it with any number of flat points."""
+    """One compiled function of a batch of points; call it with any number of flat points: so many at once, at most,
+    and so many in all (None: no more)."""
 
-    def __init__(self, function: Callable, axes: tuple[np.ndarray, ...], scene, points: int):
+    def __init__(self, function: Callable, axes: tuple[np.ndarray, ...], scene, points: int, in_all: int | None = None):
         devices = local_devices()
         self._layout = layout(points, len(devices), devices[0].platform)
         self._mesh = _mesh_of(tuple(devices))
@@ -30,7 +31,7 @@ class Runner:
         self._scene = structure.unflatten(leaves)
         kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
         self._call, self._messages, self.tree, self.shapes = _compiled(
-            function, self._mesh, self._layout, kinds, structure, like, few=points <= MUCH
+            function, self._mesh, self._layout, kinds, structure, like, few=(in_all or points) <= MUCH
         )
 
     def __call__(

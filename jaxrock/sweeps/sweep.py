@@ -264,7 +264,7 @@ def compute(
 
     With many processes each takes its turn of the blocks; every process returns all.
     """
-    run = Runner(function, plan.axes, scene, math.prod(plan.block))
+    run = Runner(function, plan.axes, scene, math.prod(plan.block), math.prod(plan.shape))
     own, count = process()
     if store is None and count == 1 and plan.block == plan.shape:
         return _at_once(run, plan, label, progress, columns), 0
