@@ -41,12 +41,23 @@ QUESTIONS = {
     "its history": "rk.simulate(column, rk.SinePulse(0.5, 1.6)).rotation",
     "`sensitivity`": "rk.sensitivity(block, pulse)",
     "map of 64 x 64": "rk.overturning_map(np.linspace(1, 8, 64), np.linspace(1, 10, 64), progress=False).margin",
+    "map of 128 x 128, without llvmlite": (
+        "rk.overturning_map(np.linspace(1, 8, 128), np.linspace(1, 10, 128), progress=False).margin"
+    ),
+    "spectrum of 200 blocks under a record, without llvmlite": (
+        "rk.rocking_spectrum(0.2, rk.example_record(), np.linspace(0.5, 8, 200), progress=False).margin"
+    ),
+    "map of 32 x 32 by Diffrax, without llvmlite": (
+        "rk.overturning_map(np.linspace(1, 8, 32), np.linspace(1, 10, 32), engine=rk.Diffrax(), progress=False).margin"
+    ),
 }
 
 
 def ask(question, way):
     """In this process: processor seconds of the first answer, of one to another number of rows, seconds of the next
     ones, and all numbers of the first."""
+    if "without llvmlite" in question:
+        sys.modules["llvmlite"] = None
     import jax
     import numpy as np
 
@@ -80,7 +91,8 @@ def ask(question, way):
 
     first, answer = timed(time.process_time, ROWS)
     other = timed(time.process_time, OTHER)[0]
-    again = min(timed(time.perf_counter, ROWS)[0] for _ in range(3 if "motion" in question else 50))
+    often = 3 if "motion" in question or "without" in question else 50
+    again = min(timed(time.perf_counter, ROWS)[0] for _ in range(often))
     numbers = [float(number) for leaf in answer for number in np.ravel(np.asarray(leaf, float))]
     return first, other, again, numbers
 
@@ -113,9 +125,9 @@ Processor seconds of the first answer in a fresh process with nothing kept, and 
 {OTHER} rows of outcomes after one to {ROWS}, which have room in one program; the least time of answers after that;
 medians of {TIMES}, in turns. Of known numbers, few and on a CPU, the package has XLA compile such programs quickly
 (`jaxrock._quickly`): without LLVM's effort and XLA's newer emitters; also where such a program follows scenes, if these
-are machine code, of flexible columns, which are not, and of sweeps of few points on one device that have no loops. The
-difference is the largest of any number of the answer, covariances too; of `estimate_motion` it is what a climb
-settles at.
+are machine code, of flexible columns, which are not, and of sweeps of few points on one device that have no loops, or
+follow rigid blocks without machine code. The difference is the largest of any number of the answer, covariances too; of
+`estimate_motion` it is what a climb settles at.
 
 {table(heads, rows)}
 """

@@ -5,9 +5,9 @@ functions are called thousands of times while a program is traced, and a check t
 JAXROCK_CHECK_ALL=1 they are checked everywhere.
 
 XLA compiles as after `keep_compiled`, and then as quickly as it can, since nearly every program runs once: that takes
-half of the time or less. LLVM does so with machine code of our own: numbers of many lanes are the same to the bit
-(`test_native.py`, `test_at_any_effort`), of one to rounding. With `XLA_FLAGS=` both compile as they do for users, as
-they do in processes that tests start.
+half of the time or less. LLVM does so with machine code of our own, whose numbers are the same to the bit
+(`test_native.py`, `test_at_any_effort`). With `XLA_FLAGS=` both compile as they do for users; LLVM does so in processes
+that tests start, too.
 """
 
 import atexit

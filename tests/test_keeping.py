@@ -447,7 +447,7 @@ def test_scenes_that_xla_runs_are_compiled_well(monkeypatch):
 
 
 def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
-    """What has no loops, and is not done for many points, in the least time; all else as well as XLA can."""
+    """What has no loops or is light, of few points, in the least time; all else as well as XLA can."""
     ways = []
     compiled = jax.stages.Lowered.compile
 
@@ -469,7 +469,12 @@ def test_sweeps_are_compiled_as_what_is_in_them_wants(monkeypatch):
             for _ in range(2):
                 np.testing.assert_array_equal(rk.sweep(function, x=x, progress=False).values, expected)
         assert ways == ["quickly", "well"]
+        of_one_block = runner.light(lambda x, _: halved(x))
+        for scene, points in (((), 5), (np.zeros(500_000), 5), ((), 2**14 + 1)):
+            (found,) = runner.Runner(of_one_block, (x,), scene, 5, points)([x])
+            np.testing.assert_array_equal(found, [0, 1, 1, 0.75, 1])
+        assert ways[2:] == ["quickly", "well", "well"]  # where they are light, few, and of a short motion
         monkeypatch.setattr(runner, "MUCH", 4)
         for block in (None, 2):  # of few points, of many in all
             np.testing.assert_array_equal(rk.sweep(straight, x=x, block=block, progress=False).values, 2 * x)
-    assert len(ways) == 2  # of many points, and on many devices, with the options of `jax.jit`
+    assert len(ways) == 5  # of many points, and on many devices, with the options of `jax.jit`

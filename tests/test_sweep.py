@@ -145,6 +145,16 @@ def test_whether_scenes_are_few_is_not_told_by_their_devices(points):
     assert few == {points <= batching._FEW}
 
 
+def test_batches_are_of_few_sizes():
+    """Each is compiled: few, that are called few times, and are never filled up beyond the next power of two."""
+    sizes = {points: layout(points, 1, "cpu")[1] for points in (*range(1, 3000), *range(3000, 2**14, 97), 10**6)}
+    assert len(set(sizes.values())) == 4
+    for points, lanes in sizes.items():
+        calls = -(-points // lanes)
+        assert calls <= 8 or lanes == max(sizes.values())
+        assert calls * lanes <= max(2 ** (points - 1).bit_length(), 128) or points > 2**14
+
+
 def test_what_fills_a_batch_up_is_one_of_its_points():
     """Any other point might take for ever."""
     runner, seen = Runner(lambda x, _: x, (np.ones(1),), (), 0), []

@@ -32,6 +32,7 @@ from jaxrock.studies.ends import brackets_of, roots_of
 from jaxrock.studies.lowest_ends import lowest_ends
 from jaxrock.studies.parameters import named, peak_of
 from jaxrock.studies.varied import AbstractVaried, Amplitude, Duration, check_sizeless, on_border
+from jaxrock.sweeps.runner import light
 from jaxrock.sweeps.sweep import known_surface, surface
 
 _FIRST = 256  # intervals of the first sampling
@@ -220,11 +221,13 @@ def _names(both: PyTree) -> list[str]:
 # Of many scenes: what is asked of one point.
 
 
+@light
 def _at(z, index, scene):
     kind, both = scene
     return kind.at(z, *one_of_many(both, index))
 
 
+@light
 def _slopes(z, index, scene):
     kind, both = scene
     return kind.slopes(z, *one_of_many(both, index))

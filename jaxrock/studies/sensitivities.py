@@ -24,6 +24,7 @@ from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Enumeration, Status, item
 from jaxrock.studies.parameters import named, rebuilt
 from jaxrock.studies.spectra import axis, scaled_law
+from jaxrock.sweeps.runner import light
 from jaxrock.sweeps.sweep import surface
 
 Scalar = Inexact[Array, "..."]
@@ -260,6 +261,7 @@ def sensitivity_map(
     return SensitivityMap(strength, duration, shape, sensitivities)
 
 
+@light
 def _under_lobe(strength, duration, scene) -> Sensitivity:
     shape, alpha, restitution, model, engine = scene
     block = Block(alpha, jnp.ones_like(alpha), restitution)

@@ -24,6 +24,7 @@ from jaxrock.motions.pulses.sinusoidal import SinePulse
 from jaxrock.responses.current_model import current_model
 from jaxrock.responses.outcome import Outcome, outcome
 from jaxrock.status import Status
+from jaxrock.sweeps.runner import light
 from jaxrock.sweeps.sweep import surface
 from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
@@ -350,6 +351,7 @@ def _kept(result: Outcome, block: Block) -> dict:
 # kind is not compiled again.
 
 
+@light
 def _under_motion(period, scene):
     alpha, restitution, motion, model, engine = scene
     alpha, period = _in_one_precision(alpha, period, of=motion)
@@ -373,5 +375,6 @@ def _in_one_precision(*numbers: Array, of: Any = ()) -> list[Array]:
     return [x.astype(kind) for x in numbers]
 
 
+@light
 def _under_pulse(*point_and_scene) -> dict:
     return _kept(*under_pulse(*point_and_scene))

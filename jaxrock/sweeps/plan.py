@@ -10,7 +10,10 @@ from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
-_LANES = 2**14  # of a compiled call on a device, at most; of a GPU four times as many
+# Lanes of a compiled call on a CPU, and how often such a call is made before a larger one is: each size is compiled, in
+# the time in which a hundred calls of the smaller ones run.
+_CALLS = {_CHUNK: 1, 2 * _CHUNK: 4, 2**10: 8, 2**14: math.inf}
+_GPU_LANES = 2**10, 2**16  # the least and the most, in powers of two
 _SMALLEST_BLOCK = 65536
 _LARGEST_BLOCK = 2**18  # bounds the memory, whatever the size of the grid
 _BLOCKS = 64  # of a grid, if it is large: what a killed job loses at most, and what is dealt to processes
@@ -66,14 +69,17 @@ class Plan(NamedTuple):
 
 
 def layout(points: int, devices: int, platform: str) -> tuple[int, int]:
-    """Shape of a batch: devices, lanes. As many lanes at once as there are points, in few different numbers, each of
-    which is compiled.
+    """Shape of a batch: devices, lanes; of few different ones, each of which is compiled.
 
     Few scenes go without a quick pass (`transforms.batching`), which leaves other last digits: whether these are few
     is told by the points, not by how many devices share them.
     """
-    least, most = (_CHUNK if points <= _CHUNK else 2 * _CHUNK, _LANES) if platform == "cpu" else (1024, 4 * _LANES)
-    return devices, 2 ** (min(max(-(-points // devices), least), most) - 1).bit_length()
+    share = -(-points // devices)
+    if platform != "cpu":
+        least, most = _GPU_LANES
+        return devices, 2 ** (min(max(share, least), most) - 1).bit_length()
+    few = points <= _CHUNK
+    return devices, next(n for n, calls in _CALLS.items() if share <= n * calls and (few or n > _CHUNK))
 
 
 def deal(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -16,6 +16,17 @@ from jaxrock.sweeps.plan import deal, dealt_to, layout
 from jaxrock.transforms.fingerprint import Checked, Program, with_checks
 
 _EVERYWHERE, _DEALT = PartitionSpec(), PartitionSpec("devices")
+# Points of light functions, and these times numbers of their scene, that take less time than to compile them well
+# (`benchmarks/fits.md`).
+_FEW, _LITTLE = 2**14, 2_000_000
+_LIGHT = "_follows_one_rigid_block"
+
+
+def light(function: Callable) -> Callable:
+    """Decorate a function of a point that follows one rigid block: where no machine code is made of it, XLA compiles it
+    for as long as thousands of points take."""
+    setattr(function, _LIGHT, True)
+    return function
 
 
 class Runner:
@@ -30,8 +41,10 @@ class Runner:
         leaves, structure = flat
         self._scene = structure.unflatten(leaves)
         kinds, like = tuple(x.dtype for x in axes), tuple(map(jax.typeof, leaves))
+        in_all = in_all or points
+        brief = hasattr(function, _LIGHT) and in_all <= _FEW and in_all * sum(x.size for x in like) <= _LITTLE
         self._call, self._messages, self.tree, self.shapes = _compiled(
-            function, self._mesh, self._layout, kinds, structure, like, few=(in_all or points) <= MUCH
+            function, self._mesh, self._layout, kinds, structure, like, in_all <= MUCH, brief
         )
 
     def __call__(
@@ -116,7 +129,14 @@ class _Compiled(NamedTuple):
 # the scene, a pytree, by whose structure `jax.jit` tells programs apart.
 @functools.lru_cache(maxsize=64)
 def _compiled(
-    function: Callable, mesh: Mesh, shape: tuple[int, int], kinds: tuple, structure, scene: tuple, few: bool
+    function: Callable,
+    mesh: Mesh,
+    shape: tuple[int, int],
+    kinds: tuple,
+    structure,
+    scene: tuple,
+    few: bool,
+    brief: bool,
 ) -> _Compiled:
     """`function(*point, scene)` at a batch of points of these kinds of numbers, and what is known of it beforehand."""
     at_first = few and mesh.size == 1
@@ -125,20 +145,22 @@ def _compiled(
     told = jax.eval_shape(call, like, structure.unflatten(scene))
     results, tree = jax.tree.flatten(told.results)
     shapes = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in results]
-    return _Compiled(_AtFirst(call, mesh) if at_first else call, told.messages, tree, shapes)
+    return _Compiled(_AtFirst(call, mesh, brief) if at_first else call, told.messages, tree, shapes)
 
 
 class _AtFirst:
-    """A function of a batch of few points on one device, compiled for its first batch as what is in it wants it."""
+    """A function of a batch of few points on one device, compiled for its first batch as what is in it wants it;
+    `brief`: in the least time, also if it has loops."""
 
-    def __init__(self, function: Any, mesh: Mesh):
-        self._function, self._platform, self._compiled = function, mesh.devices.flat[0].platform, None
+    def __init__(self, function: Any, mesh: Mesh, brief: bool):
+        self._function, self._brief, self._compiled = function, brief, None
+        self._platform = mesh.devices.flat[0].platform
 
     def __call__(self, *batch):
         if self._compiled is None:
             lowered = self._function.lower(*batch)
             # Where no loop is left, scenes are machine code of their own, and what is around them takes a moment.
-            quick = self._platform == "cpu" and "stablehlo.while" not in lowered.as_text()
+            quick = self._platform == "cpu" and (self._brief or "stablehlo.while" not in lowered.as_text())
             self._compiled = lowered.compile(quick_options() if quick else compiler_options(self._platform))
         return self._compiled(*batch)
 
