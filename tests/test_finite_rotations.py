@@ -181,7 +181,7 @@ def by_amplitude():
 
         return jax.jvp(numbers, (amplitude,), (1.0,), has_aux=True)
 
-    return jax.jit(jax.vmap(one))
+    return jax.jit(jax.vmap(one), compiler_options=FOR_LONG)
 
 
 @pytest.mark.slow

@@ -341,7 +341,7 @@ def by_width():
     def one(width, *given):
         return jax.jvp(lambda width: results(width, *given), (width,), (1.0,))
 
-    return jax.jit(jax.vmap(one))
+    return jax.jit(jax.vmap(one), compiler_options=FOR_LONG)
 
 
 @pytest.mark.parametrize("count", [16, pytest.param(200, marks=pytest.mark.slow)])

@@ -32,9 +32,9 @@ def density(names):
 @pytest.fixture(scope="module")
 def grid(density):
     """Densities on a fine grid of the ranges' shares, and the values there."""
-    share = (np.arange(100) + 0.5) / 100
+    share = (np.arange(50) + 0.5) / 50
     point = np.stack(np.meshgrid(*[np.log(share / (1 - share))] * 2, indexing="ij"), -1).reshape(-1, 2)
-    found = np.concatenate([density.objective(part) for part in np.split(point, 10)])
+    found = np.concatenate([density.objective(part) for part in np.split(point, 5)])
     return density.values(point), found
 
 

@@ -31,6 +31,7 @@ from jax.extend.core import Literal
 
 from jaxrock._programs import following
 from jaxrock.numerics.xla_cpu import marking
+from jaxrock.status import marked_result
 from jaxrock.transforms.recipe import Recipe
 
 native: Any = None
@@ -70,7 +71,21 @@ class Lanes:
         if self.in_machine_code:
             return self._one_natively(leaves) if self.size is None else self._many_natively(leaves)
         with marking(self.on_cpu):
-            return list(self.recipe(leaves)) if self.size is None else self._many_by_xla(leaves)
+            found = list(self.recipe(leaves)) if self.size is None else self._many_by_xla(leaves)
+        return self._none_of_none(leaves, found) if self.portable else found
+
+    def _none_of_none(self, leaves, found: list) -> list:
+        """Results, of which those of scenes with a number that is none are none: in exported programs nothing else says
+        that it is nonsense that was asked for."""
+        structure = jax.tree.structure(self.recipe.results)
+
+        def marked(given, found):
+            return jax.tree.leaves(marked_result(structure.unflatten(found), given))
+
+        if self.size is None:
+            return marked(leaves, found)
+        scenes = _Scenes(leaves, self.own, jax.tree.structure(list(leaves)))
+        return scenes.each(marked, scenes.own, found)
 
     @functools.cached_property
     def in_machine_code(self) -> bool:
