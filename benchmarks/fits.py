@@ -39,7 +39,7 @@ QUESTIONS = {
     "`contact_forces` of a history": "rk.responses.contact_forces(rk.simulate(block, pulse), block)",
     "flexible column, `outcome`": "rk.outcome(column, rk.SinePulse(0.5, 1.6))",
     "its history": "rk.simulate(column, rk.SinePulse(0.5, 1.6)).rotation",
-    "`sensitivity`": "rk.sensitivity(block, pulse)",
+    "`sensitivity`": "rk.studies.sensitivity(block, pulse)",
     "map of 64 x 64": "rk.overturning_map(np.linspace(1, 8, 64), np.linspace(1, 10, 64), progress=False).margin",
     "map of 128 x 128, without llvmlite": (
         "rk.overturning_map(np.linspace(1, 8, 128), np.linspace(1, 10, 128), progress=False).margin"

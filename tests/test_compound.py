@@ -420,3 +420,18 @@ def test_types_are_those_of_jax(first, second):
     for number in (jnp.asarray(0.7), jnp.float64(0.7)):  # weak, and not
         check(number)
         jax.jit(check).trace(number)
+
+
+def test_within_shard_map():
+    """Of numbers that differ along a mesh, and others that do not."""
+    x = np.linspace(0.1, 0.4, 4)
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("parts",))
+    every = jax.sharding.PartitionSpec("parts")
+
+    def of(x):
+        return polynomials.polynomial(x, jnp.asarray(2.0), jnp.asarray(3.0), derivatives=1)[0]
+
+    for function in (of, jax.vmap(jax.grad(lambda x: of(x) ** 2))):
+        dealt = jax.shard_map(function, mesh=mesh, in_specs=every, out_specs=every)
+        np.testing.assert_allclose(jax.jit(dealt)(x), function(x), rtol=1e-15)
+        np.testing.assert_allclose(dealt(x), function(x), rtol=1e-15)

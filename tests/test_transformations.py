@@ -3,6 +3,7 @@
 Values by one call for each number; derivatives by differences of these, and of each other.
 """
 
+import copy
 import functools
 import itertools
 import json
@@ -136,6 +137,21 @@ def test_values(way, function, values):
 @pytest.mark.parametrize("function, way", list(combinations(SLOPES, ("vmap of grad",))), indirect=["function"])
 def test_slopes(way, function, slopes):
     np.testing.assert_allclose(SLOPES[way](function), slopes, rtol=2e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["jit", "vmap", "shard_map", "map", "cond", "checkpoint"])
+def test_histories_of_columns(way):
+    """Whose evaluation is an operation of XLA's, and not machine code that is called."""
+
+    def of(amplitude):
+        return rk.simulate(COLUMN, rk.SinePulse(0.95 * amplitude, 0.8), samples=9).rotation[3]
+
+    np.testing.assert_allclose(WAYS[way](of), [float(of(a)) for a in AT], rtol=1e-9)
+    if way == "shard_map":
+        slopes = [float(jax.jvp(of, (a,), (1.0,))[1]) for a in AT]
+        found = jax.jit(jax.grad(lambda x: dealt(jax.vmap(of))(x).sum()))(AT)
+        np.testing.assert_allclose(found, slopes, rtol=1e-7)
 
 
 def test_slopes_by_all_samples_within_shard_map():
@@ -318,16 +334,59 @@ def test_debugging():
         assert float(outcome(0.3)) == pytest.approx(float(outcome(jnp.asarray(0.3))), rel=1e-12)
 
 
-def test_results_are_pickled_and_kept(tmp_path):
-    pulse = rk.SinePulse(0.3, 0.8)
-    for found in (rk.outcome(BLOCK, pulse, **QUICK), rk.simulate(BLOCK, pulse, samples=9, **QUICK)):
-        again = pickle.loads(pickle.dumps(found))
+def restoring(rotation, block):
+    return jnp.sin(block.alpha - rotation)
+
+
+def arm(rotation, block):
+    return jnp.cos(block.alpha - rotation)
+
+
+PULSE = rk.SinePulse(0.3, 0.8)
+RESULTS = {
+    "outcome": lambda: rk.outcome(BLOCK, PULSE, **QUICK),
+    "history": lambda: rk.simulate(BLOCK, PULSE, samples=9, **QUICK),
+    "history by an equation of one's own": lambda: rk.simulate(
+        BLOCK, PULSE, rk.models.Equation(restoring, arm), samples=9
+    ),
+    "histories": lambda: jax.vmap(lambda a: rk.simulate(BLOCK, rk.SinePulse(a, 0.8), samples=9, **QUICK))(AT),
+    "history of a column": lambda: rk.simulate(COLUMN, PULSE, samples=9),
+    "map": lambda: rk.overturning_map(np.linspace(1, 8, 3), np.linspace(1, 9, 3), **QUICK),
+    "sensitivity": lambda: rk.studies.sensitivity(BLOCK, PULSE, **QUICK),
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW) if "column" in x else x for x in RESULTS])
+def test_results_are_pickled_and_kept(name, tmp_path):
+    found = RESULTS[name]()
+    eqx.tree_serialise_leaves(tmp_path / "found", found)
+    loaded = eqx.tree_deserialise_leaves(tmp_path / "found", found)
+    for again in (pickle.loads(pickle.dumps(found)), copy.deepcopy(found), loaded):
+        assert jax.tree.structure(again) == jax.tree.structure(found)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
             np.testing.assert_array_equal(one, other)
-        eqx.tree_serialise_leaves(tmp_path / "found", found)
-        loaded = eqx.tree_deserialise_leaves(tmp_path / "found", found)
-        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(loaded), strict=True):
-            np.testing.assert_array_equal(one, other)
+    if name.startswith("history"):
+        again = pickle.loads(pickle.dumps(found))
+        np.testing.assert_array_equal(again(0.7)[0], found(0.7)[0])
+
+
+def test_a_history_by_a_function_that_is_not_what_it_was(monkeypatch):
+    """Pickled by its name, as Python does it."""
+    found = pickle.dumps(RESULTS["history by an equation of one's own"]())
+    code = restoring.__code__
+    monkeypatch.setattr(restoring, "__code__", (lambda rotation, block: 2 * jnp.sin(block.alpha - rotation)).__code__)
+    assert restoring.__code__ is not code
+    with pytest.raises(ValueError, match="computes something else now"):
+        pickle.loads(found)
+
+
+@pytest.mark.slow
+def test_a_history_by_a_function_that_holds_arrays_is_not_pickled():
+    held = np.array([1.0, 0.5])
+    model = rk.models.Equation(lambda rotation, block: held[0] * jnp.sin(block.alpha - rotation), arm)
+    found = rk.simulate(BLOCK, PULSE, model, samples=9)
+    with pytest.raises((pickle.PicklingError, AttributeError), match="pickle"):
+        pickle.dumps(found)
 
 
 def test_a_search_by_optax_under_vmap():

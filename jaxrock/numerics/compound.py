@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from jaxrock._abstract import typed_like
+from jaxrock._abstract import typed_like, without_mesh
 from jaxrock._precision import setting
 from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
@@ -139,7 +139,7 @@ def _called(name: str, kinds: tuple, settings: tuple, double: bool) -> Callable:
 
 
 def _lowered(name: str, context, *operands, **settings):
-    return mlir.lower_fun(_called(name, *_kept_by(context.avals_in, settings)))(context, *operands)
+    return mlir.lower_fun(_called(name, *_kept_by(context.avals_in, settings)))(without_mesh(context), *operands)
 
 
 def _batched(primitive: Primitive, operands, axes, **settings) -> tuple[list, list]:

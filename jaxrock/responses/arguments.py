@@ -78,8 +78,9 @@ def steps_of_flexible(
     """The budget of steps for a flexible block; raise ValueError for what does not apply to one."""
     if model is not USUAL:
         raise ValueError("Argument `model` does not apply to a FlexibleBlock, whose equation is its own.")
+    start_of(initial)  # raises, if it is no start at all
     # By NumPy: within `jax.jit` a comparison by JAX is traced, however well its sides are known.
-    if any(isinstance(x, jax.core.Tracer) or np.asarray(x) != 0 for x in start_of(initial)):
+    if is_traced(initial) or any(np.asarray(x) != 0 for x in initial):
         raise ValueError(
             f"Argument `initial` must be (0, 0) for a FlexibleBlock, which starts at rest, but is {shown(initial)}."
         )

@@ -11,6 +11,8 @@ It has to be a function of its arguments and of what it reads. A function that w
 JAX has kept of it.
 """
 
+import copy
+import pickle
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -35,14 +37,32 @@ class ByIdentity(eqx.Module):
         return self.function(*arguments, **named)
 
 
+class _Origin:
+    """A function and what it was traced for, `told` where all that it reads is known, and nothing of it is traced.
+    Equal to any other, as the program tells all."""
+
+    def __init__(self, *told: Any):
+        self.told = told
+
+    def __hash__(self):
+        return 0
+
+    def __eq__(self, other):
+        return isinstance(other, _Origin)
+
+
 class UserFunction(eqx.Module):
-    """A function as it was when it was traced. Made by `current_function`."""
+    """A function as it was when it was traced. Made by `current_function`.
+
+    It is pickled as the function is, by its name, and traced anew where it is loaded.
+    """
 
     program: Program = eqx.field(static=True)
     structure: Any = eqx.field(static=True)  # of its arguments
     dtypes: tuple = eqx.field(static=True)
     arrays: tuple  # numbers that the function holds as a pytree, and arrays that it captures
     captured: tuple
+    origin: _Origin = eqx.field(static=True)
 
     @classmethod
     def of(cls, function: Callable, *arguments, **named) -> "UserFunction":
@@ -63,10 +83,20 @@ class UserFunction(eqx.Module):
         jaxpr, rules = _with_own_arrays(closed.jaxpr), _rules(closed, call, values)
         program = Program(jaxpr, jax.tree.structure((told.results, told.failed)), told.messages, rules)
         dtypes = tuple(leaf.dtype for leaf in leaves)
-        made = cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)))
+        origin = _Origin() if known is None else _Origin(function, arguments, named)
+        made = cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)), origin)
         if known is not None:
             _known[closed] = made
         return made
+
+    def __reduce__(self):
+        if not self.origin.told:
+            raise pickle.PicklingError("A function that holds arrays, or reads what may change, cannot be pickled.")
+        return _loaded, (*self.origin.told, self.program.fingerprint(()), self.captured)
+
+    def __deepcopy__(self, memo):
+        arrays, captured = copy.deepcopy((self.arrays, self.captured), memo)
+        return UserFunction(self.program, self.structure, self.dtypes, arrays, captured, self.origin)
 
     def __call__(self, *arguments, **named):
         """Evaluate it within a trace; checks that it makes are made, or put down, here."""
@@ -81,6 +111,14 @@ class UserFunction(eqx.Module):
 
 
 _known: weakref.WeakKeyDictionary[ClosedJaxpr, UserFunction] = weakref.WeakKeyDictionary()
+
+
+def _loaded(function: Callable, arguments: tuple, named: dict, told: str, captured: tuple) -> UserFunction:
+    """A function that was pickled. **Raises:** ValueError where it computes something else now."""
+    made = UserFunction.of(function, *arguments, **named)
+    if made.program.fingerprint(()) != told:
+        raise ValueError("A function that was pickled computes something else now.")
+    return UserFunction(made.program, made.structure, made.dtypes, (), captured, made.origin)
 
 
 def current_function(function: Callable, *arguments, **named) -> UserFunction | ByIdentity:
