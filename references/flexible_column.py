@@ -8,6 +8,8 @@ import jaxrock as rk
 TALL = dict(width=5.0, height=50.0, youngs_modulus=30e9, density=2500.0)  # Diamantopoulos & Fragiadakis, figure 22
 SHORT = dict(width=5.0, height=25.0, youngs_modulus=30e9, density=2500.0)  # figure 23
 PULSE = rk.SinePulse(0.5, 1.6)
+# Options of XLA for columns that are many: by the hundred they run for longer than they are compiled.
+FOR_LONG = {"xla_backend_optimization_level": 1}
 
 
 def largest_survived(overturned, low, high):

@@ -448,7 +448,7 @@ def test_threads_at_once_answer_as_one_alone(tmp_path):
 
 @pytest.mark.slow
 def test_processes_and_threads_at_once_answer_as_one_alone():
-    found = threads.attack(30.0)
+    found = threads.attack(20.0)
     assert not found["wrong"] and min(found["asked"].values()) > 1 and sum(found["asked"].values()) > 64
 
 

@@ -15,7 +15,7 @@ from jaxrock.flexible.column import Column
 from jaxrock.flexible.nonlinear import NonlinearScene, scene_of
 from jaxrock.flexible.phases import rocking_phase
 from jaxrock.flexible.remainder import Tangents
-from references.flexible_column import PULSE, SHORT, TALL, Chain, largest_survived
+from references.flexible_column import FOR_LONG, PULSE, SHORT, TALL, Chain, largest_survived
 
 WHOLE = dict(base="sine", rotations="finite", p_delta=True)
 SAMPLES = 301  # of all histories: XLA compiles every number of times anew

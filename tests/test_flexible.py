@@ -16,7 +16,7 @@ from jaxrock.blocks.flexible import is_possible
 from jaxrock.flexible.closeness import approached, still_to_come
 from jaxrock.flexible.phases import Arc, Numbers, Phase, locked_phase, rocking_phase
 from jaxrock.flexible.stepper import FlexibleScene
-from references.flexible_column import PULSE, SHORT, TALL, beam, independent, largest_survived
+from references.flexible_column import FOR_LONG, PULSE, SHORT, TALL, beam, independent, largest_survived
 
 # ---------------------------------------------------------------- the column
 

@@ -1030,7 +1030,7 @@ def test_diffrax_as_xla_has_it(name, monkeypatch):
         *(pytest.param(x, marks=pytest.mark.slow) for x in ("vertical records", "two sides, exponential, vertical")),
     ],
 )
-def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
+def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch, caplog):
     """The knots of two motions are sorted once, and the blocks do the same as where XLA runs all of it."""
     given = np.full(20, 0.2), np.linspace(0.8, 2.0, 20)
 
@@ -1039,7 +1039,9 @@ def test_what_a_loop_does_not_change_comes_before_it(name, monkeypatch):
 
     own = lowered()
     monkeypatch.setattr(batching, "native", None)
-    by_xla = lowered()
+    with caplog.at_level(logging.DEBUG, "jaxrock"):
+        by_xla = lowered()
+    assert "is left to XLA: llvmlite is not installed" in caplog.text
     ours = re.compile(r"custom_call @jaxrock_[0-9a-f]{20}\b")
     assert ours.search(own.as_text()) and not ours.search(by_xla.as_text())
     np.testing.assert_allclose(own.compile()(*given), by_xla.compile()(*given), rtol=1e-9)

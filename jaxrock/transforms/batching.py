@@ -90,7 +90,10 @@ class Lanes:
     @functools.cached_property
     def in_machine_code(self) -> bool:
         """Whether machine code of our own runs it."""
-        if not self.on_cpu or self.portable or native is None or not self.recipe.in_lanes:
+        if not self.on_cpu or self.portable or not self.recipe.in_lanes:
+            return False
+        if native is None:
+            _LOG.debug("%s is left to XLA: llvmlite is not installed", self.recipe)
             return False
         try:
             self._plans()
