@@ -15,7 +15,7 @@ from jaxrock.flexible.column import Column
 from jaxrock.flexible.nonlinear import NonlinearScene, scene_of
 from jaxrock.flexible.phases import rocking_phase
 from jaxrock.flexible.remainder import Tangents
-from references.flexible_column import FOR_LONG, PULSE, SHORT, TALL, Chain, largest_survived
+from references.flexible_column import PULSE, SHORT, TALL, Chain, largest_survived
 
 WHOLE = dict(base="sine", rotations="finite", p_delta=True)
 SAMPLES = 301  # of all histories: XLA compiles every number of times anew
@@ -181,7 +181,7 @@ def by_amplitude():
 
         return jax.jvp(numbers, (amplitude,), (1.0,), has_aux=True)
 
-    return jax.jit(jax.vmap(one), compiler_options=FOR_LONG)
+    return jax.jit(jax.vmap(one))
 
 
 @pytest.mark.slow

@@ -330,7 +330,7 @@ def by_amplitude():
 
 
 @functools.cache
-def by_width():
+def by_width(for_long=False):
     """Largest rotation, displacement and bending, and the margin, of columns by width [m]; and their slopes by it."""
 
     def results(width, amplitude, modulus, damping, duration):
@@ -341,7 +341,7 @@ def by_width():
     def one(width, *given):
         return jax.jvp(lambda width: results(width, *given), (width,), (1.0,))
 
-    return jax.jit(jax.vmap(one), compiler_options=FOR_LONG)
+    return jax.jit(jax.vmap(one), compiler_options=FOR_LONG if for_long else None)
 
 
 @pytest.mark.parametrize("count", [16, pytest.param(200, marks=pytest.mark.slow)])
@@ -355,9 +355,10 @@ def test_slopes_of_largest_values_wherever_they_are(count):
         random.choice([0.005, 0.03, 0.1, 0.3, 0.9], count),
         random.choice([0.05, 0.4, 0.6, 0.9, 1.3], count),
     )
-    _, slopes = by_width()(np.ones(count), *given)
+    at = by_width(count > 100)
+    _, slopes = at(np.ones(count), *given)
     near, nearer = (
-        (by_width()(np.full(count, 1 + step), *given)[0] - by_width()(np.full(count, 1 - step), *given)[0]) / (2 * step)
+        (at(np.full(count, 1 + step), *given)[0] - at(np.full(count, 1 - step), *given)[0]) / (2 * step)
         for step in (1e-5, 1e-6)
     )
     smooth = np.isclose(near, nearer, rtol=1e-4, atol=1e-7)  # else there is a tie between, or the column is lost
