@@ -59,12 +59,13 @@ def test_a_solver_of_low_order_needs_an_absolute_tolerance():
 @pytest.mark.parametrize(
     "engine, tolerance",
     [
-        pytest.param(rk.Diffrax(solver=diffrax.Dopri8(), rtol=1e-9), 1e-8, id="Dopri8"),
-        pytest.param(rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)"),
+        pytest.param(rk.Diffrax(solver=diffrax.Dopri8(), rtol=1e-9), 1e-8, id="Dopri8", marks=pytest.mark.slow),
+        pytest.param(
+            rk.Diffrax(solver=diffrax.Kvaerno5(), rtol=1e-6), 1e-5, id="Kvaerno5 (implicit)", marks=pytest.mark.slow
+        ),
         pytest.param(rk.Diffrax(controller=diffrax.ConstantStepSize()), 1e-6, id="constant steps"),
     ],
 )
-@pytest.mark.slow  # fast: `test_engines_agree`, `test_a_controller_with_arrays`
 def test_any_solver(engine, tolerance):
     """Explicit, implicit, adaptive or not: the same response within the tolerance."""
     exact, found = rk.outcome(BLOCK, PULSE), rk.outcome(BLOCK, PULSE, engine=engine)

@@ -453,7 +453,7 @@ def soft_sensitivities(held, plain):
     "study, kind",
     [
         (soft_map, "series"),
-        pytest.param(soft_map, "functions", marks=pytest.mark.slow),
+        (soft_map, "functions"),
         (soft_suite, "series"),
         pytest.param(soft_critical, "series", marks=pytest.mark.slow),
         pytest.param(soft_sensitivities, "series", marks=pytest.mark.slow),

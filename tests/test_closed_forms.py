@@ -389,7 +389,7 @@ def engine_sine(intensity, ratio, e):
     return rk.outcome(rk.Block(ALPHA, 1.0, e), rk.SinePulse(ALPHA * intensity, 2 * jnp.pi / ratio), rk.Linear())
 
 
-QUICK = {(0.5, 0.9), (4.2, 0.9), (5.3, 1.0)}
+QUICK = {(0.5, 0.9), (1.05, 0.95), (4.2, 0.9), (5.3, 1.0)}
 
 
 @pytest.mark.parametrize("ratio, e", [

@@ -173,7 +173,7 @@ def of_two(tmp_path_factory):
     return dict(zip(sweeps, job(2, folder / "second", *sweeps.values()))), stores
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2, 4])
 def test_processes_share_a_sweep(request, tmp_path, alone, count):
     if count == 2:
         found = request.getfixturevalue("of_two")[0]["shared"]

@@ -209,11 +209,7 @@ def free(name):
     return jax.jit(one)
 
 
-@pytest.mark.parametrize(
-    "name, tolerance",
-    [("series", 1e-13), pytest.param("diffrax", 1e-6, marks=pytest.mark.slow)],  # fast: `test_dissipation`
-    ids=["series", "diffrax"],
-)
+@pytest.mark.parametrize("name, tolerance", [("series", 1e-13), ("diffrax", 1e-6)], ids=["series", "diffrax"])
 def test_energy_of_free_rocking(name, tolerance):
     """Between impacts the energy is constant; each impact leaves e^2 of it."""
 

@@ -100,7 +100,6 @@ def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
     np.testing.assert_allclose(evaluate(points)[1], differences, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.slow  # fast: slopes are slopes, above
 def test_a_likelihood_is_smooth_in_the_amplitude():
     """However rough the margin is: nodes do not move along."""
     amplitude = TRUTH["amplitude"] * np.exp(np.linspace(-0.5, 0.5, 1001))
@@ -483,7 +482,6 @@ def test_the_command_from_a_table_to_figures(tmp_path, capsys, monkeypatch):
     assert len(path.read_text().splitlines()) == 13  # what was read is left alone
 
 
-@pytest.mark.slow  # fast: `test_the_objective_is_that_of_the_likelihood` has priors, too
 def test_rocks_that_say_nothing_leave_what_was_known_before(tmp_path, capsys):
     """They cannot be moved in the range: the most probable motion and its intervals are those of the priors."""
     path = tmp_path / "rocks.csv"

@@ -41,7 +41,7 @@ def moments(log_density):
     return [(mean, np.sqrt(square - mean**2)) for mean, square in found]
 
 
-@pytest.mark.parametrize("log_density", [two_normals, pytest.param(banana, marks=pytest.mark.slow), half_normal])
+@pytest.mark.parametrize("log_density", [two_normals, banana, half_normal])
 def test_chains_have_the_moments_of_a_grid(log_density):
     random = np.random.default_rng(0)
     first = around(np.array([[0.0, 0.0]]), 0.05, 0.85, *BOX)

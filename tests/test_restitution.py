@@ -173,7 +173,6 @@ def test_a_law_that_does_not_change_is_a_number():
     np.testing.assert_allclose(plain.error, seeming.error, rtol=1e-6)
 
 
-@pytest.mark.slow  # fast: the laws with the series engine above, both engines in `test_engines_agree`
 def test_both_engines_agree():
     """Free stages by energy and by arcs, verdicts, peaks and margins."""
     few = [x[:40] for x in scenes(200)]
@@ -242,11 +241,7 @@ def test_impacts_that_end_rocking():
     assert 0 < int(found.impact_count) < int(constant.impact_count)
 
 
-@pytest.mark.parametrize(
-    "engine",
-    [ENGINES["series"], pytest.param(ENGINES["diffrax"], marks=pytest.mark.slow)],
-    ids=ENGINES,
-)
+@pytest.mark.parametrize("engine", [ENGINES["series"], ENGINES["diffrax"]], ids=ENGINES)
 def test_a_law_that_gains_energy_has_no_result(engine):
     found = rk.outcome(rk.Block(0.2, 2.0, Gaining()), PULSE, rk.Linear(), engine=engine)
     assert found.status == rk.Status.not_finite

@@ -311,10 +311,10 @@ def test_moments_whose_balance_is_not_known_are_refused(terms):
 @pytest.mark.parametrize(
     "arm",
     [
-        pytest.param(rk.models.Terms(constant=1.0), marks=pytest.mark.slow),
-        pytest.param(rk.models.Terms(constant=1.0, line=-0.3), marks=pytest.mark.slow),
+        rk.models.Terms(constant=1.0),
+        rk.models.Terms(constant=1.0, line=-0.3),
         rk.models.Terms(cosine=0.9, line=0.1),
-        pytest.param(rk.models.Terms(cosine=1.0), marks=pytest.mark.slow),
+        rk.models.Terms(cosine=1.0),
     ],
     ids=["constant", "line", "cosine and line", "cosine"],
 )
