@@ -4,7 +4,8 @@
 
 Times are processor seconds of all threads, and seconds on the wall, from after the imports of the package to the
 answer; of the command line, the whole process. Every question starts with an empty folder of kept programs; the second
-process finds what the first has left. `rk.keep_compiled()` is called. `--package` measures another copy.
+process finds what the first has left. `rk.keep_compiled()` is called. `--package` measures another copy. Peers are
+those of `peers.py`, from after their own imports to their answers.
 """
 
 import argparse
@@ -193,19 +194,59 @@ QUESTIONS = {
     "run": ("`jaxrock run`, whole process", ["run"], 8.0, 3.0),
     "invert": ("`jaxrock invert`, whole process", ["invert", "rocks.csv"], 20.0, 8.0),
 }  # fmt: skip
+# Peers, of `peers_solvers`: the table's words, what is imported before, and the code.
+_LOOP, _MANY = (
+    (
+        "from peers_solvers import scipy_loop as loop\n"
+        "motion, settings = loop.Sine(0.3, 2 * np.pi / 0.8), loop.settings_of(1e-6, 1e-8)\n"
+        "numbers = float(block.alpha), 2.0, float(block.restitution)\n"
+    ),
+    (
+        "from references.peer_problems import Problem\n"
+        "one = np.ones(1000)\n"
+        "scenes = 0.2 * one, 2 * one, 0.9 * one, np.linspace(1.25, 4.5, 1000), 2 * np.pi / 0.8 / 2 * one\n"
+        "problem = Problem('', '', 'nonlinear', 'sine', *scenes)\n"
+    ),
+)
+PEERS = {
+    "scipy": (
+        "a loop by SciPy, DOP853 at 1e-6, one pulse",
+        _LOOP,
+        "answer = loop.follow(*numbers, motion, False, settings)",
+    ),
+    "scipy_record": (
+        "the same, record",
+        _LOOP + "record = rk.example_record()\n"
+        "motion = loop.Record((1.5 * np.asarray(record.samples)).tolist(), float(record.dt), False)\n",
+        "answer = loop.follow(*numbers, motion, False, settings)",
+    ),
+    "numba": (
+        "Taylor series by hand in numba, 1,000 pulses",
+        _MANY + "from peers_solvers import numba_taylor as peer\n",
+        "answer = peer.ways(problem)[1][2]()",
+    ),
+    "event": (
+        "`diffrax.Event` under `vmap`, 1,000 pulses",
+        _MANY + "from peers_solvers import diffrax_loop as peer\n",
+        "answer = peer.ways(problem)[0][2](slice(None))",
+    ),
+}
+QUESTIONS |= {name: (words, code, None, None) for name, (words, _, code) in PEERS.items()}
 _ROCKS = "alpha_rad,p_rad_per_s,observed\n0.15,2.0,survived\n0.2,2.5,survived\n0.1,3.0,toppled\n0.25,1.8,survived\n"
 
 
 def measure(question: str, package: pathlib.Path, kept: str, folder: str) -> dict:
     """Times of one process."""
     code = QUESTIONS[question][1]
-    environment = os.environ | {"JAXROCK_CACHE": kept, "PYTHONPATH": str(package), "MPLBACKEND": "Agg"}
+    places = os.pathsep.join([str(package), str(HERE), str(HERE.parent)])
+    environment = os.environ | {"JAXROCK_CACHE": kept, "PYTHONPATH": places, "MPLBACKEND": "Agg"}
     if isinstance(code, list):
         pathlib.Path(folder, "rocks.csv").write_text(_ROCKS)
         words = [sys.executable, "-c", _COMMAND, *code, "--out", str(pathlib.Path(folder, "out"))]
     else:
         without = "import sys\nsys.modules['llvmlite'] = None\n" if question == "bare" else ""
-        words = [sys.executable, "-c", without + _BEGIN + code + _END]
+        peer = f"{PEERS[question][1]}\nready = spent()\n" if question in PEERS else ""
+        words = [sys.executable, "-c", without + _BEGIN + peer + code + _END]
     done = subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{question}: {done.stderr[-2000:]}")
