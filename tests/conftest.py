@@ -52,7 +52,7 @@ def pytest_configure(config):
         return
     importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
     # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
-    gc.set_threshold(1_000_000, 10, 10)
+    gc.set_threshold(4_000_000, 10, 10)
     quickly = "XLA_FLAGS" not in os.environ
     if quickly:
         importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
