@@ -272,9 +272,10 @@ LOWERED = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=SLOW) if x in ("histories", "by diffrax") else x for x in LOWERED]
-)
+LOWERED_SLOWLY = "under a record", "a map", "histories", "by diffrax"
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW) if x in LOWERED_SLOWLY else x for x in LOWERED])
 def test_programs_for_accelerators(name):
     """Lowered where there is none: no code for this processor in it, no call back to Python, of bounded size. One
     program is for all kinds of them."""
@@ -295,16 +296,13 @@ def test_nonsense_is_data_in_exported_programs():
         numbers = [x for x in jax.tree.leaves(result) if jnp.issubdtype(x.dtype, jnp.inexact)]
         return jnp.stack(numbers), result.status == rk.Status.successful, result.status == rk.Status.not_finite
 
-    like = jax.ShapeDtypeStruct((), jnp.float64)
-    for function, many in ((found, False), (jax.vmap(found), True)):
-        program = jax.export.export(jax.jit(function), platforms=["cpu"])
-        made = program(*[jax.ShapeDtypeStruct((4,), jnp.float64) if many else like] * 2)
-        rows = np.array([(0.3, 0.2), (np.nan, 0.2), (0.3, -0.2), (0.3, 2.0)])
-        numbers, good, none = made.call(*rows.T) if many else map(np.stack, zip(*(made.call(*row) for row in rows)))
-        np.testing.assert_array_equal(np.isnan(numbers), [[wrong] * len(numbers[0]) for wrong in (0, 1, 1, 1)])
-        np.testing.assert_array_equal(good, [True, False, False, False])
-        np.testing.assert_array_equal(none, ~np.asarray(good))
-        assert np.isclose(numbers[0], outcome(0.3), rtol=1e-12, atol=0).any()
+    program = jax.export.export(jax.jit(jax.vmap(found)), platforms=["cpu"])
+    rows = np.array([(0.3, 0.2), (np.nan, 0.2), (0.3, -0.2), (0.3, 2.0)])
+    numbers, good, none = program(*[jax.ShapeDtypeStruct((4,), jnp.float64)] * 2).call(*rows.T)
+    np.testing.assert_array_equal(np.isnan(numbers), [[wrong] * len(numbers[0]) for wrong in (0, 1, 1, 1)])
+    np.testing.assert_array_equal(good, [True, False, False, False])
+    np.testing.assert_array_equal(none, ~np.asarray(good))
+    assert np.isclose(numbers[0], outcome(0.3), rtol=1e-12, atol=0).any()
 
 
 def test_nonsense_raises_at_once_outside_of_jit():
@@ -378,7 +376,9 @@ RESULTS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW) if "column" in x else x for x in RESULTS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=SLOW) if "column" in x or "equation" in x else x for x in RESULTS]
+)
 def test_results_are_pickled_and_kept(name, tmp_path):
     found = RESULTS[name]()
     eqx.tree_serialise_leaves(tmp_path / "found", found)
@@ -392,6 +392,7 @@ def test_results_are_pickled_and_kept(name, tmp_path):
         np.testing.assert_array_equal(again(0.7)[0], found(0.7)[0])
 
 
+@pytest.mark.slow
 def test_a_history_by_a_function_that_is_not_what_it_was(monkeypatch):
     """Pickled by its name, as Python does it."""
     found = pickle.dumps(RESULTS["history by an equation of one's own"]())
