@@ -12,6 +12,9 @@ import sys
 import time
 from pathlib import Path
 
+if "without llvmlite" in "".join(sys.argv[1:2]):
+    sys.modules["llvmlite"] = None  # before anything imports it
+
 from common import table  # first: the search path
 from peers_solvers.report import surroundings
 
@@ -56,8 +59,6 @@ QUESTIONS = {
 def ask(question, way):
     """In this process: processor seconds of the first answer, of one to another number of rows, seconds of the next
     ones, and all numbers of the first."""
-    if "without llvmlite" in question:
-        sys.modules["llvmlite"] = None
     import jax
     import numpy as np
 
