@@ -25,6 +25,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxrock as rk
 from jaxrock.responses.arguments import _usual, start_of
+from jaxrock.transforms.differentiation import differentiable
 
 BLOCK = rk.Block(0.2, 2.0, 0.9)
 COLUMN = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02)
@@ -304,6 +305,13 @@ def test_nonsense_is_data_in_exported_programs():
     np.testing.assert_array_equal(good, [True, False, False, False])
     np.testing.assert_array_equal(none, ~np.asarray(good))
     assert np.isclose(numbers[0], outcome(0.3), rtol=1e-12, atol=0).any()
+
+
+def test_functions_of_whole_numbers_are_exported():
+    """None of them can be none."""
+    program = jax.export.export(jax.jit(differentiable(lambda n: {"twice": 2 * n, "half": n / 2})), platforms=["cpu"])
+    made = program(jax.ShapeDtypeStruct((), jnp.int64))
+    assert {name: float(x) for name, x in made.call(3).items()} == {"twice": 6, "half": 1.5}
 
 
 def test_nonsense_raises_at_once_outside_of_jit():

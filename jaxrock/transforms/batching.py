@@ -77,14 +77,15 @@ class Lanes:
     def _none_of_none(self, leaves, found: list) -> list:
         """Results, of which those of scenes with a number that is none are none: in exported programs nothing else says
         that it is nonsense that was asked for."""
-        structure = jax.tree.structure(self.recipe.results)
+        structure, count = jax.tree.structure(self.recipe.results), len(leaves) - self.recipe.directions
+        leaves = list(leaves[:count])  # a direction of change says nothing of the scene
 
         def marked(given, found):
             return jax.tree.leaves(marked_result(structure.unflatten(found), given))
 
         if self.size is None:
             return marked(leaves, found)
-        scenes = _Scenes(leaves, self.own, jax.tree.structure(list(leaves)))
+        scenes = _Scenes(leaves, self.own[:count], jax.tree.structure(leaves))
         return scenes.each(marked, scenes.own, found)
 
     @functools.cached_property
