@@ -394,13 +394,22 @@ def test_results_are_pickled_and_kept(name, tmp_path):
     found = RESULTS[name]()
     eqx.tree_serialise_leaves(tmp_path / "found", found)
     loaded = eqx.tree_deserialise_leaves(tmp_path / "found", found)
-    for again in (pickle.loads(pickle.dumps(found)), copy.deepcopy(found), loaded):
+    for again in (pickle.loads(pickle.dumps(found)), copy.deepcopy(found), copy.copy(found), loaded):
         assert jax.tree.structure(again) == jax.tree.structure(found)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
             np.testing.assert_array_equal(one, other)
     if name.startswith("history"):
         again = pickle.loads(pickle.dumps(found))
         np.testing.assert_array_equal(again(0.7)[0], found(0.7)[0])
+
+
+@pytest.mark.slow
+def test_a_history_is_pickled_by_the_function_that_it_is_of():
+    """Whatever function of the same program was asked for before."""
+    nameless = rk.models.Equation(lambda rotation, block: jnp.sin(block.alpha - rotation), arm)
+    for model in (nameless, rk.models.Equation(restoring, arm)):
+        found = rk.simulate(BLOCK, PULSE, model, samples=9)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found)).rotation, found.rotation)
 
 
 @pytest.mark.slow

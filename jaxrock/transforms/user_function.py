@@ -37,20 +37,6 @@ class ByIdentity(eqx.Module):
         return self.function(*arguments, **named)
 
 
-class _Origin:
-    """A function and what it was traced for, `told` where all that it reads is known, and nothing of it is traced.
-    Equal to any other, as the program tells all."""
-
-    def __init__(self, *told: Any):
-        self.told = told
-
-    def __hash__(self):
-        return 0
-
-    def __eq__(self, other):
-        return isinstance(other, _Origin)
-
-
 class UserFunction(eqx.Module):
     """A function as it was when it was traced. Made by `current_function`.
 
@@ -62,7 +48,6 @@ class UserFunction(eqx.Module):
     dtypes: tuple = eqx.field(static=True)
     arrays: tuple  # numbers that the function holds as a pytree, and arrays that it captures
     captured: tuple
-    origin: _Origin = eqx.field(static=True)
 
     @classmethod
     def of(cls, function: Callable, *arguments, **named) -> "UserFunction":
@@ -79,24 +64,29 @@ class UserFunction(eqx.Module):
         values, known = [*arrays, *leaves], reads(function)  # what is told so holds no arrays
         closed, told = traced(call, None if known is None else (known, structure), values)
         if closed in _known:
+            _note(_known[closed].program, (function, arguments, named))
             return _known[closed]
         jaxpr, rules = _with_own_arrays(closed.jaxpr), _rules(closed, call, values)
         program = Program(jaxpr, jax.tree.structure((told.results, told.failed)), told.messages, rules)
         dtypes = tuple(leaf.dtype for leaf in leaves)
-        origin = _Origin() if known is None else _Origin(function, arguments, named)
-        made = cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)), origin)
+        made = cls(program, structure, dtypes, tuple(map(_own, arrays)), tuple(map(_own, closed.consts)))
         if known is not None:
             _known[closed] = made
+            _note(program, (function, arguments, named))
         return made
 
     def __reduce__(self):
-        if not self.origin.told:
+        origin = _origins.get(self.program)
+        if origin is None or self.arrays:
             raise pickle.PicklingError("A function that holds arrays, or reads what may change, cannot be pickled.")
-        return _loaded, (*self.origin.told, self.program.fingerprint(()), self.captured)
+        return _loaded, (*origin, self.program.fingerprint(()), self.captured)
+
+    def __copy__(self):
+        return UserFunction(self.program, self.structure, self.dtypes, self.arrays, self.captured)
 
     def __deepcopy__(self, memo):
         arrays, captured = copy.deepcopy((self.arrays, self.captured), memo)
-        return UserFunction(self.program, self.structure, self.dtypes, arrays, captured, self.origin)
+        return UserFunction(self.program, self.structure, self.dtypes, arrays, captured)
 
     def __call__(self, *arguments, **named):
         """Evaluate it within a trace; checks that it makes are made, or put down, here."""
@@ -113,12 +103,28 @@ class UserFunction(eqx.Module):
 _known: weakref.WeakKeyDictionary[ClosedJaxpr, UserFunction] = weakref.WeakKeyDictionary()
 
 
+# What a program was traced from the last time, of the latest programs, for pickling: all that such a function reads is
+# known, and nothing of it is traced. Not in the pytree, of which `jax.jit` keeps the first that has the same program.
+_origins: dict[Program, tuple[Callable, tuple, dict]] = {}
+_MOST_ORIGINS = 64
+
+
+def _note(program: Program, origin: tuple[Callable, tuple, dict]) -> None:
+    _origins.pop(program, None)
+    _origins[program] = origin
+    for oldest in list(_origins)[:-_MOST_ORIGINS]:
+        _origins.pop(oldest, None)
+
+
 def _loaded(function: Callable, arguments: tuple, named: dict, told: str, captured: tuple) -> UserFunction:
     """A function that was pickled. **Raises:** ValueError where it computes something else now."""
     made = UserFunction.of(function, *arguments, **named)
     if made.program.fingerprint(()) != told:
-        raise ValueError("A function that was pickled computes something else now.")
-    return UserFunction(made.program, made.structure, made.dtypes, (), captured, made.origin)
+        raise ValueError(
+            "A function that was pickled computes something else now, or is traced otherwise: by another version of "
+            "JAX, or in another precision."
+        )
+    return UserFunction(made.program, made.structure, made.dtypes, (), captured)
 
 
 def current_function(function: Callable, *arguments, **named) -> UserFunction | ByIdentity:
