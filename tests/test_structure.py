@@ -389,6 +389,7 @@ SHARED = {
     "keeping.facts._known": "the same value, whoever puts it there, by one call of C",
     "transforms.fingerprint._known": "the same value, whoever puts it there, by one call of C",
     "transforms.user_function._known": "the same value, whoever puts it there, by one call of C",
+    "transforms.user_function._origins": "under a lock",
     "transforms.recipe._alike": "under a lock",
 }
 CHANGES = {"add", "append", "clear", "discard", "extend", "insert", "pop", "popitem", "remove", "setdefault", "update"}

@@ -13,6 +13,7 @@ JAX has kept of it.
 
 import copy
 import pickle
+import threading
 import weakref
 from collections.abc import Callable
 from typing import Any
@@ -106,14 +107,15 @@ _known: weakref.WeakKeyDictionary[ClosedJaxpr, UserFunction] = weakref.WeakKeyDi
 # What a program was traced from the last time, of the latest programs, for pickling: all that such a function reads is
 # known, and nothing of it is traced. Not in the pytree, of which `jax.jit` keeps the first that has the same program.
 _origins: dict[Program, tuple[Callable, tuple, dict]] = {}
-_MOST_ORIGINS = 64
+_MOST_ORIGINS, _one_at_a_time = 64, threading.Lock()
 
 
 def _note(program: Program, origin: tuple[Callable, tuple, dict]) -> None:
-    _origins.pop(program, None)
-    _origins[program] = origin
-    for oldest in list(_origins)[:-_MOST_ORIGINS]:
-        _origins.pop(oldest, None)
+    with _one_at_a_time:
+        _origins.pop(program, None)
+        _origins[program] = origin
+        for oldest in list(_origins)[:-_MOST_ORIGINS]:
+            del _origins[oldest]
 
 
 def _loaded(function: Callable, arguments: tuple, named: dict, told: str, captured: tuple) -> UserFunction:
