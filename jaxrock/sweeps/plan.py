@@ -10,8 +10,8 @@ from jaxrock.sweeps.labels import shape_of
 
 _CHUNK = 64  # neighbours that are dealt to a device together
 _TILE = 8  # and their extent along each of the last two axes of a grid
-# Lanes of a compiled call on a CPU, and how often such a call is made before a larger one is: each size is compiled, in
-# the time in which a hundred calls of the smaller ones run.
+# Lanes of a compiled call on a CPU, and how often such a call is made before a larger one is: each size is compiled,
+# which takes longer than these calls.
 _CALLS = {_CHUNK: 1, 2 * _CHUNK: 4, 2**10: 8, 2**14: math.inf}
 _GPU_LANES = 2**10, 2**16  # the least and the most, in powers of two
 _SMALLEST_BLOCK = 65536

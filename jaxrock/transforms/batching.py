@@ -94,7 +94,7 @@ class Lanes:
         if not self.on_cpu or self.portable or not self.recipe.in_lanes:
             return False
         if native is None:
-            _LOG.debug("%s is left to XLA: llvmlite is not installed", self.recipe)
+            _LOG.debug("%s is left to XLA: there is no llvmlite that can be loaded", self.recipe)
             return False
         try:
             self._plans()
