@@ -19,6 +19,7 @@ import json
 import os
 import shutil
 import tempfile
+import threading
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,7 @@ def pytest_configure(config):
         return
     importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
     # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
-    gc.set_threshold(4_000_000, 10, 10)
+    gc.set_threshold(1_000_000, 10, 10)
     quickly = "XLA_FLAGS" not in os.environ
     if quickly:
         importlib.import_module("jaxrock.keeping.compiled").compile_quickly()
@@ -64,6 +65,8 @@ def pytest_configure(config):
         )
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
     jax = importlib.import_module("jax")
+    if quickly:
+        _share_contexts(importlib.import_module("jax._src.interpreters.mlir"))
     if quickly and importlib.util.find_spec("llvmlite"):
         importlib.import_module("jaxrock.native.machine").EFFORT["for long"] = 0
     jax.config.update("jax_compilation_cache_dir", os.environ[_PLACE])
@@ -72,6 +75,30 @@ def pytest_configure(config):
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", 2)
     importlib.import_module("matplotlib").use("Agg")
+
+
+_PROGRAMS = 64  # of a context, which they make greater: it stays as long as one of them
+
+
+def _share_contexts(mlir):
+    """JAX makes a context of MLIR for each program, which takes 2.5 ms and 1.1 MB, and holds it as long as the program:
+    most of the memory that it takes. Here programs share some: each thread has one, and one more for each program that
+    is being made while another is, since what JAX makes then would come to stand in that other."""
+    made, current, mine = mlir.make_ir_context, mlir.ir.Context, threading.local()
+
+    def shared():
+        contexts = mine.__dict__.setdefault("contexts", [])  # with the programs that may still be made in each
+        around = getattr(current, "current", None)
+        level = 0 if around is None else 1 + max((n for n, (c, _) in enumerate(contexts) if c is around), default=-1)
+        if around is not None and not level:
+            return made()
+        context, left = contexts[level] if level < len(contexts) else (None, 0)
+        if not left:
+            context, left = made(), _PROGRAMS
+        contexts[level : level + 1] = [(context, left - 1)]
+        return context
+
+    mlir.make_ir_context = shared
 
 
 # Bytes that a worker holds before it forgets compiled programs, if it has grown by so many since it last did: after the
