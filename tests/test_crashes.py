@@ -386,7 +386,7 @@ def test_an_interrupted_save_leaves_nothing(tmp_path, grid, ending):
 
 
 @pytest.mark.slow  # fast: `test_a_killed_job_goes_on`, and a sweep of outcomes that is interrupted, above
-@pytest.mark.parametrize("number, count, block", [(2, 2, 400), (12, 4, 100)])
+@pytest.mark.parametrize("number, count, block", [(2, 2, 400), (8, 4, 100)])
 def test_killed_at_random(number, count, block):
     """Processes that share a job, and others that know nothing of each other: every file is as if undisturbed.
 
