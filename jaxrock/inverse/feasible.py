@@ -15,6 +15,7 @@ from jaxrock._parameters import shared
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood, as_program
 from jaxrock.inverse.observations import TOPPLED, Observations
 from jaxrock.models.equation import AbstractEquation
@@ -79,16 +80,14 @@ def feasible_region(
     rows, columns = (x.ravel() for x in np.meshgrid(*lists.values(), indexing="ij"))
     rest = {name: scalar(f"fixed[{name!r}]", finite(f"fixed[{name!r}]", x)) for name, x in (fixed or {}).items()}
     likelihood = likelihood.current((*lists, *rest))
-    bar, terms = Progress(rows.size, "region", progress), []
-    for begin in range(0, rows.size, _LANES):
-        parts = (x[begin : begin + _LANES] for x in (rows, columns))
-        count = min(_LANES, rows.size - begin)
-        parts = (np.pad(x, (0, _LANES - count), mode="edge") for x in parts)
-        motions: dict[str, ArrayLike] = {**dict(zip(lists, parts)), **rest}
-        found = as_program(Likelihood.terms, likelihood, motions, False)
-        terms.append(np.asarray(found)[:count].sum(axis=-1))
-        bar.add(count)
-    total = np.concatenate(terms).reshape(*(x.size for x in lists.values()))
+    bar = Progress(rows.size, "region", progress)
+
+    def likely(motions):
+        values: dict[str, ArrayLike] = {**dict(zip(lists, motions.T)), **rest}
+        return [jnp.sum(as_program(Likelihood.terms, likelihood, values, False), axis=-1)]
+
+    (found,) = in_batches(likely, np.stack([rows, columns], axis=1), _LANES, bar.add)
+    total = found.reshape(*(x.size for x in lists.values()))
     # Half the 95 % quantile of chi-square with two degrees of freedom, -ln 0.05.
     (first, second), (across, up) = lists, lists.values()
     return FeasibleRegion((first, second), (across, up), *placed((total, total > total.max() + np.log(0.05))))

@@ -20,6 +20,7 @@ from jaxrock._quickly import quickly
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.batches import in_batches
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.motions.record import Record
 from jaxrock.responses.outcome import outcome
@@ -55,12 +56,7 @@ class Site(eqx.Module):
     def margins(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of all blocks under any number of changes, (changes, n): (changes, blocks), and whether each is known;
         one compiled program serves for all."""
-        found = []
-        for begin in range(0, len(changes), _LANES):
-            part = changes[begin : begin + _LANES]
-            padded = np.pad(part, ((0, _LANES - len(part)), (0, 0)), mode="edge")
-            found.append([np.asarray(x)[: len(part)] for x in _margins(self, padded)])
-        margins, known = (np.concatenate(x) for x in zip(*found))
+        margins, known = in_batches(lambda part: _margins(self, part), changes, _LANES)
         return margins, known
 
 

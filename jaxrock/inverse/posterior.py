@@ -20,13 +20,14 @@ from jaxrock._checks import inner_share, scalar
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
+from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.densities import LogDensity
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
 from jaxrock.inverse.likelihood import Likelihood
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.samplers import rounds_of
 from jaxrock.inverse.scatter import NODES
-from jaxrock.inverse.unknowns import Problem, Unknown, in_batches
+from jaxrock.inverse.unknowns import Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.pulses import UNITS

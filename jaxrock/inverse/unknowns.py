@@ -13,6 +13,7 @@ from jaxrock._arguments import arguments, pair
 from jaxrock._checks import finite, positive, scalar, shown
 from jaxrock._described import described
 from jaxrock._quickly import quickly
+from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
@@ -156,20 +157,6 @@ def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real
     return value, back(jnp.ones_like(value))[0], facts
 
 
-def in_batches(
-    function: Callable, places: np.ndarray, lanes: int, progress: Callable[[int], None] = lambda more: None
-) -> list[np.ndarray]:
-    """Results of `function`, each (n, ...), at any number of places, (n, parameters): so many of them at a time that
-    one compiled program serves for all."""
-    results = []
-    for begin in range(0, len(places), lanes):
-        part = places[begin : begin + lanes]
-        padded = np.pad(part, ((0, lanes - len(part)), (0, 0)), mode="edge")
-        results.append([np.asarray(x)[: len(part)] for x in function(padded)])
-        progress(len(part))
-    return [np.concatenate(x) for x in zip(*results)]
-
-
 class Evaluator:
     """Values and slopes at any number of points, in batches of one compiled program; it counts.
 
@@ -206,7 +193,7 @@ class Evaluator:
     def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
         """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
-        return tuple(np.asarray(x)[0] for x in _batch(self.problem, jnp.asarray(np.tile(place, (_LANES, 1))))[2])
+        return tuple(x[0] for x in in_batches(lambda part: _batch(self.problem, part)[2], place[None], _LANES))
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of points."""
