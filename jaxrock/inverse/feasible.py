@@ -82,9 +82,9 @@ def feasible_region(
     likelihood = likelihood.current((*lists, *rest))
     bar = Progress(rows.size, "region", progress)
 
-    def likely(motions):
+    def likely(motions, wanted):
         values: dict[str, ArrayLike] = {**dict(zip(lists, motions.T)), **rest}
-        return [jnp.sum(as_program(Likelihood.terms, likelihood, values, False), axis=-1)]
+        return [np.sum(as_program(Likelihood.terms, likelihood, values, False, wanted), axis=-1)]
 
     (found,) = in_batches(likely, np.stack([rows, columns], axis=1), _LANES, bar.add)
     total = found.reshape(*(x.size for x in lists.values()))

@@ -48,7 +48,8 @@ from jaxrock.status import Status
 from jaxrock.transforms.user_function import ByIdentity, UserFunction, current_function
 
 Real = Inexact[Array, "..."]
-_Found = tuple[Real, Bool[Array, "..."], Bool[Array, "..."]]  # margin and rotation, overturned, known
+Flags = Bool[Array, "..."]
+_Found = tuple[Real, Flags, Flags]  # margin and rotation, overturned, known
 _NO_STRENGTH = 1e-30  # [g]
 _FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
 
@@ -116,9 +117,9 @@ class Likelihood(eqx.Module):
         """
         return self._compiled(Likelihood.terms, values, slopes)
 
-    def terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
-        """What `log_terms` returns, within a program."""
-        possible, impossible = self._possible(values, slopes)
+    def terms(self, values: Mapping[str, ArrayLike], slopes: bool = True, wanted: Flags | None = None) -> Real:
+        """What `log_terms` returns, within a program; of motions that are not `wanted`, (...), nothing is computed."""
+        possible, impossible = self._possible(values, slopes, wanted)
         return self._terms(self._log_probabilities(possible), impossible)
 
     def _compiled(self, what: Callable, values: Mapping[str, ArrayLike], *how):
@@ -137,7 +138,7 @@ class Likelihood(eqx.Module):
         ends = jnp.full_like(density[:1], _FLAT)
         return possible.log_probabilities(jnp.where(seen.seen == ROTATION, jnp.concatenate([ends, density, ends]), 0.0))
 
-    def _terms(self, logarithms: Real, impossible: Bool[Array, "..."]) -> Real:
+    def _terms(self, logarithms: Real, impossible: Flags) -> Real:
         seen = self.observations
         _, topples, measured = logarithms
         terms = jnp.where(seen.seen == TOPPLED, topples, measured)
@@ -167,10 +168,12 @@ class Likelihood(eqx.Module):
         possible = self._possible(values)[0]
         return self._surprise(possible, possible.log_probabilities())
 
-    def terms_and_facts(self, values: Mapping[str, ArrayLike]) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
+    def terms_and_facts(
+        self, values: Mapping[str, ArrayLike], wanted: Flags | None = None
+    ) -> tuple[Real, tuple[Real, Real, Real, Real, Real]]:
         """What `log_terms`, and `survival`, the share of scenes that were computed, and `surprise` return; for the cost
-        of the first. Within a program."""
-        possible, impossible = self._possible(values, slopes=True)
+        of the first. Within a program; of motions that are not `wanted`, (...), nothing is computed."""
+        possible, impossible = self._possible(values, True, wanted)
         logarithms = self._log_probabilities(possible)
         facts = jnp.exp(logarithms[0]), possible.share_known, *self._surprise(possible, logarithms)
         return self._terms(logarithms, impossible), facts
@@ -192,9 +195,11 @@ class Likelihood(eqx.Module):
         measured = jnp.where((seen.seen == ROTATION) & (total > 1e-6), 0.5, 0.0)
         return badness + measured * (seen.rotation - centre) ** 2 / spread, mean + measured, variance + measured
 
-    def _possible(self, values: Mapping[str, ArrayLike], slopes: bool = False) -> tuple[Possible, Bool[Array, "..."]]:
+    def _possible(
+        self, values: Mapping[str, ArrayLike], slopes: bool = False, wanted: Flags | None = None
+    ) -> tuple[Possible, Flags]:
         """What becomes of every rock in every possible scene, with first derivatives, if `slopes`; and whether there is
-        no such motion."""
+        no such motion, or none that is `wanted`."""
         seen, names = self.observations, tuple(values)
         parameters = jnp.stack(jnp.broadcast_arrays(*(as_real(name, x) for name, x in values.items())), axis=-1)
         if not slopes:
@@ -203,6 +208,9 @@ class Likelihood(eqx.Module):
         strength, impossible = jax.vmap(lambda x: self._strength(names, x))(parameters.reshape(-1, len(names)))
         strength, impossible = strength.reshape(outer), impossible.reshape(outer)
         levels, where = levels_around(seen, self.scatter, strength)
+        if wanted is not None:  # a scene of no strength that is a number ends at once
+            levels = levels._replace(strength=jnp.where(wanted[..., None], levels.strength, jnp.nan))
+            impossible |= ~wanted
         shape = (*levels.strength.shape[:-1], *seen.ways.shape)
 
         def lanes(x):

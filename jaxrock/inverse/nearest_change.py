@@ -56,17 +56,22 @@ class Site(eqx.Module):
     def margins(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of all blocks under any number of changes, (changes, n): (changes, blocks), and whether each is known;
         one compiled program serves for all."""
-        margins, known = in_batches(lambda part: _margins(self, part), changes, _LANES)
+        margins, known = in_batches(lambda *part: _margins(self, *part), changes, _LANES)
         return margins, known
 
 
 @quickly(eqx.filter_jit, follows_scenes=True)
 def _margins(
-    site: Site, changes: Float[ArrayLike, "lanes n"]
+    site: Site, changes: Float[ArrayLike, "lanes n"], wanted: Bool[ArrayLike, " lanes"]
 ) -> tuple[Float[Array, "lanes blocks"], Bool[Array, "lanes blocks"]]:
     own = jax.tree.map(lambda whole: None if whole else 0, shared(site.blocks))
     of_all = jax.vmap(site.margin, in_axes=(own, None))
-    return jax.vmap(lambda change: of_all(site.blocks, change))(changes)
+
+    def of_one(change, wanted):  # under a record that is none a scene ends at once
+        margins, known = of_all(site.blocks, jnp.where(wanted, change, jnp.nan))
+        return jnp.where(wanted, margins, 0.0), known & wanted
+
+    return jax.vmap(of_one)(changes, wanted)
 
 
 @quickly(eqx.filter_jit, follows_scenes=True)

@@ -249,8 +249,8 @@ def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _W
 
 
 @eqx.filter_jit
-def _log_density(problem: Problem, places: Real) -> Real:
-    return problem.log_density(places, slopes=False)
+def _log_density(problem: Problem, places: Real, wanted: Bool[Array, " lanes"]) -> Real:
+    return problem.log_density(places, slopes=False, wanted=wanted)
 
 
 class _Density:
@@ -261,7 +261,7 @@ class _Density:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         self.count += len(places)
-        (density,) = in_batches(lambda part: [_log_density(self.problem, part)], places, _LANES)
+        (density,) = in_batches(lambda *part: [_log_density(self.problem, *part)], places, _LANES)
         return np.where(np.isnan(density), -np.inf, density)
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 
 from jaxrock._arguments import arguments, pair
 from jaxrock._checks import finite, positive, scalar, shown
@@ -17,6 +17,7 @@ from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood
 
 Real = Inexact[Array, "..."]
+Flags = Bool[Array, "..."]
 _LANES = 4  # points in one call of the compiled program
 _FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
 
@@ -140,16 +141,17 @@ class Problem(eqx.Module):
         priors = [unknown.log_prior(places[..., i]) for i, unknown in enumerate(self.unknowns.values())]
         return sum(priors[1:], start=priors[0])
 
-    def log_density(self, places: Real, slopes: bool = True) -> Real:
-        """Log-likelihood and log-prior (by the places) at places, (..., parameters); with first derivatives."""
-        terms = self.likelihood.terms(self.values(places), slopes)
+    def log_density(self, places: Real, slopes: bool = True, wanted: Flags | None = None) -> Real:
+        """Log-likelihood and log-prior (by the places) at places, (..., parameters), or those that are `wanted`; with
+        first derivatives."""
+        terms = self.likelihood.terms(self.values(places), slopes, wanted)
         return jnp.sum(terms, axis=-1) + self.log_prior(places)
 
 
 @quickly(eqx.filter_jit, follows_scenes=True)
-def _batch(problem: Problem, places: Real) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
+def _batch(problem: Problem, places: Real, wanted: Flags) -> tuple[Real, Real, tuple[Real, Real, Real, Real, Real]]:
     def density(places):
-        terms, facts = problem.likelihood.terms_and_facts(problem.values(places))
+        terms, facts = problem.likelihood.terms_and_facts(problem.values(places), wanted)
         return jnp.sum(terms, axis=-1) + problem.log_prior(places), facts
 
     # The places do not depend on one another, so that the slopes of the sum are those of each.
@@ -176,7 +178,7 @@ class Evaluator:
 
     def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and slopes at places, and by them."""
-        values, slopes = in_batches(lambda part: _batch(self.problem, part)[:2], places, _LANES, self.progress)
+        values, slopes = in_batches(lambda *part: _batch(self.problem, *part)[:2], places, _LANES, self.progress)
         self.note(places, values)
         return values, slopes
 
@@ -193,7 +195,7 @@ class Evaluator:
     def facts(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
         """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
-        return tuple(x[0] for x in in_batches(lambda part: _batch(self.problem, part)[2], place[None], _LANES))
+        return tuple(x[0] for x in in_batches(lambda *part: _batch(self.problem, *part)[2], place[None], _LANES))
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of points."""
