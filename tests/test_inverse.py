@@ -4,6 +4,7 @@ import re
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from jaxrock.inverse.observations import SEEN
 from jaxrock.inverse.posterior import _within
 from jaxrock.inverse.profile_likelihood import shape_at
 from jaxrock.inverse.scatter import Possible, levels_around, rocks_at
-from jaxrock.inverse.unknowns import Evaluator, Problem
+from jaxrock.inverse.unknowns import Evaluator, Problem, _batch
 from jaxrock.numerics.climb import climb
 
 # All tests have twelve rocks and a sine pulse, so that they share one compiled program.
@@ -98,6 +99,28 @@ def test_survivors_far_inside_say_nothing_and_slopes_are_slopes():
     values = [[evaluate(points + s * step)[0] for s in (1, -1)] for step in steps]
     differences = np.array([(up - down) / 2e-6 for up, down in values]).T
     np.testing.assert_allclose(evaluate(points)[1], differences, rtol=1e-4, atol=1e-4)
+
+
+def test_what_fills_up_a_batch_is_not_computed_and_changes_nothing():
+    evaluate, places = evaluator(rocks(["survived", "toppled"] * 6)), np.log(np.geomspace([0.1, 0.3], [1.0, 2.0], 4))
+    all_at_once = evaluate.at(places)
+    for name, whole, part in zip(("values", "slopes"), all_at_once, evaluate.at(places[:3])):
+        np.testing.assert_array_equal(whole[:3], part, name)
+    values, slopes, (_, known, *_) = _batch(evaluate.problem, places, np.arange(4) < 3)
+    np.testing.assert_array_equal(values[:3], all_at_once[0][:3])
+    assert values[3] == -np.inf and not slopes[3].any()
+    np.testing.assert_array_equal(known, [[1.0] * 12] * 3 + [[0.0] * 12])
+
+
+def test_a_motion_of_ones_own_is_asked_for_places_that_are_looked_at():
+    """Nothing else: it may refuse what is no number."""
+
+    def motion(amplitude, period):
+        return rk.SinePulse(amplitude, eqx.error_if(period, ~(period > 0.1), "no period"))
+
+    likelihood = rk.inverse.Likelihood(rocks(["survived", "toppled"] * 6), motion, SCATTER)
+    found = Evaluator(Problem(likelihood, UNKNOWNS)).at(np.log([[0.35, 0.8]]))[0]
+    np.testing.assert_allclose(found, evaluator(likelihood.observations).at(np.log([[0.35, 0.8]]))[0], rtol=1e-12)
 
 
 def test_a_likelihood_is_smooth_in_the_amplitude():

@@ -229,7 +229,7 @@ class Likelihood(eqx.Module):
             real, lost, known = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
         margin, rotation, lost, known = (x.reshape(shape) for x in (*real.T, lost, known))
         verge = jnp.broadcast_to((levels.alpha * seen.weaker_alpha / seen.alpha)[..., None, :], shape)
-        rotation = jnp.where(known, rotation, 0.0)
+        margin, rotation = (jnp.where(known, x, 0.0) for x in (margin, rotation))
         return Possible.of(where[..., None, :], margin, rotation, known, lost, verge), impossible
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
