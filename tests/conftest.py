@@ -65,7 +65,7 @@ def pytest_configure(config):
         )
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
     jax = importlib.import_module("jax")
-    if quickly:
+    if quickly and jax.__version_info__ < (0, 12):
         _share_contexts(importlib.import_module("jax._src.interpreters.mlir"))
     if quickly and importlib.util.find_spec("llvmlite"):
         importlib.import_module("jaxrock.native.machine").EFFORT["for long"] = 0
@@ -81,14 +81,14 @@ _PROGRAMS = 64  # of a context, which they make greater: it stays as long as one
 
 
 def _share_contexts(mlir):
-    """JAX makes a context of MLIR for each program, which takes 2.5 ms and 1.1 MB, and holds it as long as the program:
-    most of the memory that it takes. Here programs share some: each thread has one, and one more for each program that
+    """JAX before 0.12 makes a context of MLIR for each program, which takes 2.5 ms and 1.1 MB, and holds it as long as
+    the program: most of the memory that it takes. Here programs of a thread share some: one more for each program that
     is being made while another is, since what JAX makes then would come to stand in that other."""
     made, current, mine = mlir.make_ir_context, mlir.ir.Context, threading.local()
 
     def shared():
         contexts = mine.__dict__.setdefault("contexts", [])  # with the programs that may still be made in each
-        around = getattr(current, "current", None)
+        around = current.current
         level = 0 if around is None else 1 + max((n for n, (c, _) in enumerate(contexts) if c is around), default=-1)
         if around is not None and not level:
             return made()
