@@ -1,8 +1,7 @@
 """All tests run in double precision, on two devices, so that surfaces are shared out.
 
-Shapes in annotations are checked on every call, where a module states any, and but for the innermost arithmetic: its
-functions are called thousands of times while a program is traced, and a check takes longer than what it checks. With
-JAXROCK_CHECK_ALL=1 they are checked everywhere.
+Shapes in annotations are checked where a module states any, of the first calls of every function, and seldom after
+them (`references.checked_shapes`). With JAXROCK_CHECK_ALL=1 all calls are checked, in all modules.
 
 XLA compiles as after `keep_compiled`, and then as quickly as it can, since nearly every program runs once: that takes
 half of the time or less. LLVM does so with machine code of our own, whose numbers are the same to the bit
@@ -25,7 +24,7 @@ from pathlib import Path
 import pytest
 from _pytest.runner import pytest_runtest_protocol as protocol
 
-INNERMOST = {"polynomial", "expansion", "lookup", "elementary"}
+_CHECK_ALL = os.environ.get("JAXROCK_CHECK_ALL") == "1"
 
 
 def checked_modules():
@@ -33,7 +32,7 @@ def checked_modules():
     package = Path(importlib.util.find_spec("jaxrock").origin).parent
     for path in sorted(package.rglob("*.py")):
         shapes = "from jaxtyping import" in path.read_text()
-        if os.environ.get("JAXROCK_CHECK_ALL") == "1" or (shapes and path.stem not in INNERMOST):
+        if _CHECK_ALL or shapes:
             yield ".".join(["jaxrock", *path.relative_to(package).with_suffix("").parts])
 
 
@@ -51,7 +50,10 @@ def pytest_configure(config):
     """Get ready to run tests; what only deals them out to others needs nothing of that."""
     if config.getoption("tx", None) and config.getoption("dist") != "no" and not config.option.collectonly:
         return
-    importlib.import_module("references.checked_shapes").check_shapes(list(checked_modules()))
+    shapes = importlib.import_module("references.checked_shapes")
+    if _CHECK_ALL:
+        shapes.SELDOM["every"] = 1
+    shapes.check_shapes(list(checked_modules()))
     # Programs of a hundred thousand operations are traced, and little of what that makes is garbage: look less often.
     gc.set_threshold(1_000_000, 10, 10)
     quickly = "XLA_FLAGS" not in os.environ

@@ -6,9 +6,10 @@ import inspect
 import jax.numpy as jnp
 import pytest
 from beartype.roar import BeartypeCallHintParamViolation, BeartypeCallHintReturnViolation
+from jaxtyping import Array, Float
 
 from jaxrock.inverse.calibration_grid import weighed
-from references import typed_use
+from references import checked_shapes, typed_use
 
 PARTS = [
     name for name, part in vars(typed_use).items() if inspect.isfunction(part) and part.__module__ == typed_use.__name__
@@ -33,9 +34,30 @@ def test_types_are_what_checkers_are_told(name, tmp_path, monkeypatch):
 
 
 def test_shapes_are_checked_of_what_is_given_and_returned():
-    """See `references.checked_shapes`; two functions of the package stand for all."""
-    assert weighed(jnp.ones((2, 3)), [jnp.ones(3)]).shape == (2,)
+    """See `references.checked_shapes`; a function of the package stands for all."""
+    function = inspect.unwrap(weighed)
+    assert function is not weighed  # while tests run
+    fresh = checked_shapes.checked(function)
+    assert fresh(jnp.ones((2, 3)), [jnp.ones(3)]).shape == (2,)
     with pytest.raises(BeartypeCallHintParamViolation, match="parameter shares"):
-        weighed(jnp.ones(()), [])
+        fresh(jnp.ones(()), [])
     with pytest.raises(BeartypeCallHintReturnViolation, match="return"):
-        weighed(jnp.ones((2, 3)), [])
+        fresh(jnp.ones((2, 3)), [])
+
+
+def test_shapes_are_checked_seldom_of_what_is_called_often(monkeypatch):
+    def calls(of):
+        function, told = checked_shapes.checked(identity), []
+        for number in range(of):
+            try:
+                function(None)
+            except BeartypeCallHintParamViolation:
+                told.append(number)
+        return told
+
+    def identity(x: Float[Array, " n"]):
+        return x
+
+    assert calls(100) == [*range(64), 64, 80, 96]
+    monkeypatch.setitem(checked_shapes.SELDOM, "every", 1)
+    assert calls(100) == list(range(100))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from jaxrock._arguments import arguments
 from jaxrock.blocks.restitution import Constant
@@ -70,7 +71,7 @@ class Equation(AbstractEquation):
         alone, pushed = (self._acceleration(zero, zero, push, as_functions_see(block)) for push in (zero, zero + 1))
         return -alone, alone - pushed
 
-    def faults(self, block: Block | Side) -> dict[str, Scalar]:
+    def faults(self, block: Block | Side) -> dict[str, Bool[Array, ""]]:
         """What is wrong with the functions just after uplift, and at half the slenderness, in words, and whether it
         is."""
         zero = jnp.zeros_like(block.alpha)

@@ -131,7 +131,7 @@ def derivative(coefficients: list[Scalar]) -> list[Scalar]:
     return [k * c for k, c in enumerate(coefficients)][1:]
 
 
-def horner(coefficients: list[Scalar], x: Scalar) -> Scalar:
+def horner(coefficients: list[Scalar], x: Scalar | float) -> Scalar:
     """Value of a polynomial at x."""
     return polynomial(x, *coefficients, derivatives=0)[0]
 
