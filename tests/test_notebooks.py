@@ -6,6 +6,7 @@ import inspect
 import re
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 import jaxrock as rk
@@ -16,42 +17,55 @@ nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-# Minutes of compilation, of what `test_arcs`, `test_block_calibration`, `test_borders`, `test_closed_forms`,
-# `test_critical`, `test_derivatives`, `test_asymmetric_rocks`, `test_flexible`, `test_found_record`, `test_hazard`,
-# `test_histories`, `test_inverse`, `test_rolling`, `test_search`, `test_similarity`, `test_spectra`, `test_springs`
-# and `test_suite_outcomes` judge. All of them are asked for names and arguments by `test_what_notebooks_call_there_is`.
-SLOW = {
+# What takes seconds. In kernels of their own all of them take minutes, of what `test_arcs`, `test_asymmetric_rocks`,
+# `test_block_calibration`, `test_borders`, `test_closed_forms`, `test_critical`, `test_derivatives`, `test_flexible`,
+# `test_found_record`, `test_hazard`, `test_histories`, `test_inverse`, `test_rolling`, `test_search`,
+# `test_similarity`, `test_spectra`, `test_springs` and `test_suite_outcomes` judge; and all are asked for names and
+# arguments by `test_what_notebooks_call_there_is`.
+SHORT = {
+    "01_a_block_in_an_earthquake",
     "02_who_overturns",
-    "03_a_block_of_your_own",
     "04_single_lobe_pulses",
-    "05_one_sine_pulse",
-    "06_similarity",
-    "07_sensitivity",
-    "08_recover_a_pulse",
-    "09_published_rocks",
     "10_hazard_curve_rejection",
     "11_fit_a_history",
-    "16_fit_it_yourself",
-    "12_strength_duration_shape",
-    "13_spring_models",
-    "14_flexible_blocks",
     "15_calibrate_a_block",
-    "17_the_critical_record",
-    "18_a_museum_and_its_basement",
-    "19_which_intensity_measure",
-    "20_from_mesh_to_fragility",
     "errata",
 }
 
 
-def rows():
-    for path in NOTEBOOKS:
-        yield pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem in SLOW else ())
+def each(paths):
+    """Decorate a test with notebooks."""
+    return pytest.mark.parametrize("path", paths, ids=lambda path: path.stem)
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("path", list(rows()))
+@each([path for path in NOTEBOOKS if path.stem in SHORT])
+def test_cells_of_a_notebook(path, monkeypatch):
+    """In this process, with what it has compiled."""
+    monkeypatch.chdir(path.parent)  # where its data are
+    notebook, names = nbformat.read(path, as_version=4), {"__name__": "__main__"}
+    with_fewer_points(notebook)
+    with plt.rc_context():
+        for cell in notebook.cells:
+            if cell.cell_type == "code":
+                shown(cell.source, path.name, names)
+    plt.close("all")
+
+
+def shown(source, where, names):
+    """Run a cell; what stands in its last line is written, as a notebook does it."""
+    program = ast.parse(source)
+    last = ast.Expression(program.body.pop().value) if isinstance(program.body[-1], ast.Expr) else None
+    exec(compile(program, where, "exec"), names)
+    if last is not None:
+        print(repr(eval(compile(last, where, "eval"), names)))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@each(NOTEBOOKS)
 def test_notebook(path, monkeypatch, tmp_path_factory):
+    """In a kernel of its own."""
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path_factory.getbasetemp() / "kept for notebooks"))
     notebook = nbformat.read(path, as_version=4)
     with_fewer_points(notebook)
@@ -68,7 +82,7 @@ def called(tree):
             yield ast.unparse(node.func), [keyword.arg for keyword in node.keywords if keyword.arg]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@each(NOTEBOOKS)
 def test_what_notebooks_call_there_is(path):
     """Names of the package and of arguments, without running anything."""
     code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
@@ -95,7 +109,7 @@ def with_fewer_points(notebook):
             cell.source = re.sub(rf"^{name} = \d+", f"{name} = {number}", cell.source, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@each(NOTEBOOKS)
 def test_what_readers_see(path):
     """A title, sizes that are stated once, data in files, and what was drawn."""
     cells = nbformat.read(path, as_version=4).cells
