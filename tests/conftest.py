@@ -105,7 +105,7 @@ def _share_contexts(mlir):
 
 # Bytes that a worker holds before it forgets compiled programs, if it has grown by so many since it last did: after the
 # last test of a file, and within one, where the next test may need what was compiled for this.
-_AFTER_A_FILE, _WITHIN, _LEAST_GROWTH = 1.25e9, 1.36e9, 2e8
+_AFTER_A_FILE, _WITHIN, _LEAST_GROWTH = 1.3e9, 1.4e9, 2e8
 _MOST_MAPS = 30_000
 _TESTS = 50  # after so many it is looked how many maps there are, for to read them takes as long as a small test
 _held, _left = [0.0], [_TESTS]  # bytes after they were last forgotten; tests until maps are looked at

@@ -181,7 +181,7 @@ def test_files_that_nobody_saved_are_refused(tmp_path, ending):
         rk.studies.Grid.load(path)
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, pytest.param(120, marks=pytest.mark.slow)])
 def test_damaged_at_random(count):
     """By kept seeds: stores and saved grids, of outcomes; the long one has 72 stores, and had 504 by hand."""
     found = damage.attack(count)
@@ -352,7 +352,7 @@ def often_interrupted(function, takes, wanted, seed):
         came = interrupted(function, takes * rng.random())
         often, takes = often + came, takes if came else 0.8 * takes
         yield
-    gc.collect()  # what was left open is found now, where it may be, and not in the midst of another test
+    gc.collect(1)  # what was left open is found now, where it may be, and not in the midst of another test
 
 
 def seconds(function):

@@ -468,7 +468,7 @@ def test_neighbours_answer_alike():
 
     Of these one in sixty had a peak that was 3e-8 of it too large, where such a piece was taken for one of a second.
     """
-    block, near = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02), np.linspace(-5e-14, 5e-14, 201)
+    block, near = rk.blocks.FlexibleBlock(0.6, 3.0, 30e9, 2500.0, 0.02), np.linspace(-5e-14, 5e-14, 121)
     # One by one: compiled above; until after its peak.
     found = [rk.outcome(block, rk.SinePulse(0.266 * (1 + x), 0.8), duration=1.6) for x in near]
     peaks, energies = np.array([(float(each.max_rotation), float(each.energy)) for each in found]).T
