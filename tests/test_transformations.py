@@ -307,6 +307,18 @@ def test_nonsense_is_data_in_exported_programs():
     assert np.isclose(numbers[0], outcome(0.3), rtol=1e-12, atol=0).any()
 
 
+def test_slopes_of_many_are_those_of_one_and_each_is_computed_once():
+    """Of one scene alone directions are scenes; a derivative does not know that it will be one of many."""
+
+    def peak(x):
+        return rk.outcome(rk.Block(0.2, x[0], x[1]), rk.SinePulse(x[2], 0.8), **QUICK).max_rotation
+
+    rows = np.linspace([1.5, 0.85, 0.2], [3.0, 0.95, 0.4], 7)
+    slopes = jax.vmap(jax.jit(jax.grad(peak)))
+    assert set(re.findall(r"size=(\w+)", str(jax.make_jaxpr(slopes)(rows)))) == {"7"}
+    np.testing.assert_allclose(slopes(rows), [jax.grad(peak)(row) for row in rows], rtol=1e-10, atol=1e-12)
+
+
 def test_functions_of_whole_numbers_are_exported():
     """None of them can be none."""
     program = jax.export.export(jax.jit(differentiable(lambda n: {"twice": 2 * n, "half": n / 2})), platforms=["cpu"])

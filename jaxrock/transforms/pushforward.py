@@ -20,7 +20,7 @@ from jaxrock.numerics.compound import changed, is_compound
 from jaxrock.transforms.partials import MINUS_ONE, MOVED, OF_SOME, ONE, PARTIALS, STILL, Over, number
 
 _SMALL = 20  # operations of a program within that is written out wherever it stands
-_PARTS = ("split", "unstack", "scenes")  # operations of many results, all of which change
+_PARTS = ("split", "unstack", "scenes", "scene_alone")  # operations of many results, all of which change
 _WITHIN = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}  # programs that only stand there, and where
 
 

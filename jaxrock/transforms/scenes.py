@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxrock._abstract import summed_like, typed_like
+from jaxrock._abstract import summed_like, typed_like, without_mesh
 from jaxrock.transforms.forward_mode import (
     directions_of,
     in_rows,
@@ -127,8 +127,10 @@ def _pushed(leaves, changes, *, recipe, own, size):
     # Few directions of one scene are lanes of a vector, and the program of one is the smallest. (Lists of a record,
     # which one scene looks up for all lanes, would take a fifth longer.)
     alone = size is None and 1 < numbers <= AT_ONCE and not any(x.shape for x in recipe.like)
-    if recipe.derivatives == "by directions" or (recipe.in_lanes and (recipe.order or alone)):
+    if recipe.derivatives == "by directions" or (recipe.in_lanes and recipe.order):
         value, jacobian = _jacobian_by_directions(leaves, moves, recipe, own, size)
+    elif recipe.in_lanes and alone:
+        value, jacobian = _jacobian_alone(leaves, moves, recipe)
     elif recipe.in_lanes and numbers > AT_ONCE:
         value, jacobian = _jacobian_in_rows(leaves, moves, recipe, own, size)
     else:
@@ -207,6 +209,77 @@ def _jacobian_in_rows(leaves, moves, recipe, own, size):
 
 
 ad.primitive_jvps[scenes_p] = _pushed
+
+# Value and Jacobian of one scene, by directions; of many, which `jax.vmap` makes of it later, at once: every scene is
+# computed once then. A derivative does not know what it will be part of (`jax.vmap(jax.jit(jax.grad(...)))`).
+# Parameters: the recipe, and which of its leaves move.
+alone_p = Primitive("scene_alone")
+alone_p.multiple_results = True
+
+
+def _jacobian_alone(leaves, moves, recipe):
+    found = alone_p.bind(*leaves, recipe=recipe, moves=moves)
+    value, jacobian = jax.tree.unflatten(jax.tree.structure(value_and_jacobian(recipe, moves).results), found)
+    return jax.tree.leaves(value), jacobian
+
+
+def _by_directions(*leaves, recipe, moves):
+    return jax.tree.leaves(_jacobian_by_directions(leaves, moves, recipe, (False,) * len(leaves), None))
+
+
+@functools.partial(jax.jit, static_argnames=("recipe", "moves"))
+def _compiled_alone(*leaves, recipe, moves):
+    return alone_p.bind(*leaves, recipe=recipe, moves=moves)
+
+
+@alone_p.def_impl
+def _(*leaves, recipe, moves):
+    with jax.disable_jit(False):
+        return _compiled_alone(*leaves, recipe=recipe, moves=moves)
+
+
+@alone_p.def_abstract_eval
+def _(*leaves, recipe, moves):
+    return typed_like(leaves, [(x.shape, x.dtype) for x in jax.tree.leaves(value_and_jacobian(recipe, moves).results)])
+
+
+def _alone_no_more(leaves, axes, *, recipe, moves):
+    own = tuple(axis is not None for axis in axes)
+    leaves = [jnp.moveaxis(x, axis, 0) if mine else x for x, axis, mine in zip(leaves, axes, own)]
+    size = next(x.shape[0] for x, mine in zip(leaves, own) if mine)
+    found = jax.tree.leaves(_jacobian_at_once(leaves, moves, recipe, own, size))
+    return found, [0] * len(found)
+
+
+batching.primitive_batchers[alone_p] = _alone_no_more
+
+
+def _alone_pushed(leaves, changes, *, recipe, moves):
+    moved = [type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes]
+
+    def function(*moving):
+        rest = iter(moving)
+        return _by_directions(
+            *(next(rest) if move else x for x, move in zip(leaves, moved)), recipe=recipe, moves=moves
+        )
+
+    if not any(moved):
+        found = function()
+        return found, [_unmoved(x) for x in found]
+    moving = ([x for x, move in zip(each, moved) if move] for each in (leaves, changes))
+    found, pushed = jax.jvp(function, *moving)
+    return found, [_unmoved(x) if d.dtype == jax.dtypes.float0 else d for x, d in zip(found, pushed)]
+
+
+ad.primitive_jvps[alone_p] = _alone_pushed
+
+
+def _alone_lowered(context, *leaves, **parameters):
+    written = mlir.lower_fun(functools.partial(_by_directions, **parameters), multiple_results=True)
+    return written(without_mesh(context), *leaves)
+
+
+mlir.register_lowering(alone_p, _alone_lowered)
 
 
 def _transposed(weights, *leaves, recipe, own, size):
