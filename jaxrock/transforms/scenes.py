@@ -1,4 +1,5 @@
-"""One primitive of JAX: a program of one scene, at one scene or at many. All its rules stand here.
+"""One primitive of JAX: a program of one scene, at one scene or at many. All its rules stand here; last, those of a
+second one, which is the derivative of one scene as long as nothing makes many of it.
 
 - Under `jax.vmap` one scene becomes many, and one more axis of many becomes more of them.
 - The derivative is a small Jacobian times the change of the inputs; value and Jacobian are one program of the same
@@ -109,8 +110,12 @@ def _unmoved(x):
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
+def _moves(changes) -> tuple[bool, ...]:
+    return tuple(type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes)
+
+
 def _pushed(leaves, changes, *, recipe, own, size):
-    moves = tuple(type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes)
+    moves = _moves(changes)
     if not any(moves):
         found = scenes_p.bind(*leaves, recipe=recipe, own=own, size=size)
         return found, [_unmoved(x) for x in found]
@@ -210,6 +215,25 @@ def _jacobian_in_rows(leaves, moves, recipe, own, size):
 
 ad.primitive_jvps[scenes_p] = _pushed
 
+
+def _transposed(weights, *leaves, recipe, own, size):
+    """Of a change on a tape, which is linear in its direction; its value weighs nothing."""
+    base, moves = recipe.origin
+    count = len(leaves) - recipe.directions
+    values = len(jax.tree.leaves(recipe.results[0]))
+    weights = [ad.instantiate_zeros(x) for x in weights[values:]]
+    flags = *own[:count], *[size is not None] * len(weights)
+    found = scenes_p.bind(*leaves[:count], *weights, recipe=pulled_back(base, moves), own=flags, size=size)
+    summed = [x if size is None or mine else x.sum(axis=0) for x, mine in zip(found, own[count:])]
+    return [*[None] * count, *(summed_like(x, leaf.aval) for x, leaf in zip(summed, leaves[count:]))]
+
+
+ad.primitive_transposes[scenes_p] = _transposed
+
+mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=False))
+mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=True), platform="cpu")
+
+
 # Value and Jacobian of one scene, by directions; of many, which `jax.vmap` makes of it later, at once: every scene is
 # computed once then. A derivative does not know what it will be part of (`jax.vmap(jax.jit(jax.grad(...)))`).
 # Parameters: the recipe, and which of its leaves move.
@@ -255,7 +279,7 @@ batching.primitive_batchers[alone_p] = _alone_no_more
 
 
 def _alone_pushed(leaves, changes, *, recipe, moves):
-    moved = [type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes]
+    moved = _moves(changes)
 
     def function(*moving):
         rest = iter(moving)
@@ -280,21 +304,3 @@ def _alone_lowered(context, *leaves, **parameters):
 
 
 mlir.register_lowering(alone_p, _alone_lowered)
-
-
-def _transposed(weights, *leaves, recipe, own, size):
-    """Of a change on a tape, which is linear in its direction; its value weighs nothing."""
-    base, moves = recipe.origin
-    count = len(leaves) - recipe.directions
-    values = len(jax.tree.leaves(recipe.results[0]))
-    weights = [ad.instantiate_zeros(x) for x in weights[values:]]
-    flags = *own[:count], *[size is not None] * len(weights)
-    found = scenes_p.bind(*leaves[:count], *weights, recipe=pulled_back(base, moves), own=flags, size=size)
-    summed = [x if size is None or mine else x.sum(axis=0) for x, mine in zip(found, own[count:])]
-    return [*[None] * count, *(summed_like(x, leaf.aval) for x, leaf in zip(summed, leaves[count:]))]
-
-
-ad.primitive_transposes[scenes_p] = _transposed
-
-mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=False))
-mlir.register_lowering(scenes_p, functools.partial(lowered, on_cpu=True), platform="cpu")
