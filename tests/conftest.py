@@ -83,9 +83,9 @@ _PROGRAMS = 64  # of a context, which they make greater: it stays as long as one
 
 
 def _share_contexts(mlir):
-    """JAX before 0.12 makes a context of MLIR for each program, most of its memory, and holds it as long as the program.
-    Here programs of a thread share some: one more for each program that is being made while another is, since what JAX
-    makes then would come to stand in that other."""
+    """JAX before 0.12 makes a context of MLIR for each program, most of its memory, and holds it as long as that. Here
+    programs of a thread share some: one more for each program that is being made while another is, since what JAX makes
+    then would come to stand in that other."""
     made, current, mine = mlir.make_ir_context, mlir.ir.Context, threading.local()
 
     def shared():
