@@ -46,8 +46,15 @@ os.environ["JAXROCK_CACHE"] = "off"  # tests compile anew what they test
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads than one wait at full speed
 
 
+def pytest_addoption(parser):
+    """Add what an environment that has all packages asks for."""
+    parser.addoption("--no-skips", action="store_true", help="a skipped test fails, whatever is missing")
+
+
 def pytest_configure(config):
     """Get ready to run tests; what only deals them out to others needs nothing of that."""
+    skips = importlib.import_module("references.skipped_tests")
+    config.pluginmanager.register(skips.SkippedTests(allowed=not config.option.no_skips))
     if config.getoption("tx", None) and config.getoption("dist") != "no" and not config.option.collectonly:
         return
     shapes = importlib.import_module("references.checked_shapes")

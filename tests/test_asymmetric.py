@@ -52,7 +52,7 @@ QUICK = {"model": rk.Linear(), "engine": rk.Series(order=6)}  # where neither ma
 SINES = [case for case in CASES if case["horizontal"][0] == "sine" and not case["vertical"]]
 SINES = [case for case in SINES if case["model"] == "housner" and case["initial"] == [0, 0]]
 OTHERS = [case for case in CASES if case not in SINES]
-needs_references = pytest.mark.skipif(not CASES, reason="the references lie in the repository")
+needs_references = pytest.mark.skipif(not CASES, reason="needs the folder references of the repository")
 
 
 @jax.jit

@@ -145,7 +145,7 @@ def test_in_single_precision_after_double(operation, settings, count):
 
 @each
 def test_machine_code_is_the_same(operation, settings, count):
-    call = pytest.importorskip("jaxrock.native.call")
+    call = pytest.importorskip("jaxrock.native.call", reason="needs llvmlite")
     numbers = numbers_for(count)
     lanes = [np.linspace(0.8, 1.2, 21) * x for x in numbers]
 

@@ -58,7 +58,7 @@ def test_what_is_said_of_others_runs_where_they_are(other):
     try:
         importlib.import_module(other)
     except (ImportError, RuntimeError) as error:  # OpenSees needs libraries of the system
-        pytest.skip(str(error))
+        pytest.skip(f"needs {other.partition('.')[0]}: {error}")
     page = (ROOT / "docs/comparison.md").read_text()
     ours = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (theirs,) = (code for code in re.findall(r"```py\n(.*?)```", page, re.DOTALL) if f"import {other} " in code)
@@ -82,7 +82,7 @@ def anchors(text):
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in told}
 
 
-@pytest.mark.skipif(not (ROOT / "notebooks").exists(), reason="source distributions leave the notebooks out")
+@pytest.mark.skipif(not (ROOT / "notebooks").exists(), reason="needs the folder notebooks of the repository")
 @pytest.mark.parametrize("page", PAGES)
 def test_every_link_of_a_page_leads_somewhere(page):
     text = (ROOT / page).read_text()

@@ -359,7 +359,7 @@ def test_a_fallen_block_lies_on_the_ground_in_the_picture(block, way):
 
 @pytest.mark.filterwarnings("ignore:os.fork")
 def test_films_as_mp4(response, tmp_path):
-    pytest.importorskip("imageio_ffmpeg", reason="brings the program ffmpeg")
+    pytest.importorskip("imageio_ffmpeg")
     rk.plot.save_animation(rk.plot.animate(response, fps=2, speed=30.0), tmp_path / "film.mp4", dpi=50)
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
 

@@ -283,7 +283,7 @@ def test_a_fit_finds_the_maximum_and_its_intervals_end_where_the_profile_says():
 
 @pytest.mark.slow
 def test_a_posterior_is_that_of_a_grid():
-    pytest.importorskip("numpyro", reason="samples need NumPyro")
+    pytest.importorskip("numpyro")
     seen = rocks(truth(3))
     found = rk.inverse.sample_motion(seen, rk.SinePulse, UNKNOWNS, SCATTER, effective_size=2000)
     assert found.status != rk.inverse.PosteriorStatus.not_converged
@@ -321,7 +321,7 @@ def test_samples_need_numpyro(monkeypatch):
 
 @pytest.mark.parametrize("name", ["effective_size", "steps"])
 def test_samples_need_good_arguments(name):
-    pytest.importorskip("numpyro", reason="samples need NumPyro")
+    pytest.importorskip("numpyro")
     with pytest.raises(ValueError, match=f"`{name}` must be a whole number from 1 to"):
         rk.inverse.sample_motion(rocks(["survived"] * 12), rk.SinePulse, UNKNOWNS, SCATTER, **{name: 0})
 

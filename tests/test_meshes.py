@@ -9,7 +9,7 @@ import pytest
 import jaxrock as rk
 from jaxrock.blocks.slab import Slab
 
-trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
+trimesh = pytest.importorskip("trimesh")
 
 WIDTH, DEPTH, HEIGHT = 0.6, 0.4, 2.0
 

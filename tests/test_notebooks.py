@@ -11,11 +11,11 @@ import pytest
 
 import jaxrock as rk
 
-nbclient = pytest.importorskip("nbclient", reason="notebooks run where nbclient is installed")
-nbformat = pytest.importorskip("nbformat", reason="notebooks run where nbformat is installed")
+nbclient = pytest.importorskip("nbclient")
+nbformat = pytest.importorskip("nbformat")
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="source distributions leave the notebooks out")
+in_repository = pytest.mark.skipif(not FOLDER.exists(), reason="needs the folder notebooks of the repository")
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # What takes seconds. In kernels of their own all of them take minutes, of what `test_arcs`, `test_asymmetric_rocks`,
 # `test_block_calibration`, `test_borders`, `test_closed_forms`, `test_critical`, `test_derivatives`, `test_flexible`,

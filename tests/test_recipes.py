@@ -150,9 +150,8 @@ def test_frames_have_room_while_a_recipe_is_traced():
     in_a_thread(count)
     in_a_thread(lambda: Recipe(traced, jax.tree.structure(number), number).program)
     bare, roomy = found
-    assert roomy < 50
-    if bare < 50:
-        pytest.skip("this Python keeps a piece that it has left (gh-142183)")
+    # Some releases of Python keep a piece that they have left (gh-142183): without room little is asked for there, too.
+    assert roomy < 50 <= bare or roomy <= bare < 50
 
 
 def test_the_collector_rests_while_a_recipe_is_traced():

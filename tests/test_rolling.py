@@ -391,7 +391,7 @@ def test_slopes_of_an_outcome_by_a_radius_of_many():
     assert float(slope) == pytest.approx(float(above - below) / 1e-3, rel=1e-5)
 
 
-trimesh = pytest.importorskip("trimesh", reason="meshes are read where trimesh is installed")
+trimesh = pytest.importorskip("trimesh")
 
 
 def prism(outline, depth=0.6):

@@ -12,7 +12,7 @@ import jaxrock as rk
 from jaxrock.inverse.samplers import rounds_of
 from jaxrock.numerics.proposals import independent_proposals
 
-numpyro = pytest.importorskip("numpyro", reason="samples need NumPyro")
+numpyro = pytest.importorskip("numpyro")
 blackjax = pytest.importorskip("blackjax")
 
 MEAN, DEVIATION = np.array([1.0, -2.0]), np.array([0.5, 2.0])

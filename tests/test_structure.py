@@ -349,7 +349,7 @@ FOLDERS = ("jaxrock", "references", "benchmarks", "tests")
 def test_what_tests_and_benchmarks_share_lies_in_references(folder, allowed):
     """Tests import nothing of benchmarks, benchmarks nothing of tests; the package only itself."""
     if not (ROOT / folder).exists():
-        pytest.skip("a package without its repository")
+        pytest.skip(f"needs the folder {folder} of the repository")
     homes = {path.stem: name for name in ("benchmarks", "tests") for path in (ROOT / name).glob("*.py")}
     homes |= {path.name: "benchmarks" for path in (ROOT / "benchmarks").glob("*/")}
     homes |= {name: name for name in FOLDERS}
