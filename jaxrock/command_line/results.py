@@ -102,8 +102,12 @@ class ResultFolder:
         if line in told.splitlines():
             return
         start = "" if told.endswith("\n") else "\n" if told else f"{_TITLE}\n"  # a full disk may have cut the last line
-        with (self.path / KNOWN).open("a", encoding="utf-8") as file:
+        with open(self.path / KNOWN, "a", encoding="utf-8", opener=_opened) as file:
             file.write(f"{start}{line}\n")
+
+
+def _opened(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _digest(path: Path) -> str:
