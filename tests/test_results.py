@@ -270,8 +270,9 @@ class Unwritable(io.StringIO):
 
 @pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
 @pytest.mark.parametrize("more", [(), ("--json",), ("--quiet",)])
-def test_a_stream_that_is_closed(monkeypatch, capfd, closed, more):
+def test_a_stream_that_is_closed(tmp_path, monkeypatch, capfd, closed, more):
     """As Python has it for `>&-`: none. What goes wrong is not said on the standard output instead."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, closed, None)
     assert main(["cache", *more]) == 0
     assert main(["run", "missing.AT2", *more]) == 2

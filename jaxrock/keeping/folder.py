@@ -30,6 +30,7 @@ _PATIENCE = 600  # seconds after which a file that was never finished is nobody'
 _NAME = re.compile(r"(jaxrock_)?[0-9a-f]{20,40}")
 _UNFINISHED = re.compile(rf"\.({_NAME.pattern})\.[0-9a-f]{{32}}\.partial")
 _NAME_OF_JAX = re.compile(r".+-[0-9a-f]{64}-(cache|atime)|\.lockfile|xla_gpu_\w+(/.+)?")
+_DELETED_BY_JAX = re.compile(r"-(cache|atime)$")
 _PLAINLY = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY", "O_CLOEXEC"))
 _ANEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
@@ -167,7 +168,10 @@ def _of_package(kind: str) -> list[tuple[Path, os.stat_result]]:
 
 
 def of_jax() -> tuple[list[Path], list[Path]]:
-    """Files in the folder that JAX looks after: those that it made for the user, and all others."""
+    """Files in the folder that JAX looks after: those that it made for the user, and those that it must not meet.
+
+    These are links, files of other users, and files of other names that it would delete as its own.
+    """
     made, others, place = [], [], folder_of(OF_JAX)
     if place is None:
         return made, others
@@ -177,7 +181,7 @@ def of_jax() -> tuple[list[Path], list[Path]]:
                 about = path.lstat()
                 if is_own_file(about) and _NAME_OF_JAX.fullmatch(path.relative_to(place).as_posix()):
                     made.append(path)
-                elif not stat.S_ISDIR(about.st_mode):
+                elif not stat.S_ISDIR(about.st_mode) and (not is_own_file(about) or _DELETED_BY_JAX.search(path.name)):
                     others.append(path)
     return made, others
 
