@@ -20,12 +20,16 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
 
     **Arguments:**
 
-    - `replace`: whether it takes the place of a file that is there.
+    - `replace`: whether it takes the place of a file that is there, and of the file that a link leads to.
     - `lasting`: whether it has reached the disk before it is renamed, so that it outlives a loss of power.
 
     **Raises:** FileExistsError where somebody else was faster, unless it replaces; IsADirectoryError; FileNotFoundError
-    where there is no folder for it.
+    where there is no folder for it; OSError where it would replace what is no regular file, such as a device.
     """
+    if replace and path.exists():
+        _check_replaced(path)
+    if replace and path.is_symlink():
+        path = path.resolve()
     if not path.name:  # the root, or where one is
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not path.parent.exists():
@@ -36,11 +40,19 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
         if lasting:
             for file in [aside, *aside.rglob("*")]:
                 _reach_the_disk(file)
-        _rename(aside, path, replace)
+        move_into_place(aside, path, replace)
         if lasting:
             _reach_the_disk(path.parent)
     finally:
         _remove(aside)
+
+
+def _check_replaced(path: Path) -> None:
+    """Raise OSError for what is no regular file: a device, for one, which root could replace by a file."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not path.is_file():
+        raise OSError(errno.EINVAL, "Only regular files are replaced", str(path))
 
 
 def _remove(aside: Path) -> None:
@@ -66,7 +78,11 @@ def _reach_the_disk(file: Path) -> None:
         os.close(handle)
 
 
-def _rename(aside: Path, path: Path, replace: bool) -> None:
+def move_into_place(aside: Path, path: Path, replace: bool) -> None:
+    """Rename what is written to what it shall be called.
+
+    **Raises:** FileExistsError where something is there, unless it is replaced.
+    """
     if replace:
         os.replace(aside, path)
     elif aside.is_dir():

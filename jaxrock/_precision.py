@@ -24,11 +24,11 @@ def _say() -> None:
     warnings.warn(
         "jaxrock runs in single precision here: expect 5 digits. For 13, put "
         '`jax.config.update("jax_enable_x64", True)` before the first computation.',
-        stacklevel=_frames_of_the_package() + 1,
+        stacklevel=frames_of_the_package() + 1,
     )
 
 
-def _frames_of_the_package() -> int:
+def frames_of_the_package() -> int:
     """Of those that lead to the caller of this: after them comes who called the package."""
     frame, count = sys._getframe(1), 0
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:

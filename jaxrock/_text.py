@@ -1,8 +1,12 @@
 """Text files as they come: their lines, and errors that name the file."""
 
+import os
 import re
 from pathlib import Path
 
+from jaxrock._regular_files import open_regular
+
+_LARGEST = 2**30  # bytes; the lines of a text take several times as much memory
 _MANY = 50  # numbers that tell how all are printed
 
 
@@ -36,8 +40,16 @@ def _shape(text: str) -> tuple[int, int]:
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a text file, without their ends."""
-    data = path.read_bytes()
+    """The lines of a text file, without their ends.
+
+    **Raises:** OSError if it cannot be opened; ValueError for what is no regular file, no text, empty or too large.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > _LARGEST:
+            told = f"holds {size / 2**30:.3g} GiB, but of text at most 1 GiB is read"
+            raise file_error(path.name, f"{told}: cut it, or make a `Record` of its samples.")
+        data = file.read()
     # Files from DOS end in bytes 26, which are no text but no damage either.
     data = data.replace(b"\x1a", b"")
     if re.search(rb"[\x00-\x08\x0e-\x1f]", data):

@@ -26,6 +26,7 @@ from jaxrock.command_line.fragility import _entries, _write
 from jaxrock.command_line.main import main
 from jaxrock.command_line.options import add_pulse, extent_of, files_of, pulse_of
 from jaxrock.command_line.output import Entry, heard
+from jaxrock.command_line.results import KNOWN, ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.motions.pulses import PULSES
 
@@ -152,8 +153,8 @@ def test_run_of_a_block_that_overturns(command, at2, tmp_path, monkeypatch):
 def test_run_of_a_block_that_never_moves(command, at2, tmp_path):
     """A film of an earlier run, of whatever kind, is not left beside its results."""
     film = tmp_path / "out" / "animation.mp4"
-    film.parent.mkdir()
-    film.touch()
+    with ResultFolder(film.parent).whole(film.name) as aside:
+        aside.touch()
     status, table, _ = command("run", at2, *GIVEN, "--scale", "0.1")
     assert status == 0 and not film.exists()
     assert (table["verdict"], table["impacts during the motion"], table["peak rotation"]) == ("stands", "0", "0.000000")
@@ -165,8 +166,8 @@ def test_no_film_of_a_block_that_never_moves(words, at2, tmp_path, capsys, monke
     """It says so at once; a film of an earlier run, which would be overwritten, is not left beside these results."""
     monkeypatch.setattr(rk.plot, "animate", lambda *_, **__: pytest.fail("draws a block that stands still"))
     film = tmp_path / "out" / "animation.gif"
-    film.parent.mkdir()
-    film.write_bytes(b"GIF89a of a block that rocks")
+    with ResultFolder(film.parent).whole(film.name) as aside:
+        aside.write_bytes(b"GIF89a of a block that rocks")
     assert main(["run", at2, *GIVEN, "--scale", "0.1", "--animate", "--out", str(film.parent), *words]) == 0
     printed = capsys.readouterr().out
     assert not film.exists() and str(film) not in printed
@@ -220,9 +221,9 @@ def test_a_file_is_there_whole_or_not_at_all(monkeypatch, tmp_path, kind):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(np, "savetxt", half)
-    figure, path, report = types.SimpleNamespace(savefig=half), tmp_path / "map.png", output.Report("map", quiet=True)
+    figure, given = types.SimpleNamespace(savefig=half), (output.Report("map", quiet=True), ResultFolder(tmp_path))
     with pytest.raises(OSError, match=r"map.png cannot be written: No space left on device"):
-        output.write_csv(report, path, "x", [1.0]) if kind == "table" else output.save(report, figure, path)
+        output.write_csv(*given, "map.png", "x", [1.0]) if kind == "table" else output.save(*given, "map.png", figure)
     assert not list(tmp_path.iterdir())
 
 
@@ -294,9 +295,9 @@ def test_spectral_velocities_are_not_written_for_openquake(tmp_path, monkeypatch
         jnp.array([0.1, 0.2]), np.zeros((1, 2, 1), np.int8), *jnp.ones((2, 1)), ("a",), "SV(0.5)", np.ones(1)
     )
     report = output.Report("fragility")
-    _write(report, argparse.Namespace(out=tmp_path), found, rk.hazard.LogNormalFragility(0.3, 0.4))
+    _write(report, argparse.Namespace(out=ResultFolder(tmp_path)), found, rk.hazard.LogNormalFragility(0.3, 0.4))
     assert "no fragility.xml: OpenQuake knows no SV(0.5)" in capsys.readouterr().out
-    assert {path.name for path in tmp_path.iterdir()} == {"fragility.csv", "stripes.csv", "fragility.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"fragility.csv", "stripes.csv", "fragility.png", KNOWN}
 
 
 def test_no_unexceeded_motion_of_an_earlier_run(tmp_path, monkeypatch):
@@ -310,9 +311,10 @@ def test_no_unexceeded_motion_of_an_earlier_run(tmp_path, monkeypatch):
         names=("amplitude",), values=one, interval=[[0, 2]], open=[[False, False]], probability=one
     )
     region = types.SimpleNamespace(values=(one, one), names=("amplitude", "period"), log_likelihood=one, allowed=one)
-    (tmp_path / "unexceeded.csv").write_text("of an earlier run")
-    files = invert._write(tmp_path, observations, estimate, region, None)
-    assert sorted(files) == sorted(tmp_path.iterdir())
+    with ResultFolder(tmp_path).whole("unexceeded.csv") as aside:
+        aside.write_text("of an earlier run")
+    files = invert._write(ResultFolder(tmp_path), observations, estimate, region, None)
+    assert sorted([tmp_path / KNOWN, *files]) == sorted(tmp_path.iterdir())
 
 
 def test_spectrum(command, column, tmp_path):

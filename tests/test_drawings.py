@@ -1,9 +1,11 @@
 """Drawings are to scale, at any rotation; films show the response and its verdict."""
 
 import base64
+import errno
 import importlib.util
 import io
 import re
+from pathlib import Path
 
 import jax
 import matplotlib
@@ -301,6 +303,26 @@ def test_films_are_written(kind, response, tmp_path):
     rk.plot.save_animation(film, path, dpi=30)
     start = path.read_bytes()[:15]
     assert start.startswith(b"GIF89a") if kind == "gif" else start == b"<!DOCTYPE html>"
+
+
+@pytest.mark.parametrize("kind", ["gif", "html", "mp4"])
+def test_a_film_that_fails_leaves_the_one_before(kind, response, tmp_path, monkeypatch):
+    def full(self, path, **_):
+        Path(path).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / f"film.{kind}"
+    path.write_text("years of work")
+    film = rk.plot.animate(response, fps=2, speed=30.0)
+    scene_alone(film)
+    if kind == "html":
+        monkeypatch.setattr(Path, "write_text", lambda self, *_, **__: full(None, self))
+    else:
+        monkeypatch.setattr(type(film), "save", full)
+    monkeypatch.setattr("matplotlib.animation.FFMpegWriter.isAvailable", lambda: True)
+    with pytest.raises(OSError, match="No space left"):
+        rk.plot.save_animation(started(film), path, dpi=10)
+    assert path.read_text() == "years of work" and [each.name for each in tmp_path.iterdir()] == [path.name]
 
 
 def test_films_as_html_are_whole_and_of_their_dpi(response, tmp_path):

@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxrock._arguments import path_of
 from jaxrock._checks import shown
+from jaxrock._regular_files import open_regular
 
 
 def surface_of(mesh: Any) -> Any:
@@ -15,7 +16,7 @@ def surface_of(mesh: Any) -> Any:
             import trimesh
         except ImportError as error:
             raise ImportError('Reading a mesh needs trimesh: pip install "jaxrock[mesh]".') from error
-        with path.open("rb"):  # said as for any file
+        with open_regular(path):  # said as for any file
             pass
         try:
             return trimesh.load(path, force="mesh")

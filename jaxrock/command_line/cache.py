@@ -1,11 +1,10 @@
 """The command `jaxrock cache`: what is kept between sessions."""
 
 import argparse
-import shutil
 
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.output import Report
-from jaxrock.keeping.folder import OF_JAX, folder, kept
+from jaxrock.keeping.folder import OF_JAX, clear, folder, kept
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -21,11 +20,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     size = sum(file.stat().st_size for file in files) / 2**20
     programs = sum(file.parent.name != OF_JAX or file.name.endswith("-cache") for file in files)
     if arguments.clear:
-        for each in place.iterdir() if place.is_dir() else ():  # which may be a link, and stays
-            if each.is_dir():
-                shutil.rmtree(each, ignore_errors=True)
-            else:
-                each.unlink(missing_ok=True)
+        clear()
         if left := [file for file in kept() if file.exists()]:
             raise OSError(f"{len(left)} of {len(files)} files in {place} cannot be deleted, such as {left[0]}")
     report.results |= {"folder": str(place), "programs": programs, "mebibytes": size, "deleted": arguments.clear}

@@ -15,6 +15,7 @@ class Command(NamedTuple):
     - `run`: does it, and tells a report what it found, what it wrote, and what was not computed. **Raises:**
       ValueError or OSError for input that is bad, before anything is written.
     - `computes`: whether it computes scenes.
+    - `writes`: names of the files that it may write into its folder, for these options.
     """
 
     name: str
@@ -22,3 +23,4 @@ class Command(NamedTuple):
     add_options: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace, Report], None]
     computes: bool = True
+    writes: Callable[[argparse.Namespace], tuple[str, ...]] = lambda _: ()

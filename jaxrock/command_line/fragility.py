@@ -17,7 +17,8 @@ from jaxrock.command_line.options import (
     model_of,
     number,
 )
-from jaxrock.command_line.output import Entry, Report, save, whole, write_csv
+from jaxrock.command_line.output import Entry, Report, save, write_csv
+from jaxrock.command_line.results import ResultFolder
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -95,23 +96,29 @@ def _write(
     fit: rk.hazard.LogNormalFragility | None,
 ) -> None:
     """Tables, the figure, and NRML where there is a fit."""
-    folder = arguments.out
-    folder.mkdir(parents=True, exist_ok=True)
+    folder: ResultFolder = arguments.out
     header = f"{found.measure},lower,upper"
-    write_csv(report, folder / "fragility.csv", header, found.levels, found.lower, found.upper)
+    write_csv(report, folder, "fragility.csv", header, found.levels, found.lower, found.upper)
     columns = found.table()
-    with whole(folder / "stripes.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
+    with folder.whole("stripes.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
-    report.wrote(folder / "stripes.csv")
-    (folder / "fragility.xml").unlink(missing_ok=True)  # of an earlier run, which may have had a fit
+    report.wrote(folder.path / "stripes.csv")
+    folder.discard("fragility.xml")  # of an earlier run, which may have had a fit
     if fit is not None and found.measure.startswith("SV("):
         report.say(f"no fragility.xml: OpenQuake knows no {found.measure}")
     elif fit is not None:
-        rk.hazard.write_nrml({"topples": fit}, folder / "fragility.xml", found.measure)
-        report.wrote(folder / "fragility.xml")
-    save(report, rk.plot.fragility(found, fit).figure, folder / "fragility.png")
+        with folder.whole("fragility.xml") as aside:
+            rk.hazard.write_nrml({"topples": fit}, aside, found.measure)
+        report.wrote(folder.path / "fragility.xml")
+    save(report, folder, "fragility.png", rk.plot.fragility(found, fit).figure)
 
 
-FRAGILITY = Command("fragility", "how probable it is that a block topples under scaled records", _add_options, _run)
+FRAGILITY = Command(
+    "fragility",
+    "how probable it is that a block topples under scaled records",
+    _add_options,
+    _run,
+    writes=lambda _: ("fragility.csv", "stripes.csv", "fragility.xml", "fragility.png"),
+)

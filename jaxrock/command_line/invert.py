@@ -11,11 +11,13 @@ import numpy as np
 import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import check_points, check_range, extent_of, model_of, number, other_parameters
-from jaxrock.command_line.output import Report, plain, whole
+from jaxrock.command_line.output import Report, plain
+from jaxrock.command_line.results import ResultFolder
 from jaxrock.inverse.observation_files import EXAMPLE
 from jaxrock.inverse.observations import SEEN, TOPPLED
 from jaxrock.motions.pulses import PULSES, UNITS
 
+_FILES, _WALL = ("estimate.csv", "probabilities.csv", "region.csv", "region.png"), "unexceeded.csv"
 # Of parameters without a default, which are estimated, too.
 _RANGES = {"shape": (-6.0, 6.0)}
 
@@ -165,22 +167,21 @@ def _priors(given: list[list[str]], pulse: str) -> dict[str, tuple[float, float]
 
 
 def _write(
-    folder: Path,
+    folder: ResultFolder,
     observations: rk.inverse.Observations,
     estimate: rk.inverse.Estimate,
     region: rk.inverse.FeasibleRegion,
     wall: rk.inverse.Unexceeded | None,
 ) -> list[Path]:
     """Tables and the figure; return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / name for name in ("estimate.csv", "probabilities.csv", "region.csv", "region.png")]
-    with whole(files[0]) as aside, aside.open("w", encoding="utf-8") as file:
+    files = list(_FILES)
+    with folder.whole(files[0]) as aside, aside.open("w", encoding="utf-8") as file:
         print("parameter,unit,value,low,high,low_is_open,high_is_open", file=file)
         for name, value, interval, open_ in _rows(estimate):
             ends = ",".join(f"{float(x):.6g}" for x in interval)
             flags = ",".join(str(int(x)) for x in open_)
             print(f"{name},{UNITS.get(name, '')},{float(value):.6g},{ends},{flags}", file=file)
-    with whole(files[1]) as aside, aside.open("w", encoding="utf-8") as file:
+    with folder.whole(files[1]) as aside, aside.open("w", encoding="utf-8") as file:
         shapes = _shapes(observations)
         print(f"name,{','.join(shapes)},observed,probability", file=file)
         known = np.asarray(observations.seen), np.asarray(estimate.probability)
@@ -191,21 +192,21 @@ def _write(
     rows, columns = np.meshgrid(*region.values, indexing="ij")
     header = ",".join(f"{name}_{UNITS.get(name, '')}" for name in region.names) + ",log_likelihood,allowed"
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
-    with whole(files[2]) as aside:
+    with folder.whole(files[2]) as aside:
         np.savetxt(aside, np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
-    (folder / "unexceeded.csv").unlink(missing_ok=True)  # of an earlier run
+    folder.discard(_WALL)  # of an earlier run
     if wall is not None:
-        files.append(folder / "unexceeded.csv")
-        with whole(files[-1]) as aside, aside.open("w", encoding="utf-8") as file:
+        files.append(_WALL)
+        with folder.whole(_WALL) as aside, aside.open("w", encoding="utf-8") as file:
             print("duration_s,amplitude_g,rock,complete", file=file)
             columns = map(np.asarray, (wall.durations, wall.amplitude, wall.weakest, wall.complete))
             for duration, amplitude, rock, complete in zip(*columns):
                 name = _quoted(observations.names[int(rock)]) if rock >= 0 else ""
                 print(f"{float(duration):.8g},{float(amplitude):.8g},{name},{int(complete)}", file=file)
     figure: Any = rk.plot.feasible_region(region, estimate, wall).figure
-    with whole(files[3]) as aside:
+    with folder.whole(files[3]) as aside:
         figure.savefig(aside, dpi=150, format="png")
-    return files
+    return [folder.path / name for name in files]
 
 
 def _rows(estimate: rk.inverse.Estimate) -> Iterator[tuple]:
@@ -259,5 +260,9 @@ def _results(observations: rk.inverse.Observations, estimate: rk.inverse.Estimat
 
 
 INVERT = Command(
-    "invert", "motions that rocks which stand, or fell, allow: estimates, intervals, maps", _add_options, _run
+    "invert",
+    "motions that rocks which stand, or fell, allow: estimates, intervals, maps",
+    _add_options,
+    _run,
+    writes=lambda _: (*_FILES, _WALL),
 )

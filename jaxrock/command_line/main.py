@@ -11,12 +11,14 @@ from pathlib import Path
 import jax
 
 from jaxrock.command_line.cache import CACHE
+from jaxrock.command_line.command import Command
 from jaxrock.command_line.fragility import FRAGILITY
 from jaxrock.command_line.invert import INVERT
 from jaxrock.command_line.map import MAP
-from jaxrock.command_line.options import as_typed
-from jaxrock.command_line.output import Report, heard
+from jaxrock.command_line.options import as_typed, inputs_of
+from jaxrock.command_line.output import Report, complain, drop, heard
 from jaxrock.command_line.parser import Parser
+from jaxrock.command_line.results import KNOWN, ResultFolder
 from jaxrock.command_line.run import RUN
 from jaxrock.command_line.spectrum import SPECTRUM
 from jaxrock.keeping.compiled import keep_compiled
@@ -37,13 +39,16 @@ _EXAMPLES = """\
   jaxrock invert rocks.csv --scatter 0.2          what motion rocks that stand or fell allow
   jaxrock cache --clear                           forget what was compiled before
 """
+_RESULTS = f"""\
+Results in --out are replaced by those of the next run; what jaxrock wrote there, and is unchanged, {KNOWN} tells.
+Other files, and inputs, are replaced with --force only."""
 _EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted, 141 nobody reads it any more"
 
 
 def _epilog(command: str = "") -> str:
     """Examples of a command, or of all, and what exit statuses mean."""
     lines = [line for line in _EXAMPLES.splitlines() if line.startswith(f"  jaxrock {command}")]
-    return "\n".join(["examples:", *lines, "", _EXIT])
+    return "\n".join(["examples:", *lines, "", *([] if command == "cache" else [_RESULTS, ""]), _EXIT])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -64,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
             models, folder = ("housner", "linear"), Path("results")
             sub.add_argument("--model", choices=models, default="housner", help="equation of motion (default housner)")
             sub.add_argument("--out", type=Path, default=folder, help=f"folder for what is written (default {folder})")
+            words = "also replace inputs, and files in --out that jaxrock did not make, or that were changed since"
+            sub.add_argument("--force", action="store_true", help=words)
         command.add_options(sub)
     return parser
 
@@ -78,27 +85,45 @@ def main(words: list[str] | None = None) -> int:
     **Returns:** the exit status: 0 good, 1 not computed, 2 bad input; 130 if it is interrupted, and 141 if nobody reads
     what it says any more.
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # what it cannot show is no reason to stop
     try:
         return _done(words)
     except KeyboardInterrupt:
-        print("jaxrock: interrupted", file=sys.stderr)
+        complain("interrupted")
         return 130
     except BrokenPipeError:
-        _drop_output()
+        drop(sys.stdout)
         return 141
+    except OSError as error:  # of help, or of an example, which cannot be printed
+        complain(f"error: {error}")
+        drop(sys.stdout)
+        return 2
+
+
+def _open_closed_streams() -> None:
+    """Open the streams that the program was started without (`>&-`), to nowhere.
+
+    Otherwise files that it opens take their place, and libraries in C write their words into these.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
 def _done(words: list[str] | None) -> int:
-    arguments = _parser().parse_args(words)
+    try:
+        arguments = _parser().parse_args(words)
+    finally:
+        sys.stdout.flush()  # of help, after which argparse exits
     command = _COMMANDS[arguments.command]
     report = Report(command.name, arguments.json, arguments.quiet)
     with heard(arguments.quiet, arguments.verbose):
         try:
             if command.computes:
-                _prepare(arguments)
+                _prepare(command, arguments)
             command.run(arguments, report)
             status = report.finished()
             sys.stdout.flush()
@@ -106,22 +131,20 @@ def _done(words: list[str] | None) -> int:
         except BrokenPipeError:
             raise
         except (ValueError, OSError) as error:
-            print(f"jaxrock: error: {as_typed(str(error), arguments)}", file=sys.stderr)
-            _drop_output()
+            complain(f"error: {as_typed(str(error), arguments)}")
+            drop(sys.stdout)
             return 2
 
 
-def _drop_output() -> None:
-    """Where the standard output cannot be written, forget what is left of it: Python would complain once more."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        with contextlib.suppress(OSError):  # where it is no file there is nothing to drop
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _prepare(arguments: argparse.Namespace) -> None:
-    """What commands that compute need."""
+def _prepare(command: Command, arguments: argparse.Namespace) -> None:
+    """What commands that compute need: a folder for their results, and JAX."""
+    if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
+        raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
+    there = next(place for place in (arguments.out, *arguments.out.absolute().parents) if place.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise PermissionError(f"Argument `--out` must be a folder that can be written, but {arguments.out} is not.")
+    arguments.out = ResultFolder(arguments.out, inputs_of(arguments), arguments.force)
+    arguments.out.check(command.writes(arguments))
     keep_compiled()
     jax.config.update("jax_enable_x64", True)
     import matplotlib
@@ -129,8 +152,3 @@ def _prepare(arguments: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     with contextlib.suppress(RuntimeError):  # called by a program that computes already
         use_cpu_devices()
-    if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
-        raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
-    there = next(place for place in (arguments.out, *arguments.out.absolute().parents) if place.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise PermissionError(f"Argument `--out` must be a folder that can be written, but {arguments.out} is not.")

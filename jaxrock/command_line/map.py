@@ -55,13 +55,12 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     names = {0: "safe", 1: "overturned without impact", 2: "overturned after impacts", -1: "not computed"}
     counts = {name: int((state == key).sum()) for key, name in names.items()}
     report.table([Entry(name.replace(" ", "_"), name, count, unit="scenes") for name, count in counts.items()])
-    arguments.out.mkdir(parents=True, exist_ok=True)
     columns, rows = np.meshgrid(*axes.values())
-    write_csv(report, arguments.out / "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
+    write_csv(report, arguments.out, "map.csv", ",".join(axes) + ",state,max_rotation_over_alpha,impacts,margin",
               *(np.ravel(x) for x in (columns, rows, state, result.max_rotation, result.impact_count, result.margin)),
               )  # fmt: skip
     exact = False if arguments.pixels else None
-    save(report, rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure, arguments.out / "map.png")
+    save(report, arguments.out, "map.png", rk.plot.overturning(result, by_duration=by_duration, exact=exact).figure)
     check_surface(report, result.status)
 
 
@@ -82,4 +81,10 @@ def _axes(arguments: argparse.Namespace) -> tuple[bool, dict[str, np.ndarray]]:
     return by_duration, axes
 
 
-MAP = Command("map", "overturning map: intensity against frequency of a pulse", _add_options, _run)
+MAP = Command(
+    "map",
+    "overturning map: intensity against frequency of a pulse",
+    _add_options,
+    _run,
+    writes=lambda _: ("map.csv", "map.png"),
+)

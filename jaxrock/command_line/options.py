@@ -118,7 +118,14 @@ def option_of(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-_POSITIONAL = {"command", "record", "records", "rocks"}
+_INPUTS = ("record", "records", "rocks")
+_POSITIONAL = {"command", *_INPUTS}
+
+
+def inputs_of(arguments: argparse.Namespace) -> list[Path]:
+    """The files that a command reads."""
+    words = [getattr(arguments, name, None) or [] for name in _INPUTS]
+    return [Path(path).expanduser() for each in words for path in files_of([each] if isinstance(each, str) else each)]
 
 
 def as_typed(message: str, arguments: argparse.Namespace) -> str:

@@ -3,16 +3,16 @@
 import contextlib
 import json
 import logging
+import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 import jaxrock as rk
-from jaxrock._aside import written_aside
 from jaxrock._tables import items_of
+from jaxrock.command_line.results import ResultFolder
 
 
 class Entry(NamedTuple):
@@ -48,6 +48,7 @@ class Report:
     def __init__(self, command: str, as_json: bool = False, quiet: bool = False):
         self._speaks = not (as_json or quiet)
         self._as_json, self._status = as_json, 0
+        self._unsaid: OSError | None = None
         self.results: dict[str, Any] = {}
         self._told: dict[str, Any] = {"command": command, "version": rk.__version__}
         self._units, self._files = {}, []
@@ -58,9 +59,15 @@ class Report:
         self.say(words)
 
     def say(self, words: str) -> None:
-        """Something for people only; programs find the same in `results`."""
+        """Something for people only; programs find the same in `results`.
+
+        Where it cannot be said, results are written all the same, and `finished` raises.
+        """
         if self._speaks:
-            print(words, flush=True)
+            try:
+                print(words, flush=True)
+            except OSError as error:
+                self._speaks, self._unsaid = False, error
 
     def table(self, entries: list[Entry]) -> None:
         """Names, values and units."""
@@ -80,14 +87,38 @@ class Report:
         """Something was not computed: the exit status is 1."""
         self._status = 1
         self._told.setdefault("failures", []).append(reason)
-        print(f"jaxrock: {reason}", file=sys.stderr)
+        complain(reason)
 
     def finished(self) -> int:
-        """The exit status, after all is said."""
+        """The exit status, after all is said.
+
+        **Raises:** OSError where something could not be said.
+        """
+        if self._unsaid is not None:
+            raise self._unsaid
         if self._as_json:
             told = self._told | {"results": self.results, "units": self._units, "files": self._files}
             print(json.dumps(told | {"exit_status": self._status}, indent=2, allow_nan=False))
         return self._status
+
+
+def complain(words: str) -> None:
+    """Say on the standard error what goes on, or went wrong, if that can be written."""
+    try:
+        print(f"jaxrock: {words}", file=sys.stderr, flush=True)
+    except OSError:
+        drop(sys.stderr)
+
+
+def drop(stream: TextIO) -> None:
+    """Where a stream cannot be written, forget what is left of it: Python would complain once more at its end."""
+    try:
+        stream.flush()
+    except OSError:
+        with contextlib.suppress(OSError):  # where it is no file there is nothing to drop
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
 
 
 def plain(value: Any) -> Any:
@@ -104,29 +135,19 @@ def plain(value: Any) -> Any:
     return value.item() if value.dtype.kind != "f" else float(value) if np.isfinite(value) else None
 
 
-def write_csv(report: Report, path: Path, header: str, *columns) -> None:
+def write_csv(report: Report, folder: ResultFolder, name: str, header: str, *columns) -> None:
     """Write columns of numbers, under a header of names with commas between them."""
     table = np.column_stack([np.asarray(column, dtype=float) for column in columns])
-    with whole(path) as aside:
+    with folder.whole(name) as aside:
         np.savetxt(aside, table, delimiter=",", header=header, comments="", fmt="%.12g")
-    report.wrote(path)
+    report.wrote(folder.path / name)
 
 
-def save(report: Report, figure, path: Path) -> None:
+def save(report: Report, folder: ResultFolder, name: str, figure) -> None:
     """Write a figure."""
-    with whole(path) as aside:
-        figure.savefig(aside, dpi=150, format=path.suffix[1:])
-    report.wrote(path)
-
-
-@contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """Where to write a file that is there whole or not at all; an error says which file it was."""
-    try:
-        with written_aside(path, replace=True, lasting=False) as aside:
-            yield aside
-    except OSError as error:
-        raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
+    with folder.whole(name) as aside:
+        figure.savefig(aside, dpi=150)
+    report.wrote(folder.path / name)
 
 
 def check_surface(report: Report, status: rk.Status) -> None:
@@ -150,7 +171,7 @@ class _Once(logging.Handler):
         words = record.getMessage()
         if words not in self._said:
             self._said.add(words)
-            print(f"jaxrock: {words}", file=sys.stderr, flush=True)
+            complain(words)
 
 
 @contextlib.contextmanager

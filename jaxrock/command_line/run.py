@@ -1,7 +1,6 @@
 """The command `jaxrock run`: one block under a record, with its history, impacts and figures."""
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
@@ -9,6 +8,7 @@ import jaxrock as rk
 from jaxrock.command_line.command import Command
 from jaxrock.command_line.options import add_record, add_restitution, model_of, number, record_of
 from jaxrock.command_line.output import Entry, Report, save, write_csv
+from jaxrock.command_line.results import ResultFolder
 
 _FILMS = ("gif", "html", "mp4")
 
@@ -44,7 +44,7 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
     report.table(_entries(size, block, record, model, result, response))
     _write(report, arguments.out, response)
     if arguments.animate:
-        _film(report, _film_in(arguments.out, arguments.animate), response, block)
+        _film(report, arguments.out, _film_of(arguments.animate), response, block)
     for status in (response.status, result.status):
         if status != rk.Status.successful:
             return report.failed(f"these are not results: {rk.Status[status]}")
@@ -90,29 +90,34 @@ def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
     return entries
 
 
-def _write(report: Report, folder: Path, response: rk.responses.Response) -> None:
+def _write(report: Report, folder: ResultFolder, response: rk.responses.Response) -> None:
     """Files and figures of the response."""
-    folder.mkdir(parents=True, exist_ok=True)
     for ending in _FILMS:
-        _film_in(folder, ending).unlink(missing_ok=True)  # of an earlier run, which may have been of another block
-    write_csv(report, folder / "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
+        folder.discard(_film_of(ending))  # of an earlier run, which may have been of another block
+    write_csv(report, folder, "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
-    write_csv(report, folder / "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
+    write_csv(report, folder, "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
               response.impact_velocities)  # fmt: skip
-    save(report, rk.plot.history(response)[0].figure, folder / "history.png")
-    save(report, rk.plot.phase(response).figure, folder / "phase.png")
+    save(report, folder, "history.png", rk.plot.history(response)[0].figure)
+    save(report, folder, "phase.png", rk.plot.phase(response).figure)
 
 
-def _film_in(folder: Path, ending: str) -> Path:
-    return folder / f"animation.{ending}"
+def _writes(arguments: argparse.Namespace) -> tuple[str, ...]:
+    film = (_film_of(arguments.animate),) if arguments.animate else ()
+    return "history.csv", "impacts.csv", "history.png", "phase.png", *film
 
 
-def _film(report: Report, path: Path, response: rk.responses.Response, block: rk.Block) -> None:
+def _film_of(ending: str) -> str:
+    return f"animation.{ending}"
+
+
+def _film(report: Report, folder: ResultFolder, name: str, response: rk.responses.Response, block: rk.Block) -> None:
     """The film, which takes a minute; none of a block that never moves."""
     if response.status == rk.Status.successful and float(response.max_rotation) == 0:
         return report.say("no film: the block never uplifts")
-    rk.plot.save_animation(rk.plot.animate(response, block, fps=12), path)
-    report.wrote(path)
+    with folder.whole(name) as aside:
+        rk.plot.save_animation(rk.plot.animate(response, block, fps=12), aside)
+    report.wrote(folder.path / name)
 
 
-RUN = Command("run", "simulate one block under a record", _add_options, _run)
+RUN = Command("run", "simulate one block under a record", _add_options, _run, writes=_writes)

@@ -47,13 +47,18 @@ def _run(arguments: argparse.Namespace, report: Report) -> None:
         Entry("longest_overturned", "longest 2 pi/p that overturns", longest, ".3f", "s", instead),
         Entry("not_computed", "not computed", int(np.sum(~known))),
     ])  # fmt: skip
-    arguments.out.mkdir(parents=True, exist_ok=True)
     header = "two_pi_over_p_s,max_rotation_over_alpha,max_velocity_over_p_alpha,impacts,overturned,margin"
     peaks = (result.max_rotation, result.max_velocity, result.impact_count, lost, result.margin)
     columns = [np.where(known, np.asarray(each, float), np.nan) for each in peaks]  # else they look like results
-    write_csv(report, arguments.out / "spectrum.csv", header, period, *columns)
-    save(report, rk.plot.spectrum(result)[0].figure, arguments.out / "spectrum.png")
+    write_csv(report, arguments.out, "spectrum.csv", header, period, *columns)
+    save(report, arguments.out, "spectrum.png", rk.plot.spectrum(result)[0].figure)
     check_surface(report, result.status)
 
 
-SPECTRUM = Command("spectrum", "rocking spectrum of a record: peak response against block size", _add_options, _run)
+SPECTRUM = Command(
+    "spectrum",
+    "rocking spectrum of a record: peak response against block size",
+    _add_options,
+    _run,
+    writes=lambda _: ("spectrum.csv", "spectrum.png"),
+)

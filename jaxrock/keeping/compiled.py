@@ -1,12 +1,14 @@
 """What XLA compiles is kept by JAX itself, in the same folder, if it is asked to; and compiled in less time."""
 
 import os
+from pathlib import Path
 
 import jax
 import jaxlib
 
 from jaxrock._precision import setting
-from jaxrock.keeping.folder import LARGEST, OF_JAX, folder
+from jaxrock.keeping.folder import LARGEST, OF_JAX, folder, folder_of, of_jax, remove
+from jaxrock.keeping.ownership import is_open, warn_once
 
 _EMITTERS = "--xla_cpu_use_fusion_emitters"
 _LAST = (0, 10)  # of the jaxlibs that know it; in 0.11.2 and 0.12 an option that is not known ends the program
@@ -19,22 +21,39 @@ def keep_compiled() -> None:
     written, and where the environment says `JAXROCK_CACHE=off`. Machine code and programs of the package's own are kept
     without it. It sets options of JAX (`jax_compilation_cache_dir` and its limits) and one of XLA (in `XLA_FLAGS`, if
     that says nothing of it), for all that this process compiles; last digits of what XLA computes may change by it.
+
+    What is kept runs as a part of later programs. So the folder must belong to the user, or to root, and only its owner
+    may write in it, and in no parent others may; where that does not hold nothing is kept, and a warning says why.
     """
     compile_quickly()
-    place = folder()
-    if place is None or setting("jax_compilation_cache_dir"):
+    if setting("jax_compilation_cache_dir"):
         return
-    place = place / OF_JAX
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if not os.access(place, os.W_OK):
+    place = _place_of_jax()
+    if place is None or not os.access(place, os.W_OK):
         return
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_compilation_cache_max_size", LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _place_of_jax() -> Path | None:
+    """The folder that JAX may look after; None where JAX would run there what another user wrote.
+
+    JAX reads all files in it, of any owner, and deletes those that have its names. What lay there while others could
+    write in it goes.
+    """
+    place = folder()
+    if place is None:
+        return None
+    was_open = is_open(place / OF_JAX)
+    place = folder_of(OF_JAX, make=True)
+    made, others = of_jax()
+    for path in made if was_open else ():
+        remove(path)
+    if others:
+        return warn_once(f"{others[0]} was not made by jaxrock, or belongs to another user")
+    return place
 
 
 def compile_quickly() -> None:

@@ -1,33 +1,61 @@
 """The folder of what is kept: any number of processes may read and write it, and what is damaged is made again.
 
-A file begins with a digest of its name and the rest, is written aside, and renamed: a reader finds all of it or
-nothing. When the folder has grown too large, what has not been used for longest goes first.
+A file begins with a mark and a digest of its name and the rest, is written aside, and renamed: a reader finds all of it
+or nothing. Only what is private (`ownership`) is read, as it is run. When the folder has grown too large, what has not
+been used for longest goes first. Only files that the package made are replaced or removed: regular ones of the user's,
+with their names and their mark.
 """
 
 import contextlib
 import hashlib
 import os
+import re
+import stat
 import time
 from pathlib import Path
 
 import platformdirs
 
 from jaxrock._aside import written_aside
+from jaxrock.keeping.ownership import is_own_file, is_private_file, private
 
 LARGEST = 2**30  # bytes
-_OWN = "jaxrock-compiled"  # within a folder that the user names, where other things may lie: all of this may be deleted
-OF_JAX = "xla"  # the part that JAX looks after (see `compiled`)
+KINDS = ("machine", "lowered")  # of what the package keeps, each in a folder of its own
+OF_JAX = "xla"  # the folder that JAX looks after (see `compiled`)
+_OWN = "jaxrock-compiled"  # within a folder that the user names, where other things may lie
 _OFF = ("off", "no", "none", "false", "0")
+_MARK = b"jaxrock kept\n"
 _DIGEST = hashlib.sha256().digest_size
 _PATIENCE = 600  # seconds after which a file that was never finished is nobody's
+_NAME = re.compile(r"(jaxrock_)?[0-9a-f]{20,40}")
+_UNFINISHED = re.compile(rf"\.({_NAME.pattern})\.[0-9a-f]{{32}}\.partial")
+_NAME_OF_JAX = re.compile(r".+-[0-9a-f]{64}-(cache|atime)|\.lockfile|xla_gpu_\w+(/.+)?")
+_DELETED_BY_JAX = re.compile(r"-(cache|atime)$")
+_PLAINLY = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY", "O_CLOEXEC"))
+_ANEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
 def folder() -> Path | None:
-    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that says `off`."""
+    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that says `off`.
+
+    A link leads to a larger disk, where other things may lie: there it is a folder within what the link leads to.
+    """
     said = os.environ.get("JAXROCK_CACHE", "").strip()
     if said.lower() in _OFF:
         return None
-    return Path(os.path.expanduser(said)) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
+    place = Path(os.path.expanduser(said)) / _OWN if said else platformdirs.user_cache_path("jaxrock") / "compiled"
+    return place / _OWN if place.is_symlink() else place
+
+
+def folder_of(kind: str, make: bool = False) -> Path | None:
+    """The folder of one kind of what is kept; None where it is not there, or not private.
+
+    **Arguments:**
+
+    - `make`: whether it is made where it is missing.
+    """
+    place = folder()
+    return place / kind if place is not None and private(place, place / kind, make=make) else None
 
 
 def name_of(*parts: object) -> str:
@@ -36,33 +64,39 @@ def name_of(*parts: object) -> str:
 
 
 def read(kind: str, name: str) -> bytes | None:
-    """What is kept under a name; None if it is not there, or damaged."""
-    place = folder()
+    """What is kept under a name; None if it is not there, damaged, or if others could have written it."""
+    place = folder_of(kind)
     if place is None:
         return None
-    path = place / kind / name
+    path = place / name
     try:
-        content = path.read_bytes()
+        with open(os.open(path, _PLAINLY), "rb") as file:
+            content = file.read() if is_private_file(os.fstat(file.fileno())) else b""
     except OSError:
         return None
-    if content[:_DIGEST] != _digest(kind, name, content[_DIGEST:]):
-        with contextlib.suppress(OSError):
-            path.unlink()
+    found = _verified(kind, name, content)
+    if found is None:
+        remove(path)
         return None
     with contextlib.suppress(OSError):  # it may be read-only
         os.utime(path)
-    return content[_DIGEST:]
+    return found
 
 
 def write(kind: str, name: str, content: bytes) -> None:
     """Keep something under a name, if that can be done: nothing depends on it."""
-    place = folder()
+    place = folder_of(kind, make=True)
     if place is None:
         return
+    path = place / name
     try:
-        (place / kind).mkdir(parents=True, exist_ok=True)
-        with written_aside(place / kind / name, replace=True, lasting=False) as aside:
-            aside.write_bytes(_digest(kind, name, content) + content)
+        if os.path.lexists(path) and not _is_made(path):
+            return
+        with (
+            written_aside(path, replace=True, lasting=False) as aside,
+            open(os.open(aside, _ANEW, 0o600), "wb") as file,
+        ):
+            file.write(_MARK + _digest(kind, name, content) + content)
     except OSError:
         return
     with contextlib.suppress(OSError):  # somebody may be deleting all of it
@@ -74,30 +108,97 @@ def _digest(kind: str, name: str, content: bytes) -> bytes:
     return hashlib.sha256(f"{kind}/{name}\n".encode() + content).digest()
 
 
+def _verified(kind: str, name: str, content: bytes) -> bytes | None:
+    """What a file holds, with or without a mark; None if it is damaged, or was not made by the package."""
+    content = content.removeprefix(_MARK)
+    return content[_DIGEST:] if content[:_DIGEST] == _digest(kind, name, content[_DIGEST:]) else None
+
+
+def _is_made(path: Path) -> bool:
+    """Return whether the package made a file: by its owner and its mark, or by its digest.
+
+    One that is empty, or begins with zeros, is left of a loss of power, and holds nothing.
+    """
+    try:
+        with open(os.open(path, _PLAINLY), "rb") as file:
+            if not is_own_file(os.fstat(file.fileno())):
+                return False
+            head = file.read(len(_MARK))
+            if head == _MARK or not head.strip(b"\0"):
+                return True
+            return _verified(path.parent.name, path.name, head + file.read()) is not None
+    except OSError:
+        return False
+
+
+def remove(path: Path) -> None:
+    """Remove a file that is kept, if the package made it, or JAX for it."""
+    if path.parent.name not in KINDS or _is_made(path):
+        with contextlib.suppress(OSError):  # another process may have been faster
+            path.unlink()
+
+
 def prune(largest: int) -> None:
     """Delete what has not been used for longest, until the rest has `largest` bytes at most."""
     found = []
-    for path in kept():
-        with contextlib.suppress(OSError):  # another process may have been faster
-            about = path.stat()
-            if path.parent.name == OF_JAX:
-                continue
-            if not path.name.startswith("."):
-                found.append((about.st_mtime, about.st_size, path))
-            elif time.time() - about.st_mtime > _PATIENCE:
-                path.unlink()
+    for path, about in (each for kind in KINDS for each in _of_package(kind)):
+        if not path.name.startswith("."):
+            found.append((about.st_mtime, about.st_size, path))
+        elif time.time() - about.st_mtime > _PATIENCE:
+            remove(path)
     size = sum(each for _, each, _ in found)
     for _, each, path in sorted(found):
         if size <= largest:
             return
         size -= each
-        with contextlib.suppress(OSError):
-            path.unlink()
+        remove(path)
+
+
+def _of_package(kind: str) -> list[tuple[Path, os.stat_result]]:
+    """Regular files of the user's, with the package's names, in the folder of a kind."""
+    place, found = folder_of(kind), []
+    if place is None:
+        return found
+    for entry in os.scandir(place):
+        with contextlib.suppress(OSError):  # another process may have been faster
+            named = _NAME.fullmatch(entry.name) or _UNFINISHED.fullmatch(entry.name)
+            if named and is_own_file(about := entry.stat(follow_symlinks=False)):
+                found.append((place / entry.name, about))
+    return found
+
+
+def of_jax() -> tuple[list[Path], list[Path]]:
+    """Files in the folder that JAX looks after: those that it made for the user, and those that it must not meet.
+
+    These are links, files of other users, and files of other names that it would delete as its own.
+    """
+    made, others, place = [], [], folder_of(OF_JAX)
+    if place is None:
+        return made, others
+    for at, folders, files in os.walk(place):
+        for path in [Path(at) / name for name in (*files, *folders)]:
+            with contextlib.suppress(FileNotFoundError):  # another process may have been faster
+                about = path.lstat()
+                if is_own_file(about) and _NAME_OF_JAX.fullmatch(path.relative_to(place).as_posix()):
+                    made.append(path)
+                elif not stat.S_ISDIR(about.st_mode) and (not is_own_file(about) or _DELETED_BY_JAX.search(path.name)):
+                    others.append(path)
+    return made, others
 
 
 def kept() -> list[Path]:
-    """All files of the folder."""
-    place = folder()
-    if place is None or not place.is_dir():
-        return []
-    return [path for path in place.rglob("*") if path.is_file()]
+    """All files of the folder that the package made, or JAX for it."""
+    own = [path for kind in KINDS for path, _ in _of_package(kind) if _is_made(path)]
+    return own + of_jax()[0]
+
+
+def clear() -> None:
+    """Delete what is kept, and the folders that are empty then."""
+    for path in kept():
+        remove(path)
+    for kind in (*KINDS, OF_JAX):
+        place = folder_of(kind)
+        for each in [*(place.glob("xla_gpu_*") if place is not None else ()), place]:
+            with contextlib.suppress(OSError):  # something else lies there
+                if each is not None:
+                    each.rmdir()

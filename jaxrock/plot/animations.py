@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from jaxrock._arguments import arguments, at_least, path_of
+from jaxrock._aside import written_aside
 from jaxrock._checks import Values, scalar, size
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -193,11 +194,12 @@ def save_animation(
 
     **Arguments:**
 
-    - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4.
+    - `film`: result of `animate`. `path`: ends with .gif, .html or .mp4; a file that is there is replaced, and not
+      before the film is whole.
     - `dpi`: dots per inch.
 
     **Raises:** ValueError for another ending; for MP4 where the program ffmpeg is not there: that of the system, or of
-    `pip install "jaxrock[film]"`.
+    `pip install "jaxrock[film]"`. OSError if the file cannot be written.
     """
     import matplotlib
     from matplotlib.animation import FFMpegWriter
@@ -206,22 +208,27 @@ def save_animation(
     interval, path = own._interval, Path(path)  # that of `event_source` is cut to whole milliseconds
     kind = path.suffix.lower()
     if kind == ".gif":
-        film.save(path, writer=_gif_writer(interval), dpi=dpi)
+        with written_aside(path, replace=True, lasting=False) as aside:
+            film.save(aside, writer=_gif_writer(interval), dpi=dpi)
     elif kind == ".html":
         vars(own).pop("_html_representation", None)  # which matplotlib keeps, whatever dpi it is of
         # In megabytes: beyond it pictures would be left out. 1000 // fps is what a picture lasts.
         with matplotlib.rc_context({"savefig.dpi": dpi, "animation.embed_limit": 1e6}):
             with_size = film.to_jshtml(fps=1000 / (round(interval) + 0.5), embed_frames=True)
         title = html.escape(path.stem)
-        path.write_text(f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}", encoding="utf-8")
+        text = f"<!DOCTYPE html><meta charset='utf-8'><title>{title}</title>{with_size}"
+        with written_aside(path, replace=True, lasting=False) as aside:
+            aside.write_text(text, encoding="utf-8")
     elif kind == ".mp4":
         with matplotlib.rc_context({"animation.ffmpeg_path": _ffmpeg()}):
+            more = [*matplotlib.rcParams["animation.ffmpeg_args"], "-f", "mp4"]  # whatever its name ends with
             if not FFMpegWriter.isAvailable():
                 raise ValueError(
                     "Argument `path` must end with .gif or .html, as .mp4 needs the program ffmpeg, which is not "
                     'there: install it, or `pip install "jaxrock[film]"`.'
                 )
-            film.save(path, writer=FFMpegWriter(fps=round(1000 / interval, 6)), dpi=dpi)
+            with written_aside(path, replace=True, lasting=False) as aside:
+                film.save(aside, writer=FFMpegWriter(fps=round(1000 / interval, 6), extra_args=more), dpi=dpi)
     else:
         raise ValueError(f"Argument `path` must end with .gif, .html or .mp4, but is {str(path)!r}.")
 
@@ -238,7 +245,7 @@ def _gif_writer(interval: float):
             kept = frames[::every]
             due = np.append(np.arange(len(kept)) * every, len(frames)) * interval
             lasts = np.maximum(10 * np.diff(np.round(due / 10)), 20).astype(int).tolist()
-            kept[0].save(self.outfile, save_all=True, append_images=kept[1:], duration=lasts, loop=0)
+            kept[0].save(self.outfile, save_all=True, append_images=kept[1:], duration=lasts, loop=0, format="GIF")
 
     return Writer(fps=1000 / interval)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxrock._aside import written_aside
 from jaxrock._precision import setting
+from jaxrock._regular_files import open_regular
 from jaxrock.keeping.facts import code, version_of
 from jaxrock.sweeps.labels import RECORDS, layout_name
 
@@ -126,6 +127,7 @@ def _checksum(root: dict) -> str:
 
 def _read(file: Path):
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        with open_regular(file) as opened:
+            return json.loads(opened.read().decode("utf-8"))
     except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
         return None

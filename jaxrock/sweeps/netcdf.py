@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 from jaxrock._aside import written_aside
+from jaxrock._regular_files import open_regular
 from jaxrock._tables import needed
 
 _MARK = b"\njaxrock sha256 "
@@ -114,7 +115,7 @@ def opened(path: Path):
 
 
 def _verify(path: Path) -> None:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, 2) - len(_MARK) - _DIGEST
         file.seek(max(size, 0))
         mark, told = file.read(len(_MARK)), file.read()

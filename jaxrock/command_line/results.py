@@ -1,0 +1,115 @@
+"""The folder of results: it knows the files that the command wrote there, and replaces no others.
+
+They are told by their SHA-256 in one file beside them, to which lines are only added, before a result gets its name. So
+runs that write into one folder at once, or that are killed, know each other's results. A result that was changed since
+is not known any more.
+"""
+
+import contextlib
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from jaxrock._aside import move_into_place
+
+KNOWN = ".jaxrock.sha256"
+_TITLE = "# Files that jaxrock wrote here, by their SHA-256: these it replaces, all others with --force only."
+
+
+class ResultFolder:
+    """A folder, which need not be there yet.
+
+    - `inputs`: files that are read. `force`: whether these, and files that the command did not make, are replaced.
+    """
+
+    def __init__(self, path: Path, inputs: Iterable[Path] = (), force: bool = False):
+        self.path, self._inputs, self._force = path, list(inputs), force
+
+    def check(self, names: Iterable[str]) -> None:
+        """See that files may be written.
+
+        **Raises:** FileExistsError where they would replace an input, a file that the command did not make, or one that
+        was changed since.
+        """
+        found = [f"{self.path / name} {risk}" for name in names if (risk := self._risk(self.path / name))]
+        if not self._is_list_own():
+            found.append(f"{self.path / KNOWN} is not jaxrock's")
+        if found:
+            raise FileExistsError(
+                f"Argument `--out` must be a folder whose files may be replaced, but {'; '.join(found)}. Give another "
+                "--out, or --force to replace files."
+            )
+
+    @contextlib.contextmanager
+    def whole(self, name: str) -> Iterator[Path]:
+        """Where to write a file that is there whole or not at all; an error says which file it was."""
+        path = self.path / name
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            aside = Path(tempfile.mkdtemp(".partial", f".{name}.", self.path))
+            try:
+                yield aside / name
+                self.check([name])  # another program may have written it meanwhile
+                self._note(name, _digest(aside / name))
+                move_into_place(aside / name, path, replace=os.path.lexists(path))
+            finally:
+                shutil.rmtree(aside, ignore_errors=True)
+        except FileExistsError:
+            raise
+        except OSError as error:
+            raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
+
+    def discard(self, name: str) -> None:
+        """Remove the result of an earlier run, if it is there as the command wrote it."""
+        path = self.path / name
+        if self._is_own(path):
+            path.unlink()
+
+    def _risk(self, path: Path) -> str | None:
+        """Return why a file must not be replaced, else None."""
+        if not os.path.lexists(path):
+            return None
+        if path.is_dir() and not path.is_symlink():
+            return "is a folder"
+        if self._force or self._is_own(path) and not self._is_input(path):
+            return None
+        return "is an input" if self._is_input(path) else "was not made by jaxrock, or was changed since"
+
+    def _is_input(self, path: Path) -> bool:
+        """Return whether a file is one of those that are read, by whatever name or link."""
+        return any(path.exists() and each.exists() and path.samefile(each) for each in self._inputs)
+
+    def _is_own(self, path: Path) -> bool:
+        """Return whether a file is as the command wrote it."""
+        if not path.is_file() or path.is_symlink() or not self._is_list_own():
+            return False
+        return f"{_digest(path)}  {path.name}" in self._told().splitlines()
+
+    def _is_list_own(self) -> bool:
+        known = self.path / KNOWN
+        return not os.path.lexists(known) or not known.is_symlink() and self._told().startswith(_TITLE)
+
+    def _told(self) -> str:
+        known = self.path / KNOWN
+        return known.read_text(encoding="utf-8", errors="replace") if known.is_file() else ""
+
+    def _note(self, name: str, digest: str) -> None:
+        """Add a line, in one piece, if it is new."""
+        told, line = self._told(), f"{digest}  {name}"
+        if line in told.splitlines():
+            return
+        start = "" if told.endswith("\n") else "\n" if told else f"{_TITLE}\n"  # a full disk may have cut the last line
+        with open(self.path / KNOWN, "a", encoding="utf-8", opener=_opened) as file:
+            file.write(f"{start}{line}\n")
+
+
+def _opened(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

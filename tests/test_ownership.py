@@ -1,0 +1,343 @@
+"""Kept programs run with their user's rights: only what no other user could have written is read, and only what the
+package made is removed."""
+
+import os
+import stat
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import jax
+import pytest
+
+from jaxrock.command_line.main import main
+from jaxrock.keeping import compiled, folder, ownership
+from jaxrock.keeping.compiled import keep_compiled
+
+NAME, OTHER = "jaxrock_" + 20 * "a", 40 * "b"
+OF_JAX = f"jit_f-{64 * 'c'}-cache"
+STRANGER = 65534  # `nobody`
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has no owners of this kind")
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The folder of what is kept, with one program in it; and every warning is said anew."""
+    ownership.warn_once.cache_clear()
+    (tmp_path / "of the user").mkdir()
+    monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "of the user"))
+    folder.write("machine", NAME, b"content")
+    assert folder.read("machine", NAME) == b"content"
+    return folder.folder()
+
+
+@pytest.fixture
+def give_away(monkeypatch):
+    """Let a path belong to another user: as root it is given to one, else its owner is told to be one."""
+
+    def given(path):
+        if os.geteuid() == 0:
+            return os.chown(path, STRANGER, STRANGER, follow_symlinks=False)
+        number, told = os.lstat(path).st_ino, {"fstat": os.fstat, "lstat": os.lstat, "stat": os.stat}
+
+        def of_another(ask):
+            def asked(*args, **kwargs):
+                about = ask(*args, **kwargs)
+                return os.stat_result([*about[:4], STRANGER, *about[5:]]) if about.st_ino == number else about
+
+            return asked
+
+        for name, ask in told.items():
+            monkeypatch.setattr(os, name, of_another(ask))
+
+    return given
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def refused(message):
+    """Nothing is read or written, and one warning says why."""
+    with pytest.warns(RuntimeWarning, match=message) as said:
+        assert folder.read("machine", NAME) is None
+        folder.write("machine", OTHER, b"content")
+        assert folder.read("machine", OTHER) is None
+    assert len(said) == 1 and "Let JAXROCK_CACHE name a folder of yours" in str(said[0].message)
+    return True
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o022, 0o077])
+def test_what_is_made_is_for_its_user_alone(tmp_path, monkeypatch, umask):
+    monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "new" / "kept"))
+    before = os.umask(umask)
+    try:
+        folder.write("machine", NAME, b"content")
+    finally:
+        os.umask(before)
+    place = folder.folder()
+    assert [mode(each) for each in (place.parent.parent, place.parent, place, place / "machine")] == 4 * [0o700]
+    assert mode(place / "machine" / NAME) == 0o600
+
+
+@pytest.mark.parametrize("loose", [0o755, 0o775, 0o777])
+def test_a_folder_of_the_users_is_closed_to_others(place, loose):
+    for each in (place, place / "machine"):
+        each.chmod(loose)
+    assert folder.read("machine", NAME) == b"content"
+    assert mode(place) == mode(place / "machine") == 0o700
+
+
+@pytest.mark.parametrize("which", ["whole", "machine"])
+def test_a_folder_of_another_user_is_not_used(place, give_away, which):
+    give_away(place if which == "whole" else place / "machine")
+    assert refused("belongs to another user")
+
+
+def test_a_file_of_another_user_is_not_read(place, give_away):
+    """It is neither replaced nor removed, and another is kept beside it."""
+    give_away(place / "machine" / NAME)
+    assert folder.read("machine", NAME) is None
+    folder.write("machine", NAME, b"another")
+    assert folder.read("machine", NAME) is None and (place / "machine" / NAME).read_bytes().endswith(b"content")
+    folder.write("machine", OTHER, b"content")
+    assert folder.read("machine", OTHER) == b"content"
+
+
+@pytest.mark.parametrize("loose", [0o620, 0o602, 0o666])
+def test_a_file_that_others_could_write_is_made_anew(place, loose):
+    path = place / "machine" / NAME
+    path.chmod(loose)
+    assert folder.read("machine", NAME) is None and not path.exists()
+    folder.write("machine", NAME, b"anew")
+    assert folder.read("machine", NAME) == b"anew"
+
+
+def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
+    """Nor one that is no regular file: to open a pipe would wait."""
+    path = place / "machine" / NAME
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    os.mkfifo(place / "machine" / OTHER)
+    for name in (NAME, OTHER):
+        assert folder.read("machine", name) is None
+        folder.write("machine", name, b"content")
+        assert folder.read("machine", name) is None
+    assert path.is_symlink() and (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("bits, good", [(0o777, False), (0o1777, True), (0o755, True), (0o1775, True)])
+def test_a_parent_in_which_others_may_write(place, bits, good):
+    """They could rename the folder, and put another in its place: not where it is sticky, as /tmp is."""
+    place.parent.chmod(bits)
+    assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
+
+
+@pytest.mark.parametrize(
+    "members, primary, good",
+    [([], True, True), (["me"], True, True), (["me", "you"], True, False), ([], False, False)],
+)
+def test_a_parent_that_a_group_may_write(place, monkeypatch, members, primary, good):
+    """Good where the group is the user's own; many systems make folders so."""
+    import grp
+    import pwd
+    from types import SimpleNamespace
+
+    group = place.parent.stat().st_gid
+    monkeypatch.setattr(
+        pwd, "getpwuid", lambda _: SimpleNamespace(pw_name="me", pw_gid=group if primary else group + 1)
+    )
+    monkeypatch.setattr(grp, "getgrgid", lambda _: SimpleNamespace(gr_mem=members))
+    place.parent.chmod(0o775)
+    assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
+
+
+def test_a_parent_of_another_user(place, give_away):
+    give_away(place.parent)
+    assert refused("of the user, on the way to them, belongs to another user")
+
+
+def test_owners_that_a_container_does_not_know(place, give_away, monkeypatch):
+    """In a user namespace the folders of the machine's root seem to be `nobody`'s; the folder itself may not."""
+    monkeypatch.setattr(ownership, "_is_mapped", lambda: True)
+    give_away(place.parent)
+    assert folder.read("machine", NAME) == b"content"
+    give_away(place)
+    assert refused("belongs to another user")
+
+
+@pytest.mark.parametrize(
+    "told, mapped", [("0 0 4294967295\n", False), ("0 1000 1\n1 100000 65536\n", True), (None, False)]
+)
+def test_containers_are_told_by_their_map_of_users(monkeypatch, told, mapped):
+    def read(path):
+        if told is None:
+            raise FileNotFoundError
+        return told
+
+    monkeypatch.setattr(Path, "read_text", read)
+    assert ownership._is_mapped.__wrapped__() == mapped
+
+
+@pytest.mark.parametrize("whose", ["the user's", "another's"])
+@pytest.mark.parametrize("linked", ["the folder", "its parent"])
+def test_a_link_to_a_larger_disk(place, tmp_path, give_away, whose, linked):
+    """The user's own is followed, to a folder within what it leads to; what another user planted is not."""
+    link = place if linked == "the folder" else place.parent
+    link.rename(tmp_path / "kept before")
+    (tmp_path / "disk").mkdir()
+    link.symlink_to(tmp_path / "disk")
+    if whose == "another's":
+        give_away(link)
+        assert refused("on the way to them, belongs to another user")
+        assert not list((tmp_path / "disk").iterdir())
+        return
+    folder.write("machine", NAME, b"content")
+    assert folder.read("machine", NAME) == b"content"
+    assert [path.name for path in (tmp_path / "disk").iterdir()] == ["jaxrock-compiled"]
+
+
+def test_a_link_within_the_folder_is_not_followed(place, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (place / "machine").rename(tmp_path / "kept before")
+    (place / "machine").symlink_to(tmp_path / "elsewhere")
+    assert refused("machine is a link") and not list((tmp_path / "elsewhere").iterdir())
+
+
+USERS = (
+    ".bashrc",
+    "thesis.tex",
+    "results.h5",
+    "machine/mine.o",
+    "machine/deeper/file",
+    f"machine/{OTHER}",
+    f"lowered/.{NAME}.{32 * '0'}.partial",
+    "xla/my-cache",
+)
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_only_what_the_package_made_is_removed(place, tmp_path, capsys, linked):
+    """Of a home with old and large files, to which the folder is a link, or that was copied into it: some have even
+    names of the package's."""
+    home = tmp_path / "home" if linked else place
+    if linked:
+        place.rename(tmp_path / "kept before")
+        place.symlink_to(home)
+    for name in USERS:
+        file = home / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("years of work")
+        os.utime(file, (1e9, 1e9))
+    with (home / "results.h5").open("ab") as file:
+        file.truncate(2 * folder.LARGEST)  # of holes
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("years of work")
+    folder.write("machine", NAME, b"content")
+    (folder.folder() / "machine" / ("jaxrock_" + 20 * "d")).symlink_to(elsewhere)
+    folder.prune(0)
+    assert not folder.kept()
+    folder.write("machine", NAME, b"content")
+    assert main(["cache", "--clear"]) == 0 and "1 compiled programs" in capsys.readouterr().out
+    for name in USERS:
+        with (home / name).open() as file:
+            assert file.read(13) == "years of work"
+    assert elsewhere.exists() and not folder.kept()
+
+
+def test_what_was_never_finished_goes_after_a_while(place):
+    for age, name in ((0, NAME), (1000, OTHER)):
+        unfinished = place / "machine" / f".{name}.{32 * '0'}.partial"
+        unfinished.write_bytes(folder._MARK + b"half")
+        when = unfinished.stat().st_mtime - age
+        os.utime(unfinished, (when, when))
+    folder.prune(folder.LARGEST)
+    assert {path.name for path in folder.kept()} == {NAME, f".{NAME}.{32 * '0'}.partial"}
+
+
+def test_files_without_a_mark_are_known_by_their_digest(place):
+    path = place / "machine" / NAME
+    path.write_bytes(path.read_bytes().removeprefix(folder._MARK))
+    assert folder.read("machine", NAME) == b"content" and folder.kept() == [path]
+    folder.clear()
+    assert not path.exists()
+
+
+@pytest.fixture
+def unset(monkeypatch):
+    """No cache of JAX is set; what would be is told."""
+    told = {}
+    monkeypatch.setattr(compiled, "setting", lambda _: None)
+    monkeypatch.setattr(compiled, "compile_quickly", lambda: None)
+    monkeypatch.setattr(jax.config, "update", told.__setitem__)
+    return told
+
+
+def test_jax_keeps_its_programs_in_a_private_folder(place, unset):
+    """Beside what another release of JAX may write there."""
+    (place / folder.OF_JAX).mkdir()
+    (place / folder.OF_JAX / "of another release").touch()
+    keep_compiled()
+    assert unset["jax_compilation_cache_dir"] == str(place / folder.OF_JAX) and mode(place / folder.OF_JAX) == 0o700
+
+
+@pytest.mark.parametrize(
+    "planted", ["a file of another user", "a link", "a file of another name", "its folder is a link"]
+)
+def test_jax_runs_nothing_of_others(place, unset, tmp_path, give_away, planted):
+    """JAX reads any file in its folder, follows links, and deletes what has its names."""
+    there = place / folder.OF_JAX
+    if planted == "its folder is a link":
+        there.symlink_to(tmp_path)
+    else:
+        there.mkdir()
+        file = there / (OF_JAX if planted != "a file of another name" else "my-cache")
+        file.touch() if planted != "a link" else file.symlink_to(tmp_path)
+        if planted == "a file of another user":
+            give_away(file)
+    with pytest.warns(RuntimeWarning, match="are not kept between sessions"):
+        keep_compiled()
+    assert not unset
+
+
+@pytest.mark.parametrize("loose, left", [(0o755, True), (0o775, False), (0o777, False)])
+def test_what_jax_kept_where_others_could_write_is_forgotten(place, unset, loose, left):
+    there = place / folder.OF_JAX
+    there.mkdir()
+    (there / OF_JAX).touch()
+    there.chmod(loose)
+    keep_compiled()
+    assert (there / OF_JAX).exists() == left and mode(there) == 0o700 and unset
+
+
+def test_names_of_jax_are_those_that_it_gives(tmp_path):
+    """As of this release; of what it writes nothing is left."""
+    code = """
+import jax, os, sys, jaxrock as rk
+from jaxrock.keeping import folder
+rk.keep_compiled()
+jax.jit(lambda x: 2 * x)(1.0)
+made, others = folder.of_jax()
+assert made and not others, others
+assert set(folder.kept()) == {path for path in folder.folder().rglob("*") if path.is_file()}
+folder.clear()
+assert not list(folder.folder().iterdir())
+"""
+    environment = os.environ | {"JAXROCK_CACHE": str(tmp_path / "kept"), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_computation_goes_on_where_nothing_may_be_kept(place, give_away):
+    """The answer is the same, and the warning is one."""
+    import jaxrock as rk
+
+    give_away(place)
+    jax.clear_caches()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        outcome = rk.outcome(rk.Block(0.2, 2.0), rk.SinePulse(0.41, 0.77), rk.Linear(), engine=rk.Series(order=4))
+        assert float(outcome.max_rotation) > 0
+    assert sum("are not kept between sessions" in str(each.message) for each in said) == 1
