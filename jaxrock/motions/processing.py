@@ -29,7 +29,7 @@ from jaxrock._checks import (
 )
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, LENGTHS
-from jaxrock.motions.filters import LOWEST, butterworth, of_displacement, of_velocity, smoothed
+from jaxrock.motions.filters import LOWEST, NARROWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
 from jaxrock.motions.record import Record
 from jaxrock.motions.two_sensors import slow_difference, spline_of_displacement
@@ -251,9 +251,10 @@ def filtered(
     - `order`: of the filter.
     - `zero_phase`: whether it runs forwards and backwards (which doubles its order); the ground rests before and after.
 
-    **Returns:** a `Record`.
+    **Returns:** a `Record` of as many samples: what rings on before its beginning and after its end is left out.
 
-    **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate.
+    **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate, or
+    within a millionth of one another.
     """
     samples, dt = _samples(record)
     low, high = _corner("low", low, dt), _corner("high", high, dt)
@@ -261,6 +262,8 @@ def filtered(
         raise ValueError("Arguments `low` and `high` must not both be None.")
     if low is not None and high is not None and low >= high:
         raise ValueError(f"Argument `high` must be above `low`, {low} Hz, but is {high}.")
+    if low is not None and high is not None and high - low < NARROWEST * high:
+        raise ValueError(f"Argument `high` must be above `low`, {low} Hz, by a millionth of itself, but is {high}.")
     return _like(record, butterworth(samples, dt, low, high, order, zero_phase))
 
 
