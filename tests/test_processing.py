@@ -70,7 +70,8 @@ def test_filters_keep_what_passes(low, high, kept):
 
 # Corners [Hz] and order: bands down to a hundredth of their frequency, a double pole, both ends of the range.
 FILTERS = [(0.5, 0.52, 4), (5.0, 5.2, 4), (2.0, 2.02, 3), (3.0, 3.3, 6), (1.0, 1.5, 20), (1.0, 3 + 8**0.5, 1),
-           (0.05, 0.06, 2), (0.05, 49.0, 5), (None, 0.02, 20), (None, 20.0, 7), (0.02, None, 9), (40.0, None, 1)]  # fmt: skip
+           (0.05, 0.06, 2), (0.05, 49.0, 5), (None, 0.02, 20), (None, 20.0, 7),
+           (0.02, None, 9), (40.0, None, 1)]  # fmt: skip
 
 
 def by_the_spectrum(values, low, high, order, count=1 << 19):

@@ -14,7 +14,7 @@ NARROWEST = 1e-6  # width of a band over its upper corner, for the same reason
 
 
 def smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, beyond: Callable) -> np.ndarray:
-    """Pass values, as they go on `beyond` both ends for ever, forwards and backwards through a low-pass (None: none)."""
+    """Pass values, which go on `beyond` both ends for ever, forwards and backwards through a low-pass (None: none)."""
     return values if corner is None else beyond(values, lambda whole: _smoothed_period(whole, dt, corner, order))
 
 
@@ -91,5 +91,5 @@ def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, 
 
 
 def _one_pole(values: np.ndarray, size: complex, sign: int, pole: complex) -> np.ndarray:
-    """Pass values through size/(s - pole), of sign 1, or size s/(s - pole), of sign -1, with s = (1 - 1/z)/(1 + 1/z)."""
+    """Pass values through size/(s - pole), sign 1, or size s/(s - pole), sign -1, with s = (1 - 1/z)/(1 + 1/z)."""
     return scipy.signal.lfilter([size, sign * size], [1 - pole, -(1 + pole)], values)

@@ -94,12 +94,13 @@ def peak_displacement(motion: AbstractMotion) -> float:
     lines = straight(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
     largest = np.abs(places).max(initial=0.0)
-    # Where the velocity v + a t + j t^2/2 passes zero within a line.
+    # Where the velocity v + a t + j t^2/2 passes zero within a line, also one that begins without any.
     slope = (lines.end - lines.begin) / lines.length
     root = np.sqrt(np.maximum(lines.begin**2 - 2 * slope * velocity, 0.0))
-    for lead in (lines.begin + root, lines.begin - root):
-        with np.errstate(all="ignore"):
-            time = -2 * velocity / lead
+    lead = lines.begin + np.copysign(root, lines.begin)
+    with np.errstate(all="ignore"):
+        times = -2 * velocity / lead, -lead / slope
+    for time in times:
         time = np.where((time > 0) & (time < lines.length), time, 0.0)
         there = places[:-1] + velocity * time + lines.begin * time**2 / 2 + slope * time**3 / 6
         largest = max(largest, np.abs(there).max(initial=0.0))
