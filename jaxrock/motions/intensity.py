@@ -16,7 +16,8 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, below_one, check_known, checked, inner_share, is_traced, scalar
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, Block
-from jaxrock.motions.motion import AbstractMotion, Shifted
+from jaxrock.motions.fourier import squared_amplitudes
+from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.oscillator import peaks_of_oscillator
 from jaxrock.motions.peaks import peaks_and_last_velocity
 from jaxrock.motions.record import Record
@@ -34,7 +35,6 @@ def __dir__() -> list[str]:
 
 
 _LONG = 100  # samples of a record that is more than a pulse
-_APART, _SHORT, _MOST = 5e-3, 2.5e-4, 1 << 20  # Fourier amplitudes [Hz]; steps of time for them [s], and how many
 
 
 @arguments
@@ -205,33 +205,13 @@ def mean_period(motion: AbstractMotion) -> float:
 
     **Source:** Rathje, Abrahamson & Bray (1998), whose sums over frequencies are these integrals.
     """
-    while isinstance(motion, Shifted):  # as it was before, and in no finer steps
-        motion = motion.motion
     lines = straight(motion)
-    lasting = lines.length[lines.length > 0]
-    if lasting.size == 0:
+    if not (lines.length > 0).any():
         raise ValueError("Argument `motion` must last, but ends where it begins.")
-    end = lines.times[-1]
-    step = max(min(_SHORT, end / 1000), end / _MOST)
-    if lasting.size > 1 and np.ptp(lasting) <= 1e-9 * lasting.max() and np.allclose(lines.begin[1:], lines.end[:-1]):
-        step = max(lasting.min(), step)  # such lines are known by their ends
-    time = step * np.arange(int(np.floor(end / step * (1 + 1e-12))) + 1)
-    knots = np.stack([lines.times[:-1], lines.times[1:] - 1e-9 * step], axis=1).ravel()
-    values = np.stack([lines.begin, lines.end], axis=1).ravel()
-    # At a jump the mean of both sides, so that it comes neither too early nor too late.
-    samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
-    count = 1 << int(np.ceil(np.log2(max(2 * samples.size, 1 / (_APART * step)))))
-    number = np.arange(int(20 * count * step) + 2)
-    grid = number / (count * step)
-    # Of straight lines between the samples: that of samples, which comes again beyond half of their rate, but weaker.
-    again = np.abs((number + count // 2) % count - count // 2)
-    found = (np.abs(np.fft.rfft(samples, count))[again] * np.sinc(grid * step) ** 2) ** 2
-    frequency = np.concatenate([[0.25], grid[(grid > 0.25) & (grid < 20)], [20.0]])
-    power = np.interp(frequency, grid, found)
-    total = np.trapezoid(power, frequency)
+    total, weighted = squared_amplitudes(lines, (0.25, 20.0))
     if not total > 0:
         raise ValueError("Argument `motion` must move between 0.25 and 20 Hz, but does not.")
-    return float(np.trapezoid(power / frequency, frequency) / total)
+    return weighted / total
 
 
 @arguments

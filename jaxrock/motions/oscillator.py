@@ -40,7 +40,9 @@ def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: flo
     if cut.size:
         peaks = np.maximum(peaks, _peaks_of_parts(_rows(lines, cut), states[:-1][cut], parts[cut], s))
     if long.any():
-        peaks = np.maximum(peaks, _peaks_of_long_lines(_rows(lines, np.flatnonzero(long)), states[:-1][long], s, window))
+        peaks = np.maximum(
+            peaks, _peaks_of_long_lines(_rows(lines, np.flatnonzero(long)), states[:-1][long], s, window)
+        )
     return peaks
 
 
@@ -98,7 +100,7 @@ def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
     from scipy.signal import lfilter
 
     x = s * lines.length
-    first, second = _integrals(x, lines.length, s)
+    first, second = integrals_of_exponential(x, lines.length)
     gain, factor = lines.begin * (first - second) + lines.end * second, np.exp(x)
     edges = np.flatnonzero(np.concatenate([[True], np.abs(np.diff(lines.length)) > 0, [True]]))
     if edges.size > x.size // 16:  # few lines of one length: a filter of each would cost more than a loop
@@ -117,16 +119,16 @@ def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
 def _after(a: np.ndarray, slope: np.ndarray, state: np.ndarray, time: np.ndarray, s: complex) -> np.ndarray:
     """z some time after the beginning of a line."""
     x = s * time
-    first, second = _integrals(x, time, s)
+    first, second = integrals_of_exponential(x, time)
     return np.exp(x) * state + a * first + slope * time * second
 
 
-def _integrals(x: np.ndarray, time: np.ndarray, s: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals over the time of e^(s (time - t)), and of that times t/time; x is s time."""
+def integrals_of_exponential(x: np.ndarray, time: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals from 0 to some time of e^(x t/time), and of that times 1 - t/time."""
     small = np.abs(x) < 1e-2
     far = np.where(small, 1.0, x)
-    first = np.where(small, time * _series(x, 1), np.expm1(far) / s)
-    return first, np.where(small, time * _series(x, 2), (np.expm1(far) / far - 1) / s)
+    first = np.expm1(far) / far
+    return time * np.where(small, _series(x, 1), first), time * np.where(small, _series(x, 2), (first - 1) / far)
 
 
 def _series(x: np.ndarray, first: int) -> np.ndarray:

@@ -88,7 +88,9 @@ def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
     smooth = lasting & np.isfinite(scales)
     changes = np.where(smooth, lengths / np.where(smooth, scales, 1.0), 0.0)
     if changes.sum() * _FEWEST > _MOST:
-        told = f"{_MOST // _FEWEST} times the time in which its acceleration changes, but lasts {changes.sum():.3g} times"
+        told = (
+            f"{_MOST // _FEWEST} times the time in which its acceleration changes, but lasts {changes.sum():.3g} times"
+        )
         raise ValueError(f"Argument `motion` must last at most {told} that: make a `Record` of what matters of it.")
     wanted = np.maximum(_PER_SCALE * changes, np.where(smooth, _LINES / max(smooth.sum(), 1), 0.0))
     return np.where(lasting, np.ceil(np.maximum(wanted * min(1.0, _MOST / max(wanted.sum(), 1.0)), 1.0)), 0).astype(int)
