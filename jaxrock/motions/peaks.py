@@ -60,11 +60,16 @@ def _fine_enough(motion: Any, peaks: Callable) -> tuple:
     if not most > 0:  # NaN of a motion that is
         return tuple(found)
     if most > _MOST:
-        told = (
-            f"{_MOST // _LEAST} times the time in which its acceleration changes, but lasts {most / _LEAST:.3g} times"
-        )
-        raise ValueError(f"Argument `motion` must last at most {told} that: make a `Record` of what matters of it.")
+        raise too_long(_MOST // _LEAST, most / _LEAST)
     return tuple(peaks(motion, min(_MOST, 1 << int(np.ceil(np.log2(most * _PER_SCALE / _LEAST)))))[:-1])
+
+
+def too_long(most: float, lasts: float) -> ValueError:
+    """Of motions with more cycles than are followed."""
+    return ValueError(
+        f"Argument `motion` must last at most {most:g} times the time in which its acceleration changes, but lasts "
+        f"{lasts:.3g} times that: make a `Record` of what matters of it."
+    )
 
 
 @quickly(static_argnums=1)
@@ -147,7 +152,8 @@ def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
 
 def _parts_by_scale(motion: AbstractMotion, room: int) -> tuple[Array, Array, Array]:
     """As `_parts`, one of every piece and so many more, as their curves ask for."""
-    lengths, wanted = motion.lengths, _PER_SCALE * motion.lengths / motion.scales
+    lengths, scales = motion.lengths, jnp.inf if motion.scales is None else motion.scales
+    wanted = _PER_SCALE * lengths / scales
     counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
     total = lengths.size + room  # those that are left over lie at the end, without a length
     piece = jnp.repeat(jnp.arange(lengths.size), counts, total_repeat_length=total)

@@ -10,6 +10,7 @@ from jaxrock._checks import check_known
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
+from jaxrock.motions.peaks import too_long
 from jaxrock.motions.record import Record
 
 _LINES = 16384  # of smooth pieces, at least
@@ -88,10 +89,7 @@ def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
     smooth = lasting & np.isfinite(scales)
     changes = np.where(smooth, lengths / np.where(smooth, scales, 1.0), 0.0)
     if changes.sum() * _FEWEST > _MOST:
-        told = (
-            f"{_MOST // _FEWEST} times the time in which its acceleration changes, but lasts {changes.sum():.3g} times"
-        )
-        raise ValueError(f"Argument `motion` must last at most {told} that: make a `Record` of what matters of it.")
+        raise too_long(_MOST // _FEWEST, changes.sum())
     wanted = np.maximum(_PER_SCALE * changes, np.where(smooth, _LINES / max(smooth.sum(), 1), 0.0))
     return np.where(lasting, np.ceil(np.maximum(wanted * min(1.0, _MOST / max(wanted.sum(), 1.0)), 1.0)), 0).astype(int)
 
