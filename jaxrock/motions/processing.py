@@ -31,7 +31,7 @@ from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, LENGTHS
 from jaxrock.motions.filters import LOWEST, NARROWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, record_in_g
 from jaxrock.motions.two_sensors import slow_difference, spline_of_displacement
 
 __all__ = [
@@ -65,7 +65,7 @@ def _slack(record: Record) -> float:
 
 
 def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Record:
-    return Record(samples, record.dt if dt is None else dt, record.name, record.origin)
+    return record_in_g(samples, record.dt if dt is None else dt, record.name, record.origin)
 
 
 def _corner(name: str, value: float | None, dt: float) -> float | None:
@@ -124,7 +124,7 @@ def from_displacement(
     """
     values, dt = _series("displacement", displacement, dt, unit)
     values = smoothed(values - values[0], dt, _corner("corner", corner, dt), order, of_displacement)
-    return Record(spline_of_displacement(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
+    return record_in_g(spline_of_displacement(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
 
 
 @arguments
@@ -153,7 +153,7 @@ def from_velocity(
     values, dt = _series("velocity", velocity, dt, unit)
     values = smoothed(values, dt, _corner("corner", corner, dt), order, of_velocity)
     spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
-    return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
+    return record_in_g(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
 
 
 @arguments

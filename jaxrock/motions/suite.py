@@ -22,7 +22,7 @@ from jaxrock.motions.components import Components
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.peaks import peaks_of_many, peaks_of_motion
-from jaxrock.motions.record import Record, with_room
+from jaxrock.motions.record import Record, record_in_g, with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
@@ -184,7 +184,7 @@ def _multiplied(motion: Any) -> Record:
     if isinstance(motion, Record):
         return motion
     record = motion.motion
-    return Record(motion.factor * record.samples, record.dt, record.name, record.origin)
+    return record_in_g(motion.factor * record.samples, record.dt, record.name, record.origin)
 
 
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None, vertical: bool):
