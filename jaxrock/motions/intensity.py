@@ -1,8 +1,9 @@
 """Intensity measures of ground motions: peaks, what is summed over time, response spectra, rocking's own.
 
 `peak_acceleration`, `peak_velocity` and their ratios to a block's are functions of JAX. The others are of known
-motions, in NumPy and SciPy: exact for records (straight lines between samples), to about 1e-7 for pulses. g is 9.81
-m/s^2.
+motions, in NumPy and SciPy: exact for records (straight lines between samples), to about 1e-7 for pulses. A pulse of
+thousands of cycles is followed as finely as one; of more than 5,000 (20 for functions of JAX under tracing) it is
+refused. Quiet within a motion costs nothing. g is 9.81 m/s^2.
 """
 
 import warnings
@@ -46,6 +47,8 @@ def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
     - `motion`: a motion of scalar parameters (use `jax.vmap` for many).
 
     **Returns:** the largest |acceleration|: exact for records and straight lines, to about 1e-9 for smooth pulses.
+
+    **Raises:** ValueError for a motion of too many cycles within a piece.
     """
     check_single(motion=motion)
     return peaks_and_last_velocity(motion)[0]
@@ -90,6 +93,8 @@ def peak_displacement(motion: AbstractMotion) -> float:
 
     **Returns:** the largest |displacement|, also between samples. It warns of a record of 100 samples or more whose
     ground ends further away than half of that: its baseline drifts. (Where a fault has moved the ground it may be so.)
+
+    **Raises:** ValueError for a motion of too many cycles within its pieces.
     """
     lines = straight(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
