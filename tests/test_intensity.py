@@ -62,6 +62,12 @@ def test_significant_duration_of_a_sine_pulse():
     assert rk.intensity.significant_duration(SINE) == pytest.approx(np.diff(ends)[0], rel=1e-9)
 
 
+def test_a_share_that_is_reached_before_a_pause():
+    """Two equal shocks: half of the intensity has come where the pause begins, not where it ends."""
+    record = rk.Record([0.3, 0.0, 0.0, 0.0, 0.0, 0.3], 1.0)
+    assert rk.intensity.significant_duration(record, 0.25, 0.5) == pytest.approx(0.5 ** (1 / 3), rel=1e-4)
+
+
 def test_of_a_record_by_quadrature():
     """Each line by itself: quadrature knows nothing of closed forms."""
     time = 0.02 * np.arange(NOISE.size)

@@ -185,8 +185,8 @@ def _squares(lines: Straight) -> np.ndarray:
 
 
 def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
-    """When the integral of the squared acceleration has come to a value: halved down to rounding within a line."""
-    row = min(int(np.searchsorted(sums, wanted, side="right")) - 1, lines.length.size - 1)
+    """When the integral of the squared acceleration first comes to a value: halved down to rounding within a line."""
+    row = min(max(int(np.searchsorted(sums, wanted)) - 1, 0), lines.length.size - 1)
     a, b, length = (float(part[row]) for part in lines)
     low, high = 0.0, 1.0
     for _ in range(60):
