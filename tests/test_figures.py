@@ -456,7 +456,7 @@ def test_arguments_of_figures_are_checked():
 def test_a_history_over_long_quiet_shows_what_happens_in_it():
     """Of two shocks a day apart, and of a wavelet within a long piece: peaks are drawn as high as they are."""
     pulse = rk.SinePulse(0.4, 0.8)
-    response = rk.simulate(rk.Block(0.3, 2.0), pulse + pulse.shifted(86_400.0))
+    response = rk.simulate(rk.Block(0.3, 2.0), pulse + pulse.shifted(86_400.0), **QUICK)
     axes = rk.plot.history(response)
     (time, rotation), (shaken, ground) = (axes[k].lines[0].get_data() for k in (0, 2))
     assert np.abs(rotation).max() == pytest.approx(float(response.max_rotation) / 0.3, rel=1e-4)
