@@ -14,6 +14,7 @@ import jaxrock as rk
 from jaxrock.closed_form import sine_pulse, single_lobe
 from jaxrock.inverse.search import Trace
 from jaxrock.motions.pulses import PULSES, UNITS
+from jaxrock.plot.responses import acceleration_of, moments_seen
 from jaxrock.studies.saved_outcomes import an_outcome
 from jaxrock.studies.sensitivities import Slopes, SlopeStatus
 
@@ -450,3 +451,18 @@ def test_arguments_of_figures_are_checked():
     for call, words in wrong_figures():
         with pytest.raises(ValueError, match=f"Arguments? {words}"):
             call()
+
+
+def test_a_history_over_long_quiet_shows_what_happens_in_it():
+    """Of two shocks a day apart, and of a wavelet within a long piece: peaks are drawn as high as they are."""
+    pulse = rk.SinePulse(0.4, 0.8)
+    response = rk.simulate(rk.Block(0.3, 2.0), pulse + pulse.shifted(86_400.0), **QUICK)
+    axes = rk.plot.history(response)
+    (time, rotation), (shaken, ground) = (axes[k].lines[0].get_data() for k in (0, 2))
+    assert np.abs(rotation).max() == pytest.approx(float(response.max_rotation) / 0.3, rel=1e-4)
+    assert np.abs(ground).max() == pytest.approx(0.4, rel=1e-6)
+    for begin in (0.0, 86_400.0):
+        assert np.sum((time > begin) & (time < begin + 0.8)) > 50
+    wavelet = rk.RickerPulse(0.4, 0.1, center=1000.0)
+    shaken = moments_seen(wavelet, 0.0, 2000.0, 20_001)
+    assert np.abs(acceleration_of(wavelet, shaken)).max() > 0.39

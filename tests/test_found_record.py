@@ -113,7 +113,7 @@ PERIODS = (0.25, 0.4, 0.7)
 
 def test_oscillators_are_those_of_the_intensities():
     """At the samples, and by rows as by recursion."""
-    samples = np.random.default_rng(3).normal(size=60)
+    samples = np.random.default_rng(3).normal(0, 0.3, 60)
     for period in PERIODS:
         kept = KeptSpectrum.of(np.array([period]), samples, 0.01)
         there = kept.displacement(period, samples)

@@ -1,6 +1,7 @@
 """Measures of intensity: closed forms of harmonic pulses, direct quadrature, and another integrator of oscillators."""
 
 import itertools
+import tracemalloc
 import warnings
 
 import jax
@@ -10,6 +11,7 @@ from scipy.integrate import cumulative_trapezoid, quad
 from scipy.linalg import expm
 
 import jaxrock as rk
+from jaxrock.motions.measures import measure_of, strengths
 from jaxrock.motions.straight import straight
 
 G, A, T = 9.81, 0.3, 0.8
@@ -60,6 +62,12 @@ def test_significant_duration_of_a_sine_pulse():
     assert rk.intensity.significant_duration(SINE) == pytest.approx(np.diff(ends)[0], rel=1e-9)
 
 
+def test_a_share_that_is_reached_before_a_pause():
+    """Two equal shocks: half of the intensity has come where the pause begins, not where it ends."""
+    record = rk.Record([0.3, 0.0, 0.0, 0.0, 0.0, 0.3], 1.0)
+    assert rk.intensity.significant_duration(record, 0.25, 0.5) == pytest.approx(0.5 ** (1 / 3), rel=1e-4)
+
+
 def test_of_a_record_by_quadrature():
     """Each line by itself: quadrature knows nothing of closed forms."""
     time = 0.02 * np.arange(NOISE.size)
@@ -83,6 +91,162 @@ def test_peak_displacement_lies_between_samples():
     velocity, place = G * 1.0, G * 0.5
     # Then a = 1 - 4 t: v = 1 + t - 2 t^2 is zero at t = 1.
     assert rk.intensity.peak_displacement(record) == pytest.approx(place + velocity + G * (0.5 - 4 / 6), rel=1e-12)
+
+
+FIRST_LINES = {
+    "speeds up and slows down": ([1.0, -2.0], 1.0),
+    "one line": ([0.4463746, -0.5369532], 0.1),
+    "back and forth": ([0.3, -0.6, 0.3], 0.5),
+    "from no acceleration": ([0.0, 0.4, -0.9], 0.3),
+    "a constant, then back": ([0.2, 0.2, -0.7, -0.7], 0.3),
+    "at rest for a while": ([0.0, 0.0, 0.0, 0.5, -1.0], 0.2),
+}
+
+
+@pytest.mark.parametrize("name", FIRST_LINES)
+def test_peak_displacement_where_a_line_begins_at_rest(name):
+    """By cubics between a hundred thousand times of each record: they are exact for lines."""
+    samples, dt = FIRST_LINES[name]
+    time = np.linspace(0.0, dt * (len(samples) - 1), 100_001)
+    velocity = cumulative_trapezoid(G * np.interp(time, dt * np.arange(len(samples)), samples), time, initial=0)
+    largest = np.abs(cumulative_trapezoid(velocity, time, initial=0)).max()
+    record = rk.Record(samples, dt)
+    assert rk.intensity.peak_displacement(record) == pytest.approx(largest, rel=1e-7)
+    suite = rk.motions.Suite([record, rk.SinePulse(A, T)])
+    assert strengths("measure", measure_of("measure", "PGD"), suite)[0] == pytest.approx(largest, rel=1e-7)
+    assert float(rk.intensity.peak_velocity(record)) == pytest.approx(np.abs(velocity).max(), rel=1e-7)
+
+
+LONG_LINES = {  # period [s], damping: of lines of 0.2 to 40 s
+    "undamped": (0.31, 0.0),
+    "hardly damped": (0.05, 0.001),
+    "usual": (0.4, 0.05),
+    "strongly damped": (0.7, 0.6),
+    "nearly critical": (0.9, 0.999),
+}
+
+
+@pytest.mark.parametrize("name", LONG_LINES)
+def test_oscillators_under_lines_of_many_periods(name):
+    """By exponentials of matrices, five hundred times a period."""
+    period, damping = LONG_LINES[name]
+    omega, samples = 2 * np.pi / period, [0.0, 0.3, -0.1, 0.0, 0.0, 0.05, 0.0]
+    for step in (0.2, 3.0, 17.0):
+        count = int(np.ceil(500 * step / period))
+        system = np.array([[0, 1, 0, 0], [-(omega**2), -2 * damping * omega, -1, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
+        flows, state, largest = powers(expm(system * step / count), count + 1)[:, :2], np.zeros(2), np.zeros(2)
+        for a, b in itertools.pairwise([*samples, 0.0, 0.0, 0.0]):
+            states = flows @ np.append(state, [G * a, G * (b - a) / step])
+            state, largest = states[-1], np.maximum(largest, np.abs(states).max(axis=0))
+        record = rk.Record(samples, step)
+        assert rk.intensity.spectral_velocity(record, period, damping) == pytest.approx(omega * largest[0], rel=1e-4)
+        speed = rk.intensity.spectral_velocity(record, period, damping, pseudo=False)
+        assert speed == pytest.approx(largest[1], rel=1e-4)
+
+
+@pytest.mark.parametrize("gap", [3600.0, 86400.0])
+def test_quiet_between_shocks_costs_nothing(gap):
+    """Of what does not overlap sums add up, peaks are those of one, and the second comes when the first is over."""
+    shock = rk.processing.cut(rk.example_record(), 3.0, 13.0)
+    shock = rk.processing.baseline_corrected(rk.processing.tapered(shock, 1.0))
+    both = shock + 0.5 * shock.shifted(gap)
+    periods = [0.05, 1.0]
+    tracemalloc.start()
+    found = rk.intensity.spectral_acceleration(both, periods)
+    period = rk.intensity.mean_period(both)
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
+    np.testing.assert_allclose(found, rk.intensity.spectral_acceleration(shock, periods), rtol=1e-6)
+    assert period == pytest.approx(rk.intensity.mean_period(shock), rel=2e-4)
+    for measure, more in ((rk.intensity.arias, 1.25), (rk.intensity.cumulative_absolute_velocity, 1.5)):
+        assert measure(both) == pytest.approx(more * measure(shock), rel=1e-6)
+    first = rk.intensity.significant_duration(shock, 0.05, 0.5)
+    assert rk.intensity.significant_duration(both, 0.04, 0.4) == pytest.approx(first, rel=1e-6)
+    assert rk.intensity.significant_duration(both, 0.04, 0.99) > gap
+
+
+@pytest.mark.parametrize("later", [3.0, 25.0, 300.0, 3600.0])
+def test_mean_period_of_two_rectangles(later):
+    """The squared amplitude of both is twice that of one times 1 + cos(2 pi f later): QUADPACK has a rule for it."""
+
+    def power(f):
+        return (np.sin(np.pi * f * 0.4) / f) ** 2
+
+    def band(function):
+        fast = quad(function, 0.25, 20, weight="cos", wvar=2 * np.pi * later, limit=2000, maxp1=200)[0]
+        return quad(function, 0.25, 20, limit=500)[0] + fast
+
+    one = rk.RectangularPulse(0.3, 0.4)
+    expected = band(lambda f: power(f) / f) / band(power)
+    assert rk.intensity.mean_period(one + one.shifted(later)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_mean_period_of_a_sequence_by_one_long_transform():
+    random = np.random.default_rng(7).normal(0, 0.1, 500) * np.hanning(500)
+    samples = np.zeros(20_000)
+    for first in (0, 3_000, 11_000, 19_000):
+        samples[first : first + 500] += random * (1 + first / 1e4)
+    count = 1 << 21
+    frequency = np.fft.rfftfreq(count, 0.01)
+    power = np.abs(np.fft.rfft(samples, count) * np.sinc(0.01 * frequency) ** 2) ** 2
+    within = (frequency > 0.25) & (frequency < 20)
+    expected = (power / np.maximum(frequency, 1e-9))[within].sum() / power[within].sum()
+    assert rk.intensity.mean_period(rk.Record(samples, 0.01)) == pytest.approx(expected, rel=1e-4)
+
+
+def pulse_of_many_cycles(cycles):
+    return rk.MavroeidisPapageorgiouPulse(0.3, 0.5, cycles, 0.4)
+
+
+@pytest.mark.parametrize("cycles", [8.0, 300.0])
+def test_many_cycles_within_one_piece(cycles):
+    """By sums over times four hundred times a cycle, of its velocity as it is printed and the derivative of that."""
+    count = 400
+    time = (np.arange(int(cycles * count)) + 0.5) * 0.5 / count
+    bell, wave = 4 * np.pi / cycles, 4 * np.pi
+    x = time - cycles / 4
+    size = A * G * 0.5 / (2 * np.pi) / 2
+    velocity = size * (1 + np.cos(bell * x)) * np.cos(wave * x + 0.4)
+    acceleration = -size * (
+        bell * np.sin(bell * x) * np.cos(wave * x + 0.4) + (1 + np.cos(bell * x)) * wave * np.sin(wave * x + 0.4)
+    )
+    motion = pulse_of_many_cycles(cycles)
+    assert rk.intensity.peak_velocity(motion) == pytest.approx(np.abs(velocity).max(), rel=1e-4)
+    assert rk.intensity.peak_acceleration(motion) == pytest.approx(np.abs(acceleration).max() / G, rel=1e-4)
+    step = time[1] - time[0]
+    assert rk.intensity.cumulative_absolute_velocity(motion) == pytest.approx(
+        np.abs(acceleration).sum() * step, rel=1e-4
+    )
+    assert rk.intensity.arias(motion) == pytest.approx(np.pi / 2 / G * (acceleration**2).sum() * step, rel=1e-6)
+    place = np.cumsum(velocity) * step
+    assert rk.intensity.peak_displacement(motion) == pytest.approx(np.abs(place).max(), rel=1e-2)
+
+
+def test_a_wavelet_within_a_long_piece():
+    """It is as strong as one that is cut close."""
+    long, close = (rk.RickerPulse(0.4, 0.1, center=where) for where in (50.0, None))
+    for measure in (rk.intensity.peak_acceleration, rk.intensity.peak_velocity):
+        assert measure(long) == pytest.approx(float(measure(close)), rel=1e-9)
+    assert rk.intensity.arias(long) == pytest.approx(rk.intensity.arias(close), rel=1e-7)
+    assert rk.intensity.spectral_acceleration(long, 0.1) == pytest.approx(
+        float(rk.intensity.spectral_acceleration(close, 0.1)), rel=1e-5
+    )
+
+
+def test_many_cycles_in_a_suite():
+    """The velocity at the middle is that of the envelope, whatever cycles others of the ensemble have."""
+    suite = rk.motions.Suite([rk.MavroeidisPapageorgiouPulse(A, 0.5, np.array([2.0, 300.0, 40.0]))])
+    np.testing.assert_allclose(suite.peak_velocity, A * G * 0.5 / (2 * np.pi), rtol=1e-9)
+
+
+def test_too_many_cycles_are_refused():
+    for measure in (rk.intensity.peak_velocity, rk.intensity.arias):
+        with pytest.raises(ValueError, match="`motion` must last at most .* make a `Record` of what matters"):
+            measure(pulse_of_many_cycles(1e6))
+    traced = jax.jit(lambda cycles: rk.intensity.peak_velocity(pulse_of_many_cycles(cycles)))
+    np.testing.assert_allclose(traced(3.0), rk.intensity.peak_velocity(pulse_of_many_cycles(3.0)), rtol=1e-12)
+    with pytest.raises(Exception, match="`motion` must have at most 20 cycles within a piece where it is traced"):
+        jax.block_until_ready(traced(100.0))
 
 
 OSCILLATORS = [(0.25, 0.05), (0.05, 0.05), (0.9, 0.0), (3.0, 0.2)]  # period [s], damping

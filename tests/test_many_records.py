@@ -117,9 +117,9 @@ def test_a_suite_is_drawn_up_by_a_few_programs():
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         random = np.random.default_rng(0)
-        rk.motions.Suite([rk.Record(random.normal(size=1030), 0.01)])
+        rk.motions.Suite([rk.Record(random.normal(0, 0.3, 1030), 0.01)])
         programs.clear()
-        suite = rk.motions.Suite([rk.Record(random.normal(size=1100 + 37 * k), 0.01) for k in range(12)])
+        suite = rk.motions.Suite([rk.Record(random.normal(0, 0.3, 1100 + 37 * k), 0.01) for k in range(12)])
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)  # those of other tests stay
     compiled = [name for name in programs if name.endswith("backend_compile_duration")]

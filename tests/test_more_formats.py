@@ -2,6 +2,7 @@
 
 import time
 import types
+import warnings
 
 import numpy as np
 import pytest
@@ -577,7 +578,7 @@ def test_a_stream_of_obspy(names):
 )
 def test_streams_that_are_refused(stream, message):
     with pytest.raises(ValueError, match=message):
-        rk.motions.components_of_stream(stream, "g")
+        rk.motions.components_of_stream(stream, "m/s2")
 
 
 def test_what_is_written_is_read_again(tmp_path):
@@ -595,6 +596,64 @@ def test_what_is_written_is_read_again(tmp_path):
     np.testing.assert_allclose(rk.read_record(path).samples, SAMPLES, rtol=1e-15)
     rk.motions.write_csv(rk.Record(SAMPLES.astype(np.float32), np.float32(0.01)), path)  # which is 0.00999999977
     assert path.read_text().splitlines()[3].startswith("0.01,")
+
+
+ROUND_TRIPS = {  # samples [g], time step [s]
+    "two": ([0.1, -0.2], 0.01),
+    "two at rest": ([0.0, 0.0], 0.3),
+    "negative zeros": ([-0.0, 0.1, -0.0], 0.005),
+    "tiny": ([1e-300, -1e-12, 1e-9], 1e-9),
+    "huge": ([2e8, -1e9, 3.0], 1e9),
+    "like times": ([0.0, 0.01, 0.02, 0.03, 0.04], 1 / 3),
+    "many": (0.3 * np.sin(np.arange(1001)), 1e-6),
+}
+NAMES = [
+    "",
+    "a, b, c",
+    "a\nb",
+    "acceleration [cm/s2]",
+    "time [ms]",
+    "DT= .1",
+    "# 1.0,2.0",
+    "x" * 5000,
+    "\0bin\ufeff",
+    "ü;\t1",
+]
+
+
+@pytest.mark.filterwarnings("ignore:A record peaks at")
+@pytest.mark.parametrize("name", ROUND_TRIPS)
+def test_all_that_is_written_is_read_again(tmp_path, name):
+    samples, dt = ROUND_TRIPS[name]
+    record = rk.Record(samples, dt)
+    ways = [(rk.motions.write_at2, (), 1e-7)] + [(rk.motions.write_csv, (u,), 1e-15) for u in ("g", "m/s2", "cm/s2")]
+    for write, given, digits in ways:
+        write(record, tmp_path / "motion", *given)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # huge ones, and long steps
+            found = rk.read_record(tmp_path / "motion")
+        np.testing.assert_allclose(found.samples, samples, rtol=digits, atol=0)
+        np.testing.assert_array_equal(np.signbit(found.samples), np.signbit(samples))
+        assert float(found.dt) == pytest.approx(dt, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_that_are_written_are_no_samples(tmp_path, name):
+    for write in (rk.motions.write_at2, rk.motions.write_csv):
+        write(rk.Record(SAMPLES, 0.005, name), tmp_path / "motion")
+        found = rk.read_record(tmp_path / "motion")
+        np.testing.assert_allclose(found.samples, SAMPLES, rtol=1e-7)
+        assert float(found.dt) == 0.005
+
+
+def test_one_sample_is_written_where_the_step_is_stated(tmp_path):
+    record = rk.Record([0.1], 0.005)
+    with pytest.raises(ValueError, match="`record` must have at least two samples, but has one: `write_at2` states"):
+        rk.motions.write_csv(record, tmp_path / "motion.csv")
+    assert not (tmp_path / "motion.csv").exists()
+    rk.motions.write_at2(record, tmp_path / "motion.at2")
+    found = rk.read_record(tmp_path / "motion.at2")
+    assert found.samples.tolist() == [0.1] and float(found.dt) == 0.005
 
 
 @pytest.mark.parametrize(

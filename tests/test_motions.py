@@ -19,7 +19,7 @@ from jaxrock.motions.record import padded, with_room
 EPS = np.finfo(float).eps
 ORDER = 12
 RNG = np.random.default_rng(3)
-SAMPLES = np.append(RNG.normal(size=11), 0.7)  # ends with a jump
+SAMPLES = np.append(RNG.normal(0, 0.3, 11), 0.7)  # ends with a jump
 RECORD = rk.Record(SAMPLES, 0.02)
 NEAR_FAULT = rk.MavroeidisPapageorgiouPulse(0.6, 0.9, 2.3, 0.7)
 
@@ -574,3 +574,76 @@ def test_how_many_pieces_last(name):
         for whole in (motion, motion.shifted(0.3), motion.shifted(0.0)):
             found, expected = whole.lasting, Lasting.of(whole.lengths)
             assert (int(found.pieces), bool(found.forward)) == (int(expected.pieces), bool(expected.forward))
+
+
+@pytest.mark.parametrize("way", ["factors", "signs", "shifts"])
+def test_many_factors_or_shifts_are_one(way):
+    """Three hundred of them are followed as one is."""
+    motion, time = rk.HalfSinePulse(0.3, 0.8), np.linspace(0.0, 4.0, 40)
+    for _ in range(300):
+        motion = {"factors": lambda m: 1.01 * m, "signs": lambda m: -m, "shifts": lambda m: m.shifted(0.01)}[way](
+            motion
+        )
+    assert motion.motion == rk.HalfSinePulse(0.3, 0.8)
+    later = 3.0 if way == "shifts" else 0.0
+    expected = 0.3 * np.where((time >= later) & (time < later + 0.8), np.sin(np.pi * (time - later) / 0.8), 0.0)
+    expected *= 1.01**300 if way == "factors" else 1.0
+    np.testing.assert_allclose(motion.acceleration(time), expected, atol=1e-12)
+
+
+def test_factors_and_shifts_of_one_are_still_checked():
+    with pytest.raises(ValueError, match="`delay` must be 0 or more and finite"):
+        rk.SinePulse(0.3, 0.8).shifted(2.0).shifted(-1.0)
+    with pytest.raises(ValueError, match="`factor` must be finite"):
+        math.inf * (2.0 * rk.SinePulse(0.3, 0.8))
+
+
+def test_a_sum_of_several():
+    """From 0, as Python's `sum` begins; below the limit."""
+    parts, time = [rk.HalfSinePulse(0.1 * k, 0.8).shifted(0.3 * k) for k in range(1, 6)], np.linspace(0.0, 3.0, 30)
+    each = [
+        np.where((time >= 0.3 * k) & (time < 0.3 * k + 0.8), 0.1 * k * np.sin(np.pi * (time / 0.8 - 0.375 * k)), 0.0)
+        for k in range(1, 6)
+    ]
+    np.testing.assert_allclose(sum(parts).acceleration(time), np.sum(each, axis=0), atol=1e-14)
+    assert sum(rk.SinePulse(0.1, 0.4).shifted(k) for k in range(33)).second.delay == 32  # as many as there may be
+
+
+MADE_OF_MANY = {
+    "a sum of two hundred": lambda: sum(rk.SinePulse(0.1, 0.4).shifted(0.7 * k) for k in range(200)),
+    "a sum of halves": lambda: functools.reduce(lambda motion, _: motion + motion, range(8), rk.SinePulse(0.1, 0.4)),
+    "factors of shifts": lambda: functools.reduce(lambda m, _: 0.9 * m.shifted(0.1), range(300), rk.SinePulse(1, 1)),
+    "verticals": lambda: functools.reduce(lambda m, _: m.with_vertical(RECORD), range(200), RECORD),
+}
+
+
+@pytest.mark.parametrize("name", MADE_OF_MANY)
+def test_a_motion_of_too_many_is_refused_where_it_is_made(name):
+    with pytest.raises(ValueError, match="must be made of at most 100 motions, .* make a `Record` of its samples"):
+        MADE_OF_MANY[name]()
+
+
+DOUBTED = {  # peak, and what is said of it
+    "m/s2": (3.436, "peaks at 3.436 g. If its samples are in m/s2, divide them by 9.81: it then peaks at 0.35 g"),
+    "cm/s2": (343.0, "peaks at 343 g. If its samples are in cm/s2, divide them by 981: it then peaks at 0.35 g"),
+}
+
+
+@pytest.mark.parametrize("unit", DOUBTED)
+def test_a_record_in_another_unit_is_doubted_once(unit):
+    peak, told = DOUBTED[unit]
+    with pytest.warns(UserWarning, match=f"^Record 'mine' {told}") as found:
+        record = rk.Record([0.0, -peak, 0.1], 0.01, "mine")
+    assert len(found) == 1
+    # What is made of it, and what is strong by its factor, is not doubted again.
+    suite = rk.motions.Suite([record, 2.0 * record])
+    jax.jit(lambda number: suite[number].acceleration(0.01))(1)
+    rk.processing.scaled(RECORD, acceleration=40.0)
+    rk.motions.Components(record, record).along(0.3)
+    jax.jit(lambda samples: rk.Record(samples, 0.01).acceleration(0.01))(record.samples)
+    with pytest.warns(UserWarning, match="^A record peaks at 3.4"):
+        rk.Record(np.array([[0.0, 0.1], [3.4, 0.0]]), 0.01)
+
+
+def test_no_record_up_to_three_g_is_doubted():
+    rk.Record([0.0, 3.0, -3.0], 0.01)

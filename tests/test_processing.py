@@ -3,8 +3,10 @@
 import jax
 import numpy as np
 import pytest
+import scipy.signal
 
 import jaxrock as rk
+from jaxrock.motions.filters import evenly, of_displacement, of_velocity, smoothed
 from jaxrock.motions.straight import straight
 
 G, DT = 9.81, 0.01
@@ -66,6 +68,82 @@ def test_filters_keep_what_passes(low, high, kept):
     assert np.abs(delayed.samples - parts[kept]).max() > 0.04
 
 
+# Corners [Hz] and order: bands down to a hundredth of their frequency, a double pole, both ends of the range.
+FILTERS = [(0.5, 0.52, 4), (5.0, 5.2, 4), (2.0, 2.02, 3), (3.0, 3.3, 6), (1.0, 1.5, 20), (1.0, 3 + 8**0.5, 1),
+           (0.05, 0.06, 2), (0.05, 49.0, 5), (None, 0.02, 20), (None, 20.0, 7),
+           (0.02, None, 9), (40.0, None, 1)]  # fmt: skip
+
+
+def by_the_spectrum(values, low, high, order, count=1 << 19):
+    """The squared gain of Butterworth's filter at each frequency, of so many samples that all has rung out."""
+    tangent = np.tan(np.pi / 2 * np.linspace(0.0, 1.0, count // 2 + 1))
+    low, high = (None if corner is None else np.tan(np.pi * corner * DT) for corner in (low, high))
+    with np.errstate(all="ignore"):
+        if high is None:
+            ratio = low / tangent
+        else:
+            ratio = tangent / high if low is None else (tangent**2 - low * high) / (tangent * (high - low))
+        gain = 1 / (1 + np.abs(ratio) ** (2 * order))
+    return np.fft.irfft(np.fft.rfft(values, count) * gain, count)[: values.size]
+
+
+@pytest.mark.parametrize("low, high, order", FILTERS)
+def test_a_filter_without_delay_loses_nothing_that_rings(low, high, order):
+    values = np.random.default_rng(4).normal(0, 0.1, 1500)
+    expected = by_the_spectrum(values, low, high, order)
+    found = do.filtered(rk.Record(values, DT), low, high, order=order)
+    np.testing.assert_allclose(found.samples, expected, atol=1e-10 * np.abs(expected).max())
+
+
+def test_a_narrow_filter_without_delay_by_padding():
+    """Forwards and backwards over so much rest that all has rung out."""
+    record = rk.example_record()
+    sections = scipy.signal.butter(4, (0.5, 0.52), "bandpass", fs=100, output="sos")
+    rest = np.pad(record.samples, 100_000)
+    there = scipy.signal.sosfilt(sections, scipy.signal.sosfilt(sections, rest)[::-1])[::-1][100_000:-100_000]
+    found = do.filtered(record, 0.5, 0.52)
+    np.testing.assert_allclose(found.samples, there, atol=1e-10 * np.abs(there).max())
+
+
+def test_a_filter_of_one_pass_by_its_poles():
+    """Of order 1: its differential equation under the bilinear transform, sample by sample."""
+    values, upper = np.random.default_rng(4).normal(0, 0.1, 300), np.tan(np.pi * 0.3 * DT)
+    expected, before, state = [], 0.0, 0.0
+    for value in values:
+        state = (state * (1 - upper) + upper * (value + before)) / (1 + upper)
+        before = value
+        expected.append(state)
+    found = do.filtered(rk.Record(values, DT), high=0.3, order=1, zero_phase=False)
+    np.testing.assert_allclose(found.samples, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("corner, order", [(0.3, 1), (0.3, 4), (8.0, 20)])
+def test_a_low_pass_of_what_goes_on_by_repeating_it(corner, order):
+    """Mirrored or turned at both ends, 1300 s of it either way: the spectrum knows nothing of ends."""
+    values = np.random.default_rng(4).normal(0, 0.1, 500).cumsum() / 10
+    last, place = values.size - 1, np.arange(-(1 << 17), 1 << 17)
+    turns, within = np.divmod(place, 2 * last)
+    mirrored = values[np.where(within <= last, within, 2 * last - within)]
+    line = values[0] + (values[-1] - values[0]) * place / last
+    beside = values - np.linspace(values[0], values[-1], values.size)
+    odd = np.where(within <= last, beside[np.minimum(within, last)], -beside[(2 * last - within) % last])
+    begin = 1 << 17
+    for beyond, whole, straight_line in ((evenly, mirrored, 0 * line), (of_velocity, odd, line)):
+        expected = by_the_spectrum(whole, None, corner, order, 1 << 18) + straight_line
+        found = smoothed(values, DT, corner, order, beyond)
+        np.testing.assert_allclose(found, expected[begin : begin + values.size], atol=1e-6)
+    # Turned about its end a displacement is mirrored at twice its length.
+    turned = np.concatenate([values, 2 * values[-1] - values[-2::-1]])
+    twice = smoothed(turned, DT, corner, order, evenly)[: values.size]
+    np.testing.assert_allclose(smoothed(values, DT, corner, order, of_displacement), twice, atol=1e-12)
+
+
+def test_a_low_pass_far_below_a_record_leaves_its_mean():
+    values = np.random.default_rng(5).normal(0, 0.1, 1001)
+    mean = (values.sum() - (values[0] + values[-1]) / 2) / 1000
+    np.testing.assert_allclose(smoothed(values, DT, 2e-4, 4, evenly), mean, atol=1e-12)
+
+
 def test_a_taper_changes_the_ends_only():
     found = do.tapered(rk.Record(np.ones(1001), DT), 1.0)
     np.testing.assert_allclose(found.samples[100:-100], 1.0)
@@ -106,13 +184,13 @@ def test_single_precision_cuts_and_resamples_as_double_does(dt):
     counts = []
     for double in (True, False):
         with jax.enable_x64(double):
-            record = rk.Record(np.arange(60_001) % 997, dt)
+            record = rk.Record(np.arange(60_001) % 997 / 1024, dt)
             part = do.cut(record, 100 * dt, 200 * dt)
             found = [np.asarray(part.samples), np.asarray(do.cut(record, end=1 / 3).samples)]
             steps = (dt / 2, dt / 4, dt / 5, 1.25 * dt, 2 * dt, 2.5 * dt, dt * 4 / 3, round(1.333 * dt, 12))
             found += [np.asarray(do.resampled(record, step).samples) for step in steps]
             counts.append([each.size for each in found])
-            np.testing.assert_array_equal(found[0], np.arange(100, 201))
+            np.testing.assert_array_equal(found[0], np.arange(100, 201) / 1024)
     assert counts[0] == counts[1]
     assert counts[0][0] == 101 and counts[0][2] == 120_001
 
@@ -153,6 +231,7 @@ def test_name_and_origin_are_kept(step):
     [
         (lambda: do.filtered(SMOOTH), "`low` and `high` must not both be None"),
         (lambda: do.filtered(SMOOTH, 2.0, 1.0), "`high` must be above `low`"),
+        (lambda: do.filtered(SMOOTH, 2.0, 2.000001), "`high` must be above `low`, 2.0 Hz, by a millionth of itself"),
         (lambda: do.filtered(SMOOTH, high=50.0), "`high` must be above 0 and below half the sampling rate, 50 Hz"),
         (lambda: do.filtered(SMOOTH, 1e-30), "`low` must be at least a millionth of the sampling rate, 0.0001 Hz"),
         (lambda: do.from_velocity(np.ones(9), DT, corner=1e-30), "`corner` must be at least a millionth"),

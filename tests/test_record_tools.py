@@ -8,6 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize
 
 import jaxrock as rk
+from jaxrock.motions.pulse_fit import _models, _Problem
 from jaxrock.motions.straight import straight
 
 DT = 0.01
@@ -145,6 +146,29 @@ def test_a_pulse_is_found_again(pulse, parameters, delay, digits):
     for name, value in (parameters | {"delay": delay}).items():
         assert fit.values[name] == pytest.approx(value, rel=digits, abs=digits), name
     assert np.abs(fit.residual.samples).max() < 0.02 * 0.4
+
+
+@pytest.mark.parametrize("cycles", [20.0, 200.0])
+def test_the_velocity_that_is_fitted_follows_every_cycle(cycles):
+    """As it is printed, where its acceleration is integrated over as many parts as the ranges ask for."""
+    record = rk.Record(np.asarray(rk.SinePulse(0.2, 0.5).acceleration(0.01 * np.arange(400))), 0.01)
+    ranges = {"amplitude": (0.2, 0.4), "period": (0.1, 0.3), "oscillations": (2.0, cycles), "phase": (0.0, 1.0)}
+    problem = _Problem.of(record, rk.MavroeidisPapageorgiouPulse, ranges | {"delay": (0.0, 1.0)}, "velocity")
+    size, period, phase = 0.3, 0.2, 0.4
+    time = np.linspace(0.0, cycles * period, 777)
+    x = time - time[-1] / 2
+    velocity = (1 + np.cos(2 * np.pi * x / time[-1])) * np.cos(2 * np.pi * x / period + phase)
+    expected = 9.81 * size * period / (4 * np.pi) * velocity
+    place = np.array([size, np.log(period), cycles, phase, 0.0])
+    assert problem.kind.names == ("amplitude", "period", "oscillations", "phase", "delay")
+    np.testing.assert_allclose(_models(problem.kind, place[None], time)[0], expected, atol=1e-8)
+    assert problem.kind.parts == (128 if cycles < 100 else 1024)
+
+
+def test_ranges_of_too_many_cycles_are_refused():
+    ranges = {"oscillations": (2.0, 1e6)}
+    with pytest.raises(ValueError, match="`ranges` must hold pulses that last at most 32768 times the time"):
+        rk.motions.fit_pulse(sampled(rk.SinePulse(0.2, 0.5)), rk.MavroeidisPapageorgiouPulse, ranges)
 
 
 def exponential(time, amplitude, duration, shape):

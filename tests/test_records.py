@@ -395,6 +395,9 @@ def test_a_mark_of_a_gap_and_a_wrong_unit_are_warned_of(file):
     """Samples beyond all that was ever recorded."""
     with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 999 g, more than .* is its unit g"):
         read_record(file("0.1\n-999\n0.2\n"), dt=0.01, unit="g")
+    with pytest.warns(UserWarning, match="`motion.txt` holds an acceleration of 3.924 g, .* is its unit g") as found:
+        read_record(file("0.1\n-3.924\n0.2\n"), dt=0.01, unit="g")
+    assert len(found) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read_record(file("100\n-999\n200\n"), dt=0.01, unit="cm/s2")

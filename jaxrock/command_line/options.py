@@ -68,7 +68,7 @@ def record_of(arguments: argparse.Namespace) -> rk.Record:
         record = rk.read_record(arguments.record, dt=arguments.dt, unit=arguments.unit, column=arguments.column)
     if not abs(arguments.scale) < float("inf"):
         raise ValueError(f"Argument `--scale` must be finite, but is {arguments.scale:g}.")
-    return rk.Record(record.samples * arguments.scale, record.dt, record.name, record.origin)
+    return rk.processing.scaled(record, arguments.scale)
 
 
 def extent_of(pulse: type[AbstractPulse]) -> str:

@@ -18,7 +18,7 @@ from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
 from jaxrock.motions.files.traces import record_of_trace
 from jaxrock.motions.motion import AbstractMotion
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, record_in_g
 
 _DOWN = re.compile(r"\W*D((OW|W)?N)?\W*", re.IGNORECASE)
 # Of PEER also VRT, VT, V1, UPDN and 000V.
@@ -66,7 +66,7 @@ class Components(eqx.Module):
             )
         count = min(each.samples.shape[-1] for each in parts)
         self.first, self.second, *rest = (
-            Record(each.samples[:count], each.dt, each.name, each.origin) for each in parts
+            record_in_g(each.samples[:count], each.dt, each.name, each.origin) for each in parts
         )
         self.vertical = rest[0] if rest else None
 
@@ -86,7 +86,7 @@ class Components(eqx.Module):
         angle = scalar("angle", direction("angle", angle))
         samples = _combined(angle, self.first.samples, self.second.samples)
         name = "" if not self.first.name else f"{self.first.name}, turned"
-        return Record(samples, self.first.dt, name, self.first.origin._replace(component=""))
+        return record_in_g(samples, self.first.dt, name, self.first.origin._replace(component=""))
 
     def in_plane(self, angle: ArrayLike, vertical: bool) -> AbstractMotion:
         """What shakes a block in one vertical plane: `along`, with the `vertical` component if that is wanted."""

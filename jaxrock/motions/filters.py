@@ -1,55 +1,95 @@
-"""Butterworth filters of samples, and what they take to lie beyond both ends.
+"""Butterworth filters of samples, and what lies beyond both ends of them: rest, or the samples mirrored for ever.
 
-NumPy and SciPy: `processing` uses them.
+NumPy and SciPy: `processing` uses them. No filter is followed beyond the ends, however long it rings there.
 """
 
 from collections.abc import Callable
 
 import numpy as np
+import scipy.fft
 import scipy.signal
 
-ROOM = 8  # in lengths of what is filtered: beyond either end no more, unless that is little
 LOWEST = 1e-6  # corner over sampling rate: of lower ones coefficients of filters lose their digits, and at last all
+NARROWEST = 1e-6  # width of a band over its upper corner, for the same reason
 
 
 def smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, beyond: Callable) -> np.ndarray:
-    """After a low-pass without delay; `beyond(values, room)`: with so many more at either end."""
-    return values if corner is None else butterworth(values, dt, None, corner, order, True, beyond)
+    """Pass values, which go on `beyond` both ends for ever, forwards and backwards through a low-pass (None: none)."""
+    return values if corner is None else beyond(values, lambda whole: _smoothed_period(whole, dt, corner, order))
 
 
-def at_rest(values: np.ndarray, room: int) -> np.ndarray:
-    """Rest before and after."""
-    return np.pad(values, room)
+def _smoothed_period(whole: np.ndarray, dt: float, corner: float, order: int) -> np.ndarray:
+    """Pass a period of values, an even number of them, through the filter: its gain is known at each frequency."""
+    ratio = np.tan(np.pi * np.arange(whole.size // 2 + 1) / whole.size) / np.tan(np.pi * corner * dt)
+    with np.errstate(over="ignore"):
+        gain = 1 / (1 + ratio ** (2 * order))
+    return scipy.fft.irfft(scipy.fft.rfft(whole) * gain, whole.size)
 
 
-def evenly(values: np.ndarray, room: int) -> np.ndarray:
-    """Mirrored at both ends."""
-    last = values.size - 1
-    place = np.abs(np.arange(-room, values.size + room)) % (2 * last)
-    return values[np.minimum(place, 2 * last - place)]
+def evenly(values: np.ndarray, smooth: Callable) -> np.ndarray:
+    """Smooth values that are mirrored at both ends."""
+    return smooth(np.concatenate([values, values[-2:0:-1]]))[: values.size]
 
 
 # What a ground at rest at first does, mirrored in time before it begins, and turned about its end after it. A mirror
 # image keeps the velocity at zero under a filter without delay; if the ground only rested before, it would jump.
 
 
-def of_displacement(values: np.ndarray, room: int) -> np.ndarray:
-    last = values.size - 1
-    turns, place = np.divmod(np.abs(np.arange(-room, values.size + room)), 2 * last)
-    turned = 2 * values[-1] - values[np.minimum(2 * last - place, last)]
-    found = np.where(place <= last, values[np.minimum(place, last)], turned)
-    return np.where(turns % 2 == 0, found, 2 * values[-1] - found)
+def of_displacement(values: np.ndarray, smooth: Callable) -> np.ndarray:
+    """Smooth values that are mirrored at their beginning, and turned about their end."""
+    turned = 2 * values[-1] - values[-2::-1]
+    return evenly(np.concatenate([values, turned]), smooth)[: values.size]
 
 
-def of_velocity(values: np.ndarray, room: int) -> np.ndarray:
-    return np.pad(values, room, "reflect", reflect_type="odd")
+def of_velocity(values: np.ndarray, smooth: Callable) -> np.ndarray:
+    """Smooth values that are turned about both ends: a straight line, which passes, and what is odd beside it."""
+    line = np.linspace(values[0], values[-1], values.size)
+    beside = values - line
+    return line + smooth(np.concatenate([beside, -beside[-2:0:-1]]))[: values.size]
 
 
-def butterworth(values, dt, low, high, order, zero_phase, beyond: Callable = at_rest) -> np.ndarray:
-    edges = [edge for edge in (low, high) if edge is not None]
-    kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
-    sections = scipy.signal.butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / dt, output="sos")
+def butterworth(
+    values: np.ndarray, dt: float, low: float | None, high: float | None, order: int, zero_phase: bool
+) -> np.ndarray:
+    """Pass values between rest before and after through a Butterworth filter, as far as they go.
+
+    Without delay the response has a part after its cause, and the mirror image of that before it. Either is a sum over
+    poles that begins at rest, so that nothing has to be followed back from beyond an end.
+    """
     if not zero_phase:
+        edges = [edge for edge in (low, high) if edge is not None]
+        kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
+        sections = scipy.signal.butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / dt, output="sos")
         return scipy.signal.sosfilt(sections, values)
-    room = int(min(max(ROOM * values.size, 100_000), np.ceil(3 * order / (min(edges) * dt))))
-    return scipy.signal.sosfiltfilt(sections, beyond(values, room), padtype=None)[room : room + values.size]
+    if high is None:
+        return values - butterworth(values, dt, None, low, order, True)
+    return _causal_half(values, dt, low, high, order) + _causal_half(values[::-1], dt, low, high, order)[::-1]
+
+
+def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, order: int) -> np.ndarray:
+    """The part of a response without delay that comes after its cause.
+
+    With S = s/w of a low-pass and (s^2 + l h)/(s (h - l)) of a band, l, h and w its corners under the bilinear
+    transform, the squared gain 1/(1 + (S/i)^2N) has at each of its poles the residue -p/2N: those with a real part
+    below zero are this half, the others its mirror image in time.
+    """
+    upper = np.tan(np.pi * high * dt)
+    lower = 0.0 if low is None else np.tan(np.pi * low * dt)
+    total = np.zeros(values.size)
+    for k in range((order + 1) // 2):  # of each pair of conjugate poles one
+        pole = 1j * np.exp(1j * np.pi * (2 * k + 1) / (2 * order))
+        size = -pole * (upper - lower) / (2 * order)
+        if low is None:
+            part = _one_pole(values, size, 1, pole * upper)
+        else:
+            middle = pole * (upper - lower) / 2
+            root = np.sqrt(middle**2 - lower * upper)
+            far = max(middle + root, middle - root, key=abs)  # the near one, as their difference, would lose its digits
+            part = _one_pole(_one_pole(values, 1, -1, lower * upper / far), size, 1, far)
+        total += (1 if 2 * k + 1 == order else 2) * part.real
+    return total
+
+
+def _one_pole(values: np.ndarray, size: complex, sign: int, pole: complex) -> np.ndarray:
+    """Pass values through size/(s - pole), sign 1, or size s/(s - pole), sign -1, with s = (1 - 1/z)/(1 + 1/z)."""
+    return scipy.signal.lfilter([size, sign * size], [1 - pole, -(1 + pole)], values)

@@ -1,13 +1,12 @@
 """Ground motions: what every motion must tell the engines, and motions made of motions.
 
-A motion is smooth on pieces. It gives the times that separate them (`knots`), for each piece a time
-scale and a bound of its acceleration, and its Taylor series at any point of a piece. Accelerations are
-in units of g; positive acceleration drives negative rotation.
+A motion is smooth on pieces. It gives the times that separate them (`knots`), for each piece a time scale and a bound
+of its acceleration, and its Taylor series at any point of a piece. Accelerations are in units of g; positive
+acceleration drives negative rotation.
 """
 
 import abc
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from jaxrock._checks import Values, delay, factor, if_known, not_nan, of_each, w
 from jaxrock._described import described
 from jaxrock._parameters import Owner, check_declared, parameter, set_parameters
 from jaxrock.motions.finer import Finer
+from jaxrock.motions.nesting import check_nesting
 from jaxrock.motions.pieces import Lasting, acceleration_at
 from jaxrock.motions.shaking import Bounds, Envelope, sum_of_series
 from jaxrock.numerics.choice import where
@@ -34,6 +34,7 @@ class AbstractMotion(Owner):
 
     def __check_init__(self):
         check_declared(self)
+        check_nesting(self)
 
     @property
     @abc.abstractmethod
@@ -112,8 +113,7 @@ class AbstractMotion(Owner):
 
         - `time`: any shape, time from the start of the motion [s].
 
-        **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
-        value after it.
+        **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, at a jump the value after it.
         """
         return acceleration_at(self, if_known(not_nan, "time", time))
 
@@ -130,18 +130,18 @@ class AbstractMotion(Owner):
         return Scaled(self, factor)
 
     def __rmul__(self, factor: ArrayLike) -> "Scaled":
-        return Scaled(self, factor)
+        return self * factor
 
     def __truediv__(self, factor: ArrayLike) -> "Scaled":
-        return Scaled(self, 1 / factor)
+        return self * (1 / factor)
 
     def __neg__(self) -> "Scaled":
-        return Scaled(self, -1.0)
+        return self * -1.0
 
     def __add__(self, other: "AbstractMotion") -> "Summed":
         return Summed(self, other) if isinstance(other, AbstractMotion) else NotImplemented
 
-    def __radd__(self, other: Any) -> "AbstractMotion":
+    def __radd__(self, other: object) -> "AbstractMotion":
         return self if isinstance(other, int) and other == 0 else NotImplemented  # with which `sum` begins
 
     def __sub__(self, other: "AbstractMotion") -> "Summed":
@@ -212,6 +212,9 @@ class Scaled(AtTheSameTimes):
         self.motion = motion
         set_parameters(self, factor=factor)
 
+    def __mul__(self, factor: ArrayLike) -> "Scaled":
+        return Scaled(self.motion, self.factor * Scaled(self.motion, factor).factor)
+
     @property
     def envelope(self) -> Envelope:
         return self.motion.envelope.each(lambda bounds: bounds.scaled(self.factor))
@@ -234,6 +237,8 @@ class Shifted(_Changed):
     def __init__(self, motion: AbstractMotion, delay: ArrayLike):
         self.motion = motion
         set_parameters(self, delay=delay)
+        if type(motion) is Shifted:
+            self.motion, self.delay = motion.motion, motion.delay + self.delay
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -268,8 +273,8 @@ class Shifted(_Changed):
 
     @property
     def envelope(self) -> Envelope:
-        def after_quiet(bounds: Bounds) -> Bounds:
-            return bounds._replace(values=jnp.concatenate([jnp.zeros_like(bounds.values[:1]), bounds.values]))
+        def after_quiet(x: Bounds) -> Bounds:
+            return x._replace(values=jnp.concatenate([jnp.zeros_like(x.values[:1]), x.values]))
 
         return self.motion.envelope.each(after_quiet)
 
@@ -280,15 +285,6 @@ class Shifted(_Changed):
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
         inner = self.motion.vertical_series(jnp.maximum(piece - 1, 0), local, unit, order)
         return None if inner is None else [where(piece > 0, v, 0.0) for v in inner]
-
-
-def _lateness(knots: Inexact[Array, " knots"], *parts: AbstractMotion) -> Scalar | None:
-    """Of two motions at once: where one is shifted, its times are rounded as those of the whole are."""
-    leaves = jax.tree.leaves(parts, is_leaf=lambda node: isinstance(node, Shifted))
-    if not any(isinstance(leaf, Shifted) for leaf in leaves):
-        return None
-    rounding = jnp.finfo(knots.dtype).eps * knots[-1]
-    return sum((late for part in parts if (late := part.lateness) is not None), rounding)
 
 
 class _Together(AbstractMotion):
@@ -310,7 +306,12 @@ class _Together(AbstractMotion):
 
     @property
     def lateness(self) -> Scalar | None:
-        return _lateness(self.knots, *self._both)
+        # Where one is shifted, its times are rounded as those of the whole are.
+        parts, knots = jax.tree.leaves(self._both, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
+        if not any(isinstance(part, Shifted) for part in parts):
+            return None
+        own = (motion.lateness for motion in self._both)
+        return sum((late for late in own if late is not None), jnp.finfo(knots.dtype).eps * knots[-1])
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
@@ -386,12 +387,11 @@ class WithVertical(_Changed, _Together):
         return Envelope(*self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both)))
 
     def series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar]:
-        both = self.horizontal.series, None
-        return self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)[0] or []
+        found = self._finer.series(self.horizontal.series, None, piece=piece, local=local, unit=unit, order=order)
+        return found[0] or []
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        both = None, self.vertical.series
-        return self._finer.series(*both, piece=piece, local=local, unit=unit, order=order)[1]
+        return self._finer.series(None, self.vertical.series, piece=piece, local=local, unit=unit, order=order)[1]
 
 
 def is_of_several(motion: AbstractMotion) -> bool:

@@ -1,9 +1,14 @@
 """The largest acceleration and velocity of a motion, as functions of JAX."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from jaxrock._checks import is_traced, watched
 from jaxrock._quickly import quickly
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scalar
@@ -14,6 +19,9 @@ _NODES, _WEIGHTS = gauss_legendre(6)
 _FEW = 32  # pieces
 _PARTS = 256  # of every piece, where there are few
 _PER_SCALE = 8  # parts of the time in which an acceleration changes, where there are many
+_LEAST = 2  # parts of that time, with which they are still exact to 1e-9
+_MOST = 1 << 20  # parts, of what is known
+_AT_A_TIME = 8192  # of these
 _NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
 
 
@@ -23,13 +31,51 @@ def peaks_of_motion(motion: AbstractMotion) -> tuple[Scalar, Scalar]:
 
 
 def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Scalar]:
-    """The same, and the velocity at the end [m/s]: by a few programs for records of any lengths."""
-    return _peaks_of(with_room(motion))
+    """The same, and the velocity at the end [m/s]: by a few programs for records of any lengths.
+
+    **Raises:** ValueError for a motion of too many cycles within its pieces, which are fewer where it is traced.
+    """
+    motion = with_room(motion)
+    return _fine_enough(motion, _peaks_of)
 
 
-@quickly()
-def _peaks_of(motion: AbstractMotion):
-    """Peaks of acceleration [g] and velocity [m/s], and the last velocity.
+def peaks_of_many(motions: AbstractMotion, choose: Callable, count: int) -> tuple[Array, Array]:
+    """`peaks_of_motion` of each that `choose(motions, index)` gives: in one program."""
+
+    def peaks(motions, room):
+        return jax.vmap(lambda index: _peaks_of(choose(motions, index), room))(jnp.arange(count))
+
+    return _fine_enough(motions, peaks)[:2]
+
+
+def _fine_enough(motion: Any, peaks: Callable) -> tuple:
+    """Return what `peaks(motion, room)` finds with the usual parts of every piece, or with more where these are few."""
+    *found, wanted = peaks(motion, None)
+    if wanted is None:
+        return tuple(found)
+    if is_traced(wanted):
+        message = "Argument `motion` must have at most 20 cycles within a piece where it is traced"
+        return watched(tuple(found), message, jnp.any(wanted > 0))
+    most = float(np.max(np.asarray(wanted)))
+    if not most > 0:  # NaN of a motion that is
+        return tuple(found)
+    if most > _MOST:
+        raise too_long(_MOST // _LEAST, most / _LEAST)
+    return tuple(peaks(motion, min(_MOST, 1 << int(np.ceil(np.log2(most * _PER_SCALE / _LEAST)))))[:-1])
+
+
+def too_long(most: float, lasts: float) -> ValueError:
+    """Of motions with more cycles than are followed."""
+    return ValueError(
+        f"Argument `motion` must last at most {most:g} times the time in which its acceleration changes, but lasts "
+        f"{lasts:.3g} times that: make a `Record` of what matters of it."
+    )
+
+
+@quickly(static_argnums=1)
+def _peaks_of(motion: AbstractMotion, room: int | None):
+    """Peaks of acceleration [g] and velocity [m/s], the last velocity, and how many parts are wanted: 0 if there are
+    enough, None if there always are.
 
     Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
     passes zero in it; from the larger of its ends the acceleration is followed to the top beside it.
@@ -52,7 +98,7 @@ def _peaks_of(motion: AbstractMotion):
             return values[: nodes.size] @ weights * width, values[nodes.size :]
 
         gain, (left, right) = gain_and(step, jnp.stack([begin, begin + step]))
-        turns = left * right < 0
+        turns = jnp.sign(left) * jnp.sign(right) < 0  # the product of small ones may be zero
         zero = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
 
         def nearer(_, found):
@@ -68,11 +114,26 @@ def _peaks_of(motion: AbstractMotion):
         peak = jnp.max(jnp.abs(jnp.stack([left, right, highest])))
         return jnp.where(step > 0, peak, 0.0), gain, jnp.where(turns, turning, 0.0)
 
-    peaks, gains, turnings = jax.vmap(in_part)(*_parts(motion))
+    if room is None:
+        peaks, gains, turnings = jax.vmap(in_part)(*_parts(motion))
+    else:
+        parts = _parts_by_scale(motion, room)
+        peaks, gains, turnings = jax.lax.map(lambda part: in_part(*part), parts, batch_size=_AT_A_TIME)
     velocity = jnp.cumsum(gains)
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     fastest = jnp.maximum(jnp.max(jnp.abs(velocity)), jnp.max(jnp.abs(before + turnings)))
-    return jnp.max(peaks), fastest * GRAVITY, velocity[-1] * GRAVITY
+    return jnp.max(peaks), fastest * GRAVITY, velocity[-1] * GRAVITY, _wanted(motion)
+
+
+def _wanted(motion: AbstractMotion) -> Array | None:
+    """How many parts are wanted at least, of all pieces together, if `_parts` are too few; or else 0."""
+    lengths, scales = jax.lax.stop_gradient((motion.lengths, motion.scales))
+    if scales is None:
+        return None
+    wanted = _LEAST * lengths / scales
+    total = wanted.sum()
+    enough = jnp.max(wanted) <= _PARTS if lengths.size <= _FEW else total <= _PARTS * _FEW
+    return jnp.where(enough, 0.0, total)
 
 
 def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
@@ -80,13 +141,19 @@ def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
 
     Of few pieces all have as many; of many those that are no straight line have as many as their curves ask for.
     """
-    lengths, scales = motion.lengths, motion.scales
-    if lengths.size <= _FEW or scales is None:
-        count = _PARTS if lengths.size <= _FEW else 1
-        piece, within = (jax.lax.broadcasted_iota(jnp.int32, (lengths.size, count), axis).ravel() for axis in (0, 1))
-        step = lengths[piece] / count
-        return piece, jnp.minimum(within * step, lengths[piece]), step
-    room, wanted = _PARTS * _FEW, _PER_SCALE * lengths / scales
+    lengths = motion.lengths
+    if lengths.size > _FEW and motion.scales is not None:
+        return _parts_by_scale(motion, _PARTS * _FEW)
+    count = _PARTS if lengths.size <= _FEW else 1
+    piece, within = (jax.lax.broadcasted_iota(jnp.int32, (lengths.size, count), axis).ravel() for axis in (0, 1))
+    step = lengths[piece] / count
+    return piece, jnp.minimum(within * step, lengths[piece]), step
+
+
+def _parts_by_scale(motion: AbstractMotion, room: int) -> tuple[Array, Array, Array]:
+    """As `_parts`, one of every piece and so many more, as their curves ask for."""
+    lengths, scales = motion.lengths, jnp.inf if motion.scales is None else motion.scales
+    wanted = _PER_SCALE * lengths / scales
     counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
     total = lengths.size + room  # those that are left over lie at the end, without a length
     piece = jnp.repeat(jnp.arange(lengths.size), counts, total_repeat_length=total)

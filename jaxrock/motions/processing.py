@@ -29,9 +29,9 @@ from jaxrock._checks import (
 )
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY, LENGTHS
-from jaxrock.motions.filters import LOWEST, butterworth, of_displacement, of_velocity, smoothed
+from jaxrock.motions.filters import LOWEST, NARROWEST, butterworth, of_displacement, of_velocity, smoothed
 from jaxrock.motions.intensity import peak_acceleration, peak_velocity
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, record_in_g
 from jaxrock.motions.two_sensors import slow_difference, spline_of_displacement
 
 __all__ = [
@@ -65,7 +65,7 @@ def _slack(record: Record) -> float:
 
 
 def _like(record: Record, samples: np.ndarray, dt: float | None = None) -> Record:
-    return Record(samples, record.dt if dt is None else dt, record.name, record.origin)
+    return record_in_g(samples, record.dt if dt is None else dt, record.name, record.origin)
 
 
 def _corner(name: str, value: float | None, dt: float) -> float | None:
@@ -124,7 +124,7 @@ def from_displacement(
     """
     values, dt = _series("displacement", displacement, dt, unit)
     values = smoothed(values - values[0], dt, _corner("corner", corner, dt), order, of_displacement)
-    return Record(spline_of_displacement(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
+    return record_in_g(spline_of_displacement(values, dt)(dt * np.arange(values.size), 2) / GRAVITY, dt, name)
 
 
 @arguments
@@ -153,7 +153,7 @@ def from_velocity(
     values, dt = _series("velocity", velocity, dt, unit)
     values = smoothed(values, dt, _corner("corner", corner, dt), order, of_velocity)
     spline = scipy.interpolate.CubicSpline(dt * np.arange(values.size), values)
-    return Record(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
+    return record_in_g(spline(dt * np.arange(values.size), 1) / GRAVITY, dt, name)
 
 
 @arguments
@@ -251,9 +251,10 @@ def filtered(
     - `order`: of the filter.
     - `zero_phase`: whether it runs forwards and backwards (which doubles its order); the ground rests before and after.
 
-    **Returns:** a `Record`.
+    **Returns:** a `Record` of as many samples: what rings on before its beginning and after its end is left out.
 
-    **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate.
+    **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate, or
+    within a millionth of one another.
     """
     samples, dt = _samples(record)
     low, high = _corner("low", low, dt), _corner("high", high, dt)
@@ -261,6 +262,8 @@ def filtered(
         raise ValueError("Arguments `low` and `high` must not both be None.")
     if low is not None and high is not None and low >= high:
         raise ValueError(f"Argument `high` must be above `low`, {low} Hz, but is {high}.")
+    if low is not None and high is not None and high - low < NARROWEST * high:
+        raise ValueError(f"Argument `high` must be above `low`, {low} Hz, by a millionth of itself, but is {high}.")
     return _like(record, butterworth(samples, dt, low, high, order, zero_phase))
 
 

@@ -23,13 +23,15 @@ from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.pulses import UNITS
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, record_in_g
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.status import Enumeration, item
 
 _NODES, _WEIGHTS = gauss_legendre(6)
-_PARTS = 64  # of every smooth piece of a pulse
+_PARTS = 64  # of every smooth piece of a pulse, at least
+_PER_SCALE = 0.5  # of the time in which its acceleration changes: exact to 1e-9
+_MOST = 1 << 14
 _LENGTHS = 14  # periods or durations that are tried
 _USUAL = {"oscillations": (1.01, 8.0), "shape": (-30.0, 30.0), "phase": (-np.pi, np.pi)}
 _FIRST = {"oscillations": (1.2, 2.0, 3.0), "shape": (-4.0, 0.0, 4.0), "phase": (0.0, np.pi / 2)}  # where it is tried
@@ -116,7 +118,8 @@ def fit_pulse(
     status = status if found.status > 0 else PulseStatus.not_converged
     explained = 1 - 2 * float(found.cost) / float(problem.target @ problem.target)
     rest = np.asarray(record.samples, float) - np.asarray(best.shifted(values["delay"]).acceleration(problem.times))
-    return PulseFit(best, values, explained, Record(rest, record.dt, record.name, record.origin), status, at_ends)
+    residual = record_in_g(rest, record.dt, record.name, record.origin)
+    return PulseFit(best, values, explained, residual, status, at_ends)
 
 
 class _Kind(NamedTuple):
@@ -126,6 +129,7 @@ class _Kind(NamedTuple):
     names: tuple[str, ...]
     logarithmic: tuple[bool, ...]
     of: str
+    parts: int = _PARTS
 
     def values(self, place) -> dict:
         """Parameters by name."""
@@ -159,7 +163,9 @@ class _Problem(NamedTuple):
             name != "delay" and UNITS.get(name) == "s" and low > 0 for name, (low, _) in zip(names, ends)
         )
         ends = np.where(np.array(logarithmic)[:, None], np.log(np.where(ends > 0, ends, 1.0)), ends)
-        return cls(_Kind(pulse, names, logarithmic, of), velocity if of == "velocity" else samples, times, *ends.T)
+        kind = _Kind(pulse, names, logarithmic, of)
+        kind = kind._replace(parts=_parts_of(kind, ends))
+        return cls(kind, velocity if of == "velocity" else samples, times, *ends.T)
 
     def starts(self, count: int) -> list[np.ndarray]:
         """The best places of a grid, each with the delay and the amplitude that fit best there."""
@@ -216,6 +222,33 @@ class _Problem(NamedTuple):
         )
 
 
+def _parts_of(kind: _Kind, ends: np.ndarray) -> int:
+    """How many parts a piece is cut into, so that pulses at all ends of the ranges change little within each.
+
+    **Raises:** ValueError for ranges of pulses with more cycles than are followed.
+    """
+    changes = float(np.nanmax(np.asarray(_changes(kind, np.array(list(itertools.product(*ends)))))))
+    if _PER_SCALE * changes > _MOST:
+        told = (
+            f"{_MOST / _PER_SCALE:g} times the time in which their acceleration changes, but hold {changes:.3g} times"
+        )
+        raise ValueError(f"Argument `ranges` must hold pulses that last at most {told} that.")
+    return max(_PARTS, 1 << int(np.ceil(np.log2(max(_PER_SCALE * changes, 1.0)))))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _changes(kind: _Kind, places):
+    """How many times the time in which its acceleration changes a piece of a pulse lasts, at some places."""
+
+    def at(place):
+        values = kind.values(place)
+        del values["delay"]
+        pulse = kind.pulse(**values)
+        return jnp.zeros(()) if pulse.scales is None else jnp.max(pulse.lengths / pulse.scales)
+
+    return jax.vmap(at)(places)
+
+
 def _parameters(pulse: Callable) -> list[str]:
     """Names of the numbers that a function makes a pulse of."""
     told = inspect.signature(pulse).parameters.values()
@@ -241,7 +274,7 @@ def _model(kind: _Kind, place, times):
     values = kind.values(place)
     times = times - values.pop("delay")
     pulse = kind.pulse(**values)
-    return GRAVITY * _velocity(pulse, times) if kind.of == "velocity" else pulse.acceleration(times)
+    return GRAVITY * _velocity(pulse, times, kind.parts) if kind.of == "velocity" else pulse.acceleration(times)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -259,19 +292,19 @@ def _with_slopes(kind: _Kind, place, times):
     return value, slopes
 
 
-def _velocity(pulse: AbstractMotion, times: Float[Array, " n"]) -> Float[Array, " n"]:
+def _velocity(pulse: AbstractMotion, times: Float[Array, " n"], count: int) -> Float[Array, " n"]:
     """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
     knots, lengths = pulse.knots, pulse.lengths
     nodes, weights = (jnp.asarray(values) for values in (_NODES, _WEIGHTS))
     piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
     local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
-    width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / _PARTS
-    part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, _PARTS - 1)
+    width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / count
+    part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, count - 1)
     # All parts of all pieces, and what is left to each time of the part that it lies in: in one go, to compile less.
-    every, parts = jnp.repeat(jnp.arange(lengths.size), _PARTS), jnp.tile(jnp.arange(_PARTS), lengths.size)
+    every, parts = jnp.repeat(jnp.arange(lengths.size), count), jnp.tile(jnp.arange(count), lengths.size)
     pieces = jnp.concatenate([every, piece])
-    begins = jnp.concatenate([parts * lengths[every] / _PARTS, part * width])
-    widths = jnp.concatenate([lengths[every] / _PARTS, local - part * width])
+    begins = jnp.concatenate([parts * lengths[every] / count, part * width])
+    widths = jnp.concatenate([lengths[every] / count, local - part * width])
 
     def gain(piece, begin, width):
         places = begin + width * (1 + nodes) / 2
@@ -279,4 +312,4 @@ def _velocity(pulse: AbstractMotion, times: Float[Array, " n"]) -> Float[Array, 
 
     gains = jax.vmap(gain)(pieces, begins, widths) / 2
     before = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gains[: every.size])])
-    return before[piece * _PARTS + part] + gains[every.size :]
+    return before[piece * count + part] + gains[every.size :]

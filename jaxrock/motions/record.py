@@ -1,6 +1,8 @@
 """Accelerograms: straight lines between equally spaced samples."""
 
 import abc
+import contextvars
+import warnings
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +20,8 @@ from jaxrock.motions.pieces import Lasting
 from jaxrock.numerics.choice import where
 
 _SHORT = 64  # samples of a record that is a program of its own
+STRONGEST = 3.0  # [g]; few records ever went beyond
+_is_in_g = contextvars.ContextVar("is_in_g", default=False)  # whether samples are known to be, and not doubted
 
 
 class Straight(AbstractMotion):
@@ -81,6 +85,8 @@ class Record(Straight):
 
     **Raises:** ValueError for samples that are not finite numbers, a column (n, 1) in place of them, or dt <= 0.
 
+    It warns of known samples beyond 3 g, which are likely in another unit. `factor * record` may be as strong as it is.
+
     Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
     """
 
@@ -103,6 +109,8 @@ class Record(Straight):
         self.samples = samples
         self.dt = size("dt", dt)
         self.label = Label((name, origin or Origin()))
+        if not is_traced(samples) and not _is_in_g.get():
+            _warn_of_unit(np.asarray(samples), name)
 
     @property
     def name(self) -> str:
@@ -139,6 +147,27 @@ class Record(Straight):
     @property
     def lasting(self) -> Lasting:
         return Lasting.of_equal(self.dt, self.samples.shape[-1] - 1)
+
+
+def record_in_g(acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None) -> Record:
+    """A `Record` of samples that are computed from accelerations in g: their unit is not doubted."""
+    before = _is_in_g.set(True)
+    try:
+        return Record(acceleration, dt, name, origin)
+    finally:
+        _is_in_g.reset(before)
+
+
+def _warn_of_unit(samples: np.ndarray, name: str) -> None:
+    peak = max(float(samples.max()), -float(samples.min()))
+    if peak > STRONGEST:
+        unit, per_g = ("m/s2", 9.81) if peak <= STRONGEST * 9.81 else ("cm/s2", 981)
+        warnings.warn(
+            f"{f'Record {name!r}' if name else 'A record'} peaks at {peak:.4g} g. If its samples are in {unit}, divide "
+            f"them by {per_g}: it then peaks at {peak / per_g:.3g} g.",
+            UserWarning,
+            stacklevel=7,
+        )
 
 
 class AbstractChosen(AbstractMotion):

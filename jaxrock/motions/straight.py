@@ -10,11 +10,13 @@ from jaxrock._checks import check_known
 from jaxrock._parameters import check_single
 from jaxrock.blocks.rigid import GRAVITY
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
+from jaxrock.motions.peaks import too_long
 from jaxrock.motions.record import Record
 
 _LINES = 16384  # of smooth pieces, at least
-_PER_SCALE = 1024  # of the time in which an acceleration changes
-_MOST = 1 << 19
+_PER_SCALE = 256  # of the time in which an acceleration changes
+_FEWEST = 32  # of it, with which they are 1e-7 off
+_MOST = 1 << 20
 
 
 class Straight(NamedTuple):
@@ -68,20 +70,27 @@ def straight(motion: AbstractMotion) -> Straight:
     piece = np.repeat(np.arange(lengths.size), counts)
     number = np.arange(piece.size) - np.repeat(np.cumsum(counts) - counts, counts)
     step = (lengths / np.maximum(counts, 1))[piece]
-    ends = (number * step, np.minimum((number + 1) * step, lengths[piece]))
-    begin, end = (GRAVITY * _values(motion, piece, local) for local in ends)
-    return Straight(begin, end, step)
+    places = (number * step, (number + 0.5) * step, np.minimum((number + 1) * step, lengths[piece]))
+    begin, middle, end = (GRAVITY * _values(motion, piece, local) for local in places)
+    # Lines from end to end of a curve lie on its inner side: these have its integral, by Simpson's rule.
+    bend = 2 / 3 * (middle - (begin + end) / 2)
+    return Straight(begin + bend, end + bend, step)
 
 
 def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
-    """Of how many lines each piece is made: one, if it is one; none without a length (the room of longer records); else
-    as many as its curves ask for."""
+    """How many lines each piece is made of: one, if it is one; none without a length (the room of longer records); else
+    as many as its curves ask for.
+
+    **Raises:** ValueError for curves of too many.
+    """
     lasting = lengths > 0
     if scales is None:
         return lasting.astype(int)
     smooth = lasting & np.isfinite(scales)
-    wanted = np.where(smooth, _PER_SCALE * lengths / np.where(smooth, scales, 1.0), 0.0)
-    wanted = np.maximum(wanted, np.where(smooth, _LINES / max(smooth.sum(), 1), 0.0))
+    changes = np.where(smooth, lengths / np.where(smooth, scales, 1.0), 0.0)
+    if changes.sum() * _FEWEST > _MOST:
+        raise too_long(_MOST // _FEWEST, changes.sum())
+    wanted = np.maximum(_PER_SCALE * changes, np.where(smooth, _LINES / max(smooth.sum(), 1), 0.0))
     return np.where(lasting, np.ceil(np.maximum(wanted * min(1.0, _MOST / max(wanted.sum(), 1.0)), 1.0)), 0).astype(int)
 
 

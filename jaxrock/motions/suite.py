@@ -21,8 +21,8 @@ from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
 from jaxrock.motions.components import Components
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
-from jaxrock.motions.peaks import peaks_of_motion
-from jaxrock.motions.record import Record, with_room
+from jaxrock.motions.peaks import peaks_of_many, peaks_of_motion
+from jaxrock.motions.record import Record, record_in_g, with_room
 
 _LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
 
@@ -184,7 +184,7 @@ def _multiplied(motion: Any) -> Record:
     if isinstance(motion, Record):
         return motion
     record = motion.motion
-    return Record(motion.factor * record.samples, record.dt, record.name, record.origin)
+    return record_in_g(motion.factor * record.samples, record.dt, record.name, record.origin)
 
 
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None, vertical: bool):
@@ -267,4 +267,4 @@ def _peaks(group: AbstractMotion):
     group = with_room(group)
     if size_of(group) == 1:  # of what is traced for one motion, there are programs already
         return [jnp.reshape(peak, (1,)) for peak in peaks_of_motion(one_of_many(group, 0))]
-    return jax.vmap(lambda index: peaks_of_motion(one_of_many(group, index)))(jnp.arange(size_of(group)))
+    return peaks_of_many(group, one_of_many, size_of(group))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 _POINTS = 20_001  # of a curve
+_LONG = 200.0  # [s], in which they lie a hundredth of a second apart
 
 
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
@@ -29,12 +30,37 @@ def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
 
 
 def moments_seen(motion: AbstractMotion, begin: float, end: float, count: int) -> np.ndarray:
-    """Times at which a motion is drawn [s]: so many at equal steps, and all of its knots between, where it has its
-    corners and, with the moment before them, its jumps."""
+    """Times at which a motion is drawn [s]: so many at equal steps, as many where it is curved, and all of its knots
+    between, where it has its corners and, with the moment before them, its jumps."""
     knots = np.asarray(motion.knots)
     # Those that lie outside stay, at the ends: one number of times, one program, for all lengths of padded records.
-    within = np.clip(np.concatenate([knots, np.nextafter(knots, -np.inf)]), begin, end)
+    within = np.clip(np.concatenate([knots, np.nextafter(knots, -np.inf), _curved(motion, knots, count)]), begin, end)
     return np.sort(np.concatenate([np.linspace(begin, end, count), within]))
+
+
+def _curved(motion: AbstractMotion, knots: np.ndarray, count: int) -> np.ndarray:
+    """So many times within pieces that are no straight lines, the closer the faster the acceleration changes there."""
+    if motion.scales is None:
+        return knots[:0]
+    lengths, scales = np.asarray(motion.lengths), np.asarray(motion.scales)
+    curved = np.isfinite(scales)
+    scales = np.where(curved, scales, 1.0)
+    changes = np.cumsum(np.where(curved, lengths / scales, 0.0))
+    share = changes[-1] * (np.arange(count) + 0.5) / count
+    piece = np.minimum(np.searchsorted(changes, share), lengths.size - 1)
+    return knots[piece] + (share - np.append(0.0, changes)[piece]) * scales[piece]
+
+
+def _times_of(response: Response | FlexibleResponse, motion: AbstractMotion) -> np.ndarray:
+    """Times at which a response is drawn [s]: at equal steps, or, of one so long that these would pass over what it
+    does, half of them between knots and impacts, as many between any two."""
+    duration = float(response.duration)
+    if duration <= _LONG:
+        return np.linspace(0, duration, _POINTS)
+    events = np.concatenate([[0.0, duration], np.asarray(motion.knots), np.asarray(response.impact_times)])
+    events = np.unique(events[(events >= 0) & (events <= duration)])
+    half = np.interp(np.linspace(0, events.size - 1, _POINTS // 2), np.arange(events.size), events)
+    return np.sort(np.concatenate([half, np.linspace(0, duration, _POINTS - half.size)]))
 
 
 @jax.jit
@@ -77,7 +103,7 @@ def _ink() -> str:
 def _dense(response: Response) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time [s], rotation over alpha and velocity over p alpha, finely enough for the corners at impacts."""
     scene = response.scene
-    time = np.linspace(0, float(response.duration), _POINTS)
+    time = _times_of(response, scene.motion)
     rotation, velocity = response(time)
     alpha, p = float(scene.alpha), float(scene.p)
     return time, np.asarray(rotation) / alpha, np.asarray(velocity) / (p * alpha)
@@ -140,7 +166,7 @@ def history(response: Response | FlexibleResponse, axes: "Sequence[Axes] | None"
 
 
 def _bending_history(response: FlexibleResponse, axes):
-    time = np.linspace(0, float(response.duration), _POINTS)
+    time = _times_of(response, response.scene.ground)
     rotation, displacement, bending = (np.asarray(x) for x in response(time))
     impacts = np.asarray(response.impact_times)
     axes[0].plot(time, rotation / float(response.scene.block.alpha), color=BLUE, linewidth=0.9)

@@ -27,7 +27,7 @@ from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.knet import KNET
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.smc import SMC
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import STRONGEST, Record, record_in_g
 
 # Formats that headers tell; another one is a line here. Each is asked before those above it: a V2 file may hold a
 # line that AT2 would take for its own, but hardly the other way round.
@@ -42,7 +42,6 @@ _WITH_HEADERS = (
 )
 
 _HEADER = 400  # lines in which headers of fixed places end
-_MOST = 20.0  # [g]; the largest that was ever recorded is a fifth of it
 _WORDS = re.compile(r"[A-CF-Za-cf-z]")
 
 _COLUMNS = Columns(_WITH_HEADERS)
@@ -112,11 +111,11 @@ def component_columns(path: str | os.PathLike, format: str | None = None) -> tup
 def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
     samples = found.samples / PER_G[found.unit]
     largest = np.abs(samples).max()
-    if largest > _MOST:
-        told = f"File `{path.name}` holds an acceleration of {largest:.4g} g, more than was ever recorded"
+    if largest > STRONGEST:
+        told = f"File `{path.name}` holds an acceleration of {largest:.4g} g, more than all but a few records"
         warnings.warn(f"{told}: is its unit {found.unit}, and does no such number mark a gap?", stacklevel=4)
     origin = found.origin._replace(format=kind.name, unit=found.unit, file=path.name)
-    return Record(samples, found.dt, found.title or path.stem, origin)
+    return record_in_g(samples, found.dt, found.title or path.stem, origin)
 
 
 def _format_of(lines: list[str], suffix: str) -> AbstractFormat:

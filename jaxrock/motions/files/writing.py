@@ -16,7 +16,7 @@ from jaxrock.motions.record import Record
 
 def _line(text: str) -> str:
     """A text in one line that a header may hold."""
-    return " ".join(text.split())
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())
 
 
 @arguments
@@ -55,11 +55,14 @@ def write_csv(record: Record, path: str | os.PathLike, unit: Annotated[str, word
     - `unit`: of the accelerations in the file, "g" (of 9.80665 m/s^2), "m/s2" or "cm/s2". The file names it in the
       title of its column, where `read_record` finds it.
 
-    **Raises:** OSError if the file cannot be written; ValueError for arguments of other kinds, and for a name that
-    would be read as a header ("NPTS= 5, DT= .1").
+    **Raises:** OSError if the file cannot be written; ValueError for arguments of other kinds, for a record of one
+    sample, which has no second time to tell the step by, and for a name that would be read as a header ("NPTS= 5, DT=
+    .1").
     """
     check_single(record=record)
     samples, step = np.asarray(record.samples, float) * PER_G[unit], as_meant(record.dt)
+    if samples.size < 2:
+        raise ValueError("Argument `record` must have at least two samples, but has one: `write_at2` states the step.")
     head = [f"# {_line(record.name)}", f"# time [s], acceleration [{unit}]"]
     trial = [f"{step * k:.12g},{x!r}" for k, x in enumerate((_TRIAL * PER_G[unit]).tolist())]
     _check_name(record.name, [*head, *trial], record, "csv", unit)

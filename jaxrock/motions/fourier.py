@@ -1,0 +1,100 @@
+"""Squared Fourier amplitudes of straight lines over a band of frequencies, in NumPy.
+
+Shocks far from one another are transformed each by itself, so that the quiet between them costs nothing. What they add
+to each other's amplitudes changes from frequency to frequency as fast as they are far apart: that factor is integrated
+in closed form.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxrock.motions.oscillator import integrals_of_exponential
+from jaxrock.motions.straight import Straight
+
+_QUIET = 20.0  # between two shocks [s], at least
+_SHOCKS = 64  # at most; with more, longer pauses part them
+_APART = 5e-3  # amplitudes, at most [Hz]
+_SHORT = 2.5e-4  # steps of time, at most [s], but those of lines of one length
+_MOST = 1 << 24  # steps
+_FINE = 8  # amplitudes for each that a shock of some length determines
+_MANY = 1 << 20  # samples, of which there are fewer
+
+
+class _Shock(NamedTuple):
+    """Straight lines between quiet: from when on [s], and how long they last [s]."""
+
+    lines: Straight
+    begin: float
+    length: float
+
+    @property
+    def middle(self) -> float:
+        return self.begin + self.length / 2
+
+
+def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[float, float]:
+    """The integral of the squared Fourier amplitude over a band of frequencies [Hz], and that of it over frequency."""
+    shocks = _shocks(lines)
+    if not shocks:
+        return 0.0, 0.0
+    longest = max(shock.length for shock in shocks)
+    fine = _FINE if longest / min(map(_step, shocks)) < _MANY else 1
+    apart = min(_APART, 1 / (2 * fine * longest))
+    grid = np.linspace(*band, int(np.ceil((band[1] - band[0]) / apart)) + 1)
+    found = np.zeros(2)
+    amplitudes = [_amplitudes(shock, grid) for shock in shocks]
+    for number, (shock, one) in enumerate(zip(shocks, amplitudes)):
+        power = np.abs(one) ** 2
+        found += [np.trapezoid(power, grid), np.trapezoid(power / grid, grid)]
+        for earlier, other in zip(shocks[:number], amplitudes):
+            both = 2 * one * other.conj()
+            found += _between(np.stack([both, both / grid]), grid, shock.middle - earlier.middle)
+    return float(found[0]), float(found[1])
+
+
+def _shocks(lines: Straight) -> list[_Shock]:
+    """What is parted by quiet."""
+    lines = Straight(*(part[lines.length > 0] for part in lines))
+    moving, times = (lines.begin != 0) | (lines.end != 0), lines.times
+    places = np.flatnonzero(moving)
+    if places.size == 0:
+        return []
+    pauses = times[places[1:]] - times[places[:-1] + 1]
+    quiet = max(_QUIET, np.sort(pauses)[-_SHOCKS] if pauses.size >= _SHOCKS else 0.0)
+    groups = np.split(places, np.flatnonzero(pauses > quiet) + 1)
+    ends = ((group[0], group[-1] + 1) for group in groups)
+    return [_Shock(Straight(*(x[a:b] for x in lines)), times[a], times[b] - times[a]) for a, b in ends]
+
+
+def _step(shock: _Shock) -> float:
+    """Of what length steps of time are [s]: that of the lines, if they are alike and go on where others end."""
+    length = shock.lines.length
+    joined = np.allclose(shock.lines.begin[1:], shock.lines.end[:-1], rtol=1e-9, atol=0)
+    if length.size > 1 and joined and np.ptp(length) <= 1e-6 * length.max():
+        return float(length.mean())
+    return max(min(_SHORT, shock.length / 1000, 8 * float(length.max())), shock.length / _MOST)
+
+
+def _amplitudes(shock: _Shock, grid: np.ndarray) -> np.ndarray:
+    """Fourier transform at some frequencies [Hz], of time from the middle of the shock on."""
+    lines, step, times = shock.lines, _step(shock), shock.lines.times
+    time = step * np.arange(int(np.floor(times[-1] / step * (1 + 1e-9))) + 1)
+    knots = np.stack([times[:-1], times[1:] - 1e-9 * step], axis=1).ravel()
+    values = np.stack([lines.begin, lines.end], axis=1).ravel()
+    # At a jump the mean of both sides, so that it comes neither too early nor too late.
+    samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
+    from scipy.signal import zoom_fft
+
+    sums = zoom_fft(samples, [grid[0], grid[-1]], grid.size, fs=1 / step, endpoint=True)
+    # Of straight lines between the samples: that of samples, which comes again beyond half of their rate, but weaker.
+    return step * sums * np.sinc(grid * step) ** 2 * np.exp(1j * np.pi * grid * shock.length)
+
+
+def _between(values: np.ndarray, grid: np.ndarray, later: float) -> np.ndarray:
+    """Real parts of integrals of values, straight between frequencies, times e^(-2 pi i later frequency)."""
+    apart = np.diff(grid)
+    turn = -2j * np.pi * later
+    whole, falling = integrals_of_exponential(turn * apart, apart)
+    pieces = values[:, :-1] * falling + values[:, 1:] * (whole - falling)
+    return (pieces * np.exp(turn * grid[:-1])).sum(axis=1).real
