@@ -11,7 +11,7 @@ unit and range.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
@@ -166,6 +166,13 @@ def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECL
         if not field.metadata.get("static", False):
             own = field.metadata.get("parameter", _UNDECLARED)
             yield from leaves_of(getattr(owner, field.name), (*path, field.name), own)
+
+
+def with_values(owner: Any, values: Mapping[str, Any]) -> Any:
+    """Return the owner with other values of those of its numbers that are named, wherever in it they are: in modules,
+    dictionaries, lists or tuples."""
+    leaves = [values.get(leaf.name, leaf.value) if leaf.is_number else leaf.value for leaf in leaves_of(owner)]
+    return jax.tree.unflatten(jax.tree.structure(owner), leaves)
 
 
 def _is_module(value: Any) -> bool:

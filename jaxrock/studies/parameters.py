@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
-from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of
+from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of, with_values
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
@@ -98,9 +98,7 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
             new = eqx.tree_at(operator.attrgetter(field), new, value, is_leaf=lambda x: x is None)
     own = _of_own(block)
     if own:
-        law = eqx.tree_at(
-            lambda law: [_at(law, leaf.path[1:]) for leaf in own], block.law, [values[x.name] for x in own]
-        )
+        law = with_values(block.law, {".".join(leaf.path[1:]): values[leaf.name] for leaf in own})
     elif not _of_law(block):
         return new
     elif len(_of_law(block)) == 1:
@@ -114,10 +112,9 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
 
 
 def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: Real | None) -> AbstractMotion:
-    numbers = _numbers(motion)
-    new = [values[leaf.name] for leaf in numbers]
-    changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
-    if "amplitude" not in [leaf.name for leaf in numbers]:
+    names = [leaf.name for leaf in _numbers(motion)]
+    changed = with_values(motion, {name: values[name] for name in names})
+    if "amplitude" not in names:
         peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
         changed = Scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
     return changed
@@ -159,9 +156,3 @@ def _numbers(motion: AbstractMotion) -> list[Leaf]:
     while isinstance(inner, Scaled | Shifted):
         inner, place = inner.motion, f"{place}motion."
     return [leaf for leaf in leaves_of(motion) if leaf.is_number and not (place and leaf.name == f"{place}amplitude")]
-
-
-def _at(owner, path: tuple[str, ...]):
-    for part in path:
-        owner = getattr(owner, part)
-    return owner

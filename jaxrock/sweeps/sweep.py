@@ -278,6 +278,8 @@ def compute(
     results = [] if store else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
     with all_or_none():
+        if store and own == 0:
+            _mark(store, "unfinished" if left else "finished")
         for number in mine:
             place = plan.place(number)
             shape = tuple(p.stop - p.start for p in place)
@@ -288,6 +290,9 @@ def compute(
             else:
                 for leaf, part in zip(results, leaves):
                     leaf[place] = part
+    with all_or_none():  # all processes have written theirs
+        if store and own == 0:
+            _mark(store, "finished")
     if count > 1 and not store:
         _gather(results, plan, left)
     if store and not load:
@@ -303,8 +308,17 @@ def _at_once(run: Runner, plan: Plan, label: str, progress: bool | None, columns
 
 
 def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:
+    _kept(store, store.write, number, leaves)
+
+
+def _mark(store: Store, state: str) -> None:
+    _kept(store, store.mark, state)
+
+
+def _kept(store: Store, write: Callable, *given) -> None:
+    """Write to a store, or say that what is finished stays."""
     try:
-        uninterrupted(store.write, number, leaves)
+        uninterrupted(write, *given)
     except OSError as error:
         said = f"{error.strerror or error}. Blocks that are finished are kept: the same sweep goes on from there"
         raise OSError(error.errno, said, str(store.path)) from error
