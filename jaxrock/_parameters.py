@@ -205,9 +205,14 @@ def one_of_many(owners: Any, index: Any) -> Any:
 
 
 def in_precision(owner: Any, dtype: Any) -> Any:
-    """The owner with all its numbers as real ones of this kind, but for what is declared whole."""
-    leaves = [leaf.value if leaf.declared.is_whole else jnp.asarray(leaf.value, dtype) for leaf in leaves_of(owner)]
-    return jax.tree.unflatten(jax.tree.structure(owner), leaves)
+    """The owner with all its numbers as real ones of this kind, but for what is declared whole, and for booleans that
+    are not declared."""
+
+    def of(leaf):
+        is_flag = leaf.declared.axes is None and jnp.result_type(leaf.value) == bool
+        return leaf.value if leaf.declared.is_whole or is_flag else jnp.asarray(leaf.value, dtype)
+
+    return jax.tree.unflatten(jax.tree.structure(owner), [of(leaf) for leaf in leaves_of(owner)])
 
 
 def in_real_numbers(*owners: Any) -> tuple:

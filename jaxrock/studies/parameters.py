@@ -1,6 +1,7 @@
 """The parameters of a scene by name: what derivatives are taken by, and what is fitted."""
 
 import operator
+from collections import Counter
 
 import equinox as eqx
 import jax
@@ -30,8 +31,13 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     parameters of its own these, as `restitution.gentle`), and those of the motion as it names them; `amplitude` [g]
     also of a motion that does not (a record): its peak, which scales all of it.
 
-    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name.
+    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name, and for two
+    parameters of one name, as of `{"a.b": 1.0, "a": {"b": 2.0}}`.
     """
+    for owner, leaves in {"block": _of_own(block), "motion": _numbers(motion)}.items():
+        for name, count in Counter(leaf.name for leaf in leaves).items():
+            if count > 1:
+                raise ValueError(f"Argument `{owner}` has {count} parameters {name!r}: they need names of their own.")
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
     moving = {leaf.name: leaf.value for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
     for name in found.keys() & moving:

@@ -194,19 +194,39 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
         array = np.asarray(values)
     except ValueError as error:  # lists of unlike lengths
         raise ValueError(f"Argument `{name}` must be a list of numbers, but is {shown(values)}.") from error
+    many = isinstance(values, (list, tuple)) and all(isinstance(value, int) for value in values)
+    if array.ndim == 1 and array.size and many and array.dtype.kind in "fO":
+        largest = max(values, key=abs)
+        raise ValueError(f"Argument `{name}` must be whole numbers of one type of 64 bits, but has {largest}.")
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
             f"{array.dtype}."
         )
-    array = native(array)
-    found = array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
+    with np.errstate(over="ignore", under="ignore"):
+        found = native(array)
+        found = found.astype(jax.dtypes.canonicalize_dtype(found.dtype))  # in the precision of the session
     if array.dtype.kind in "iu" and (found != array).any():
         raise ValueError(
             f"Argument `{name}` must be whole numbers of the precision of the session ({found.dtype}), but has "
             f"{array[found != array][0]}: enable double precision, or give them as floats."
         )
+    if array.dtype.kind == "f":
+        _check_size(name, array, found)
     return found
+
+
+def _check_size(name: str, given: np.ndarray, found: np.ndarray) -> None:
+    """Refuse numbers that are infinite or zero in the precision of the session, and were not; processors take what is
+    below the least normal number as zero."""
+    known = np.finfo(found.dtype)
+    bad = (np.isinf(found) & ~np.isinf(given)) | ((np.abs(found) < known.tiny) & (given != 0))
+    if bad.any():
+        raise ValueError(
+            f"Argument `{name}` must be numbers of the precision of the session ({found.dtype}: 0, or from "
+            f"{known.tiny:.2g} to {known.max:.2g} in size), but has {given[bad][0]!s}: take another unit"
+            f"{'' if found.dtype == np.float64 else ', or enable double precision'}."
+        )
 
 
 def surface(
