@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
+from jaxrock._guard import as_array
 from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of, with_values
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
@@ -39,7 +40,7 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
             if count > 1:
                 raise ValueError(f"Argument `{owner}` has {count} parameters {name!r}: they need names of their own.")
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
-    moving = {leaf.name: leaf.value for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
+    moving = {leaf.name: as_array(leaf.value) for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
     for name in found.keys() & moving:
         raise ValueError(f"Argument `motion` has a parameter {name!r}, as the block has: it needs another name.")
     return found | moving
@@ -47,7 +48,7 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
 
 def amplitude_of(motion: AbstractMotion) -> Real:
     """The amplitude that a motion names, or its peak [g]."""
-    own = [leaf.value for leaf in _numbers(motion) if leaf.name == "amplitude"]
+    own = [as_array(leaf.value) for leaf in _numbers(motion) if leaf.name == "amplitude"]
     return own[0] if own else peak_of(motion)
 
 
@@ -144,7 +145,7 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
     """Parameters of the restitution; none of a law without numbers that is not one for each side either."""
     own = _of_own(block)
     if own:
-        return {leaf.name: leaf.value for leaf in own}
+        return {leaf.name: as_array(leaf.value) for leaf in own}
     if block.law.depends_on_speed:
         return {}
     if not isinstance(block, AsymmetricBlock) and tells_sides(block.law, block.corners):
