@@ -107,7 +107,8 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
         if isinstance(known, np.ndarray) and known.dtype.kind in "fiu":
             known = native(known)
             is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
-            return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
+            with np.errstate(over="ignore"):  # its range tells an infinite number
+                return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
         array = as_array(known)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error

@@ -209,7 +209,7 @@ def in_precision(owner: Any, dtype: Any) -> Any:
     are not declared."""
 
     def of(leaf):
-        is_flag = leaf.declared.axes is None and jnp.result_type(leaf.value) == bool
+        is_flag = leaf.declared.axes is None and jnp.issubdtype(jnp.result_type(leaf.value), jnp.bool_)
         return leaf.value if leaf.declared.is_whole or is_flag else jnp.asarray(leaf.value, dtype)
 
     return jax.tree.unflatten(jax.tree.structure(owner), [of(leaf) for leaf in leaves_of(owner)])

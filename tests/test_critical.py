@@ -309,3 +309,46 @@ def test_no_motion_is_unexceeded_where_the_least_topples_a_rock():
     )
     assert np.asarray(found.complete).all() and np.isfinite(found.amplitude).all()
     assert not np.asarray(below.complete).any() and np.isnan(below.amplitude).all()
+
+
+# Scenes of one batch: a wide block and a large one, one without ends, one that is not known, and two alike.
+ALPHA = np.array([0.2, 0.6, np.nan, 0.05, 0.2])
+RATE = np.array([2.0, 0.5, 2.0, 8.0, 2.0])
+HELD = rk.models.Equation(lambda x, block: jnp.sin(block.alpha - x), lambda x, block: jnp.cos(block.alpha - x))
+
+
+def critical(alpha, p, options):
+    block = rk.Block(alpha, p, 0.9, throw=False)
+    search = rk.studies.critical_durations if "factor" in options else rk.critical_amplitudes
+    return search(block, rk.SinePulse(0.4, 1.0), progress=False, **options)
+
+
+BATCHES = {
+    "all amplitudes": {"intensity": (1.0, 4.0)},
+    "the lowest amplitudes": {"intensity": (1.0, 4.0), "max_ends": 2},
+    "all durations": {"factor": (0.2, 4.0)},
+    "of an equation": {"intensity": (1.0, 4.0), "model": HELD, "derivatives": False},
+}
+
+
+@pytest.mark.parametrize(
+    "options", [pytest.param(x, marks=pytest.mark.slow) if "model" in x else x for x in BATCHES.values()], ids=BATCHES
+)
+def test_a_scene_does_not_depend_on_its_neighbours(options):
+    """A batch is a loop over its scenes; one that cannot be computed says so, alone."""
+    together = critical(ALPHA, RATE, options)
+    np.testing.assert_array_equal(together.complete, [True, True, False, True, True])
+    assert together.count[2] == 0
+    for k in range(ALPHA.size):
+        alone = critical(ALPHA[k : k + 1], RATE[k : k + 1], options)
+        assert alone.count[0] == together.count[k] and alone.complete[0] == together.complete[k]
+        count = int(alone.count[0])
+        for name in ("value", "rising", "impacts", "balanced", "derivative"):
+            both = (np.asarray(getattr(each, name)) for each in (alone, together))
+            np.testing.assert_allclose(*(x[i, :count] for x, i in zip(both, (0, k))), rtol=1e-9, err_msg=name)
+
+
+def test_a_motion_that_is_not_known_is_so_alone():
+    pulses = rk.SinePulse(np.array([1.0, np.nan]), 1.0, throw=False)
+    found = rk.critical_amplitudes(rk.Block(0.2, 2.0, 0.9), pulses, intensity=(1.0, 4.0), progress=False)
+    np.testing.assert_array_equal(found.complete, [True, False])

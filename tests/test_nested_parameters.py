@@ -1,4 +1,4 @@
-"""Parameters of laws, motions and equations of the user's own, wherever they are: dictionaries, lists, tuples, modules."""
+"""Parameters of laws and motions of the user's own, wherever they are: dictionaries, lists, tuples, modules."""
 
 import equinox as eqx
 import jax
@@ -76,7 +76,14 @@ def test_critical_amplitudes_of_a_law_with_a_dictionary():
         return rk.critical_amplitudes(block, PULSE, max_ends=1, progress=False)
 
     both = found(FIRM)
-    assert both.names == ("alpha", "p", "restitution.held.count", "restitution.held.firm", "restitution.speed", "period")
+    assert both.names == (
+        "alpha",
+        "p",
+        "restitution.held.count",
+        "restitution.held.firm",
+        "restitution.speed",
+        "period",
+    )
     by_differences = (found(FIRM + 1e-5).value[0] - found(FIRM - 1e-5).value[0]) / 2e-5
     np.testing.assert_allclose(both.derivative[0, 3], by_differences, rtol=1e-6)
     assert both.derivative[0, 2] == 0

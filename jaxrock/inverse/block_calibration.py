@@ -37,7 +37,7 @@ class CalibrationStatus(Enumeration):
     """What became of a calibration; `CalibrationStatus[found.status]` is the message."""
 
     successful = item(
-        "A maximum of the likelihood lies within the ranges: the highest that climbs from the best points of a net found."
+        "A maximum of the likelihood lies within the ranges: the highest that was found from the best points of a net."
     )
     at_an_end = item(
         "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."

@@ -117,8 +117,8 @@ def _check_cells(message: str, failed: np.ndarray, grid: dict[str, np.ndarray]) 
     if cells.size:
         at = ", ".join(f"{name} = {values.ravel()[cells[0]]:.4g}" for name, values in grid.items())
         raise ValueError(
-            f"Argument `block` must make a block in every cell of the grid, but fails in {cells.size} of {failed.size}, "
-            f"the first of which is {at}: {message[0].lower()}{message[1:]}. The grid goes {_BEYOND} of the largest "
+            f"Argument `block` must make a block in every cell of the grid, but fails in {cells.size} of {failed.size}"
+            f", the first of which is {at}: {message[0].lower()}{message[1:]}. The grid goes {_BEYOND} of the largest "
             "`scatter` beyond the ranges of `unknowns`."
         )
 

@@ -195,9 +195,9 @@ class _Scenes(eqx.Module):
         threshold, peak, amplitude, least = _facts(both, model, size)
         message = "Argument `motion` must move the ground"
         if is_traced(peak):
-            least = watched(least, message, ~(peak > _LEAST).all())
-        elif not (np.asarray(peak) > _LEAST).all():
-            raise ValueError(f"{message}, but its peak is {np.asarray(peak).min():g} g.")
+            least = watched(least, message, (peak <= _LEAST).any())
+        elif (np.asarray(peak) <= _LEAST).any():
+            raise ValueError(f"{message}, but its peak is {np.nanmin(np.asarray(peak)):g} g.")
         return cls(both, threshold, amplitude, least, single=not shape)
 
 

@@ -123,8 +123,13 @@ def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: 
     changed = with_values(motion, {name: values[name] for name in names})
     if "amplitude" not in names:
         peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
-        changed = Scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
+        changed = scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
     return changed
+
+
+def scaled(motion: AbstractMotion, factor: Real) -> AbstractMotion:
+    """A motion times a factor, which is not checked: it may be NaN, and so is the outcome of the scene then."""
+    return eqx.tree_at(lambda changed: changed.factor, Scaled(motion, jnp.ones_like(factor)), factor)
 
 
 def _declared(block: AnyBlock) -> dict[str, Parameter]:

@@ -194,9 +194,9 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
         array = np.asarray(values)
     except ValueError as error:  # lists of unlike lengths
         raise ValueError(f"Argument `{name}` must be a list of numbers, but is {shown(values)}.") from error
-    many = isinstance(values, (list, tuple)) and all(isinstance(value, int) for value in values)
-    if array.ndim == 1 and array.size and many and array.dtype.kind in "fO":
-        largest = max(values, key=abs)
+    whole = [value for value in values if isinstance(value, int)] if isinstance(values, (list, tuple)) else []
+    if array.ndim == 1 and len(whole) == array.size > 0 and array.dtype.kind in "fO":
+        largest = max(whole, key=abs)
         raise ValueError(f"Argument `{name}` must be whole numbers of one type of 64 bits, but has {largest}.")
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
