@@ -332,7 +332,7 @@ BATCHES = {
 
 
 @pytest.mark.parametrize(
-    "options", [pytest.param(x, marks=pytest.mark.slow) if "model" in x else x for x in BATCHES.values()], ids=BATCHES
+    "options", [pytest.param(x, marks=pytest.mark.slow) if {"model", "max_ends"} & {*x} else x for x in BATCHES.values()], ids=BATCHES
 )
 def test_a_scene_does_not_depend_on_its_neighbours(options):
     """A batch is a loop over its scenes; one that cannot be computed says so, alone."""

@@ -92,7 +92,7 @@ def write(dataset, path: Path, stopped: threading.Event) -> None:
         patient = _Patient(file, stopped)
         try:
             with h5netcdf.File(patient, "w") as opened:
-                dataset.dump_to_store(backends.H5NetCDFStore(opened), encoding=_all_there(dataset))
+                dataset.dump_to_store(backends.H5NetCDFStore(opened))
         except BaseException as error:
             patient.error = patient.error or error
         if patient.error is not None:
@@ -100,12 +100,6 @@ def write(dataset, path: Path, stopped: threading.Event) -> None:
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").digest()
         patient._write(file.seek(0, 2), _MARK + digest)
-
-
-def _all_there(dataset) -> dict[str, dict]:
-    """Encoding without the fill value that xarray gives floating-point numbers: it rewrites every NaN."""
-    floating = [str(name) for name, values in dataset.variables.items() if values.dtype.kind == "f"]
-    return {name: {"_FillValue": None} for name in floating}
 
 
 def opened(path: Path):
