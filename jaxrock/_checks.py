@@ -107,7 +107,8 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
         if isinstance(known, np.ndarray) and known.dtype.kind in "fiu":
             known = native(known)
             is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
-            return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
+            with np.errstate(over="ignore"):  # its range tells an infinite number
+                return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
         array = as_array(known)
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error
@@ -186,8 +187,17 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
     good = np.asarray(good)  # of an array of JAX `np.all` would be a program for every shape
     if not good.all():
         known, good = np.broadcast_arrays(known, good)
-        raise ValueError(f"{message}, but is {known[~good].flat[0]}.")
+        raise ValueError(f"{message}, but is {_as_given(value, known, ~good)}.")
     return array
+
+
+def _as_given(value: Values, known: np.ndarray, bad: np.ndarray) -> str:
+    """Say the first bad number; as it was given, where it becomes zero or infinite in the precision of the session."""
+    number = known[bad].flat[0]
+    given = np.asarray(value) if not isinstance(value, jax.Array) else known
+    if given.shape == bad.shape and (number == 0 or np.isinf(number)) and number != given[bad].flat[0]:
+        return f"{given[bad].flat[0]}, which is {number} in the precision of the session ({known.dtype})"
+    return f"{number}"
 
 
 def _failed(holds: Callable) -> Callable:

@@ -11,7 +11,7 @@ unit and range.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
@@ -168,6 +168,13 @@ def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECL
             yield from leaves_of(getattr(owner, field.name), (*path, field.name), own)
 
 
+def with_values(owner: Any, values: Mapping[str, Any]) -> Any:
+    """Return the owner with other values of those of its numbers that are named, wherever in it they are: in modules,
+    dictionaries, lists or tuples."""
+    leaves = [values.get(leaf.name, leaf.value) if leaf.is_number else leaf.value for leaf in leaves_of(owner)]
+    return jax.tree.unflatten(jax.tree.structure(owner), leaves)
+
+
 def _is_module(value: Any) -> bool:
     return isinstance(value, eqx.Module)
 
@@ -198,9 +205,14 @@ def one_of_many(owners: Any, index: Any) -> Any:
 
 
 def in_precision(owner: Any, dtype: Any) -> Any:
-    """The owner with all its numbers as real ones of this kind, but for what is declared whole."""
-    leaves = [leaf.value if leaf.declared.is_whole else jnp.asarray(leaf.value, dtype) for leaf in leaves_of(owner)]
-    return jax.tree.unflatten(jax.tree.structure(owner), leaves)
+    """The owner with all its numbers as real ones of this kind, but for what is declared whole, and for booleans that
+    are not declared."""
+
+    def of(leaf):
+        is_flag = leaf.declared.axes is None and jnp.issubdtype(jnp.result_type(leaf.value), jnp.bool_)
+        return leaf.value if leaf.declared.is_whole or is_flag else jnp.asarray(leaf.value, dtype)
+
+    return jax.tree.unflatten(jax.tree.structure(owner), [of(leaf) for leaf in leaves_of(owner)])
 
 
 def in_real_numbers(*owners: Any) -> tuple:

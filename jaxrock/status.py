@@ -48,7 +48,9 @@ class Status(Enumeration):
     )
     undecided = item(
         "Too close to call: a near balance, a grazing impact or long chaotic rocking makes the response so sensitive "
-        "that errors of this computation decide it. A tighter tolerance may decide; near the last digit nothing can."
+        "that errors of this computation decide it. Where they are larger than rounding, a tighter tolerance or a "
+        "higher `order` of the engine lowers them, and may decide; where a chaotic tail makes rounding grow as large, "
+        "no setting of an engine decides."
     )
     solver_failed = item(
         "The differential equation solver gave up: its nonlinear solver failed or its steps became too small."

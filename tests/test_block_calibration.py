@@ -260,3 +260,25 @@ def test_what_is_refused(given, message):
             "unknowns": {"alpha": UNKNOWN}, "scatter": {"alpha": SPREAD}, "progress": False}  # fmt: skip
     with pytest.raises(ValueError, match=message):
         rk.inverse.calibrate_block(**good | given)
+
+
+@pytest.mark.parametrize(
+    "block, message",
+    [
+        (
+            lambda alpha: rk.blocks.AsymmetricBlock(alpha, 2.5 * alpha, P),
+            r"fails in 2 of 16, the first of which is alpha = 0.6\d+: argument `alpha2` must be in \(0, pi/2\)",
+        ),
+        (lambda alpha: rk.Block(2 * alpha, P), "fails in 3 of 16, .* argument `alpha` must be at most 0.955"),
+        (lambda alpha: rk.Block(alpha, P, 1.5 * alpha), r"first of which is alpha = 0.77\d*: argument `restitution`"),
+        (lambda alpha: rk.Block(jnp.arcsin(1.3 * alpha), P, 0.9), "argument `alpha` must be in"),
+    ],
+    ids=["a second angle", "a wide block", "a restitution", "NaN"],
+)  # fmt: skip
+def test_the_cell_that_makes_no_block_is_named(block, message):
+    """The grid goes beyond the range of the unknown."""
+    unknown = rk.inverse.Unknown(0.1, 0.4)
+    with pytest.raises(ValueError, match=message):
+        rk.inverse.calibrate_block(
+            block, motions()[:2], [1, 0], {"alpha": unknown}, {"alpha": 0.3}, cells=16, progress=False
+        )

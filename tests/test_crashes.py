@@ -24,7 +24,7 @@ import pytest
 import jaxrock as rk
 from jaxrock._aside import _reach_the_disk
 from jaxrock.sweeps import devices, netcdf
-from jaxrock.sweeps.store import Store, local
+from jaxrock.sweeps.store import Store, local, opened
 from references import damage, kills, threads
 
 xarray, zarr = pytest.importorskip("xarray"), pytest.importorskip("zarr")
@@ -149,6 +149,7 @@ def test_a_block_of_another_store_is_not_taken(store, tmp_path):
 def test_what_was_not_computed_is_no_result_to_other_readers_either(store):
     for file in ("sine/c/1/0", "above/c/1/0", "count/c/1/0", "pair/c/1/0/0"):
         (store / file).unlink()
+    opened(store).mark("unfinished")
     with xarray.open_dataset(store, engine="zarr", chunks=None) as data:
         for name in ("sine", "above", "count", "pair"):
             missing = np.isnan(data[name])

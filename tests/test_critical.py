@@ -3,12 +3,15 @@
 import json
 from pathlib import Path
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxrock as rk
+from jaxrock.engines.diffrax.guards import field_of_trials
 from jaxrock.studies import ends
 from jaxrock.studies.lowest_ends import _closed
 
@@ -309,3 +312,86 @@ def test_no_motion_is_unexceeded_where_the_least_topples_a_rock():
     )
     assert np.asarray(found.complete).all() and np.isfinite(found.amplitude).all()
     assert not np.asarray(below.complete).any() and np.isnan(below.amplitude).all()
+
+
+# Scenes of one batch: a wide block and a large one, one without ends, one that is not known, and two alike.
+ALPHA = np.array([0.2, 0.6, np.nan, 0.05, 0.2])
+RATE = np.array([2.0, 0.5, 2.0, 8.0, 2.0])
+HELD = rk.models.Equation(lambda x, block: jnp.sin(block.alpha - x), lambda x, block: jnp.cos(block.alpha - x))
+
+
+def critical(alpha, p, options):
+    block = rk.Block(alpha, p, 0.9, throw=False)
+    search = rk.studies.critical_durations if "factor" in options else rk.critical_amplitudes
+    return search(block, rk.SinePulse(0.4, 1.0), progress=False, **options)
+
+
+SLOW = {"the lowest amplitudes", "of an equation"}
+BATCHES = {
+    "all amplitudes": {"intensity": (1.0, 4.0)},
+    "the lowest amplitudes": {"intensity": (1.0, 4.0), "max_ends": 2},
+    "all durations": {"factor": (0.2, 4.0)},
+    "of an equation": {"intensity": (1.0, 4.0), "model": HELD, "derivatives": False},
+}
+
+
+@pytest.mark.parametrize(
+    "options", [pytest.param(x, marks=[pytest.mark.slow] * (name in SLOW), id=name) for name, x in BATCHES.items()]
+)
+def test_a_scene_does_not_depend_on_its_neighbours(options):
+    """A batch is a loop over its scenes; one that cannot be computed says so, alone."""
+    together = critical(ALPHA, RATE, options)
+    np.testing.assert_array_equal(together.complete, [True, True, False, True, True])
+    assert together.count[2] == 0
+    for k in range(ALPHA.size):
+        alone = critical(ALPHA[k : k + 1], RATE[k : k + 1], options)
+        assert alone.count[0] == together.count[k] and alone.complete[0] == together.complete[k]
+        count = int(alone.count[0])
+        for name in ("value", "rising", "impacts", "balanced", "derivative"):
+            both = (np.asarray(getattr(each, name)) for each in (alone, together))
+            np.testing.assert_allclose(*(x[i, :count] for x, i in zip(both, (0, k))), rtol=1e-9, err_msg=name)
+
+
+def test_a_motion_that_is_not_known_is_so_alone():
+    pulses = rk.SinePulse(np.array([1.0, np.nan]), 1.0, throw=False)
+    found = rk.critical_amplitudes(rk.Block(0.2, 2.0, 0.9), pulses, intensity=(1.0, 4.0), progress=False)
+    np.testing.assert_array_equal(found.complete, [True, False])
+
+
+# Its acceleration is not a real number from 1.7 rad on, where a trial of an implicit solver may go.
+BOUNDED = rk.models.Equation(
+    lambda x, block: jnp.sin(block.alpha - x) * jnp.sqrt(1 - x / 1.7), lambda x, block: jnp.cos(block.alpha - x)
+)
+
+
+@pytest.mark.slow
+def test_a_trial_beyond_the_domain_of_an_equation_is_no_error_of_a_batch():
+    """Slopes of margins, which all searches ask for, by an implicit solver; an explicit one judges them."""
+    amplitudes = jnp.array([3.28540898, 6.66409842, 2.28592764, 21.76111076, 0.61, 0.1015889])
+
+    def slopes(engine):
+        def margin(amplitude):
+            found = rk.outcome(rk.Block(0.2, 2.0, 0.9), rk.SinePulse(amplitude, 1.0), BOUNDED, engine=engine)
+            return found.margin, found.status._value
+
+        given = (amplitudes,), (jnp.ones_like(amplitudes),)
+        (_, status), (found, _) = jax.jvp(jax.vmap(margin), *given)
+        return np.asarray(status) == 0, np.asarray(found)
+
+    decided, found = slopes(rk.Diffrax(solver=diffrax.Kvaerno3(), rtol=1e-6))
+    also, right = slopes(rk.Diffrax(rtol=1e-8))
+    assert decided[-2:].all() and also.all()
+    np.testing.assert_allclose(found[decided], right[decided], rtol=1e-5)
+
+
+def test_an_implicit_solver_sees_no_slopes_beyond_the_domain():
+    """Within it they are those of the field."""
+
+    class Falling(eqx.Module):
+        def flow(self, t, y):
+            return jnp.stack([y[1], jnp.sqrt(1 - y[0])])
+
+    for opening, right in ((0.75, -1.0), (2.0, 0.0)):
+        y, along = jnp.array([opening, 0.5]), jnp.array([1.0, 0.0])
+        _, change = jax.jvp(lambda y: field_of_trials(0.0, y, Falling()), (y,), (along,))
+        np.testing.assert_allclose(change, [0.0, right])

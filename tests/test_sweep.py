@@ -369,3 +369,63 @@ def test_sweeps_in_threads_keep_their_checks():
             np.testing.assert_allclose(answer, np.outer([0.9, 0.5], [1.0, 2.0]))
         else:
             assert "Argument `restitution` must be in [0, 1], but is not at the point (1.5, 1)" in answer
+
+
+@pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
+@pytest.mark.parametrize(
+    "values, shown",
+    [
+        ([1.0, 1e-50], "1e-50"),
+        ([1.0, -1e60], r"-1e\+60"),
+        ([1e-40], "1e-40"),  # which processors take as zero
+        (np.array([1e39]), r"1e\+39"),
+    ],
+)
+def test_an_axis_beyond_single_precision_is_refused(values, shown):
+    with (
+        jax.enable_x64(False),
+        pytest.raises(ValueError, match=rf"`x` must be numbers of .*float32.* has {shown}: take"),
+    ):
+        rk.sweep(lambda x: {"y": x}, x=values, progress=False)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ([2**70], f"must be whole numbers of one type of 64 bits, but has {2**70}"),
+        ([2**63 + 1, -1], f"must be whole numbers of one type of 64 bits, but has {2**63 + 1}"),
+        (
+            [1.0, 1e-320],
+            "must be numbers of the precision of the session .*float64.*, but has 1e-320: take another unit.",
+        ),
+        (np.array(["2020-01-01"], "datetime64[D]"), "must be a list of at least one number, .* type datetime64"),
+        (np.array([np.longdouble("1e400")]), "must be (numbers of|a list)"),
+    ],
+)
+def test_an_axis_that_the_session_cannot_hold_is_refused(values, message):
+    if np.asarray(values).dtype == np.longdouble and np.finfo(np.longdouble).max == np.finfo(float).max:
+        values = np.array([1e-320])  # where long doubles are doubles
+    with pytest.raises(ValueError, match=f"`x` {message}"):
+        rk.sweep(lambda x: {"y": x}, x=values, progress=False)
+
+
+def test_zeros_infinities_and_nan_are_kept():
+    found = rk.sweep(lambda x: {"y": x}, x=[0.0, -0.0, np.inf, np.nan, 2.3e-308], progress=False)
+    np.testing.assert_array_equal(found.values["y"], [0.0, -0.0, np.inf, np.nan, 2.3e-308])
+
+
+@pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: rk.Block(0.2, 1e-60), "`p` must be .*, but is 1e-60, which is 0.0 in the precision of the session"),
+        (lambda: rk.SinePulse(1e60, 1.0), r"`amplitude` must be .*, but is 1e\+60, which is inf in the precision"),
+        (
+            lambda: rk.studies.self_similar_spectrum([1.0, 1e-50], [1.0], progress=False),
+            "`frequency_ratio` must be .*, but is 1e-50, which is 0.0",
+        ),
+    ],
+)
+def test_a_number_is_shown_as_it_was_given(make, message):
+    with jax.enable_x64(False), pytest.raises(ValueError, match=message):
+        make()

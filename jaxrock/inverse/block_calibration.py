@@ -36,7 +36,9 @@ _STARTS = 6  # points of a net from which the likelihood is climbed
 class CalibrationStatus(Enumeration):
     """What became of a calibration; `CalibrationStatus[found.status]` is the message."""
 
-    successful = item("The likelihood has a maximum within the ranges, and it was found.")
+    successful = item(
+        "A maximum of the likelihood lies within the ranges: the highest that was found from the best points of a net."
+    )
     at_an_end = item(
         "The likelihood is largest at an end of a range: standard errors do not hold. Widen it, or accept it."
     )
@@ -44,7 +46,7 @@ class CalibrationStatus(Enumeration):
         "The likelihood is flat: tests leave a parameter open, and its standard error is infinite. Tests that end "
         "either way near where it decides, a prior, or its value would tell it."
     )
-    not_converged = item("The maximum of the likelihood was not found.")
+    not_converged = item("No climb from the best points of a net reached a maximum of the likelihood.")
 
 
 class BlockCalibration(AbstractTable):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxrock._parameters import leaves_of, shared
 from jaxrock.inverse.unknowns import Unknown
 from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
+from jaxrock.transforms.fingerprint import with_checks
 
 # What the usual parameters can be (wider blocks than that have no restitution of Housner's).
 _LIMITS = dict.fromkeys(("alpha", "alpha1", "alpha2"), (1e-3, 0.9)) | {"restitution": (0.0, 1.0)}
@@ -91,10 +92,14 @@ class Axis(eqx.Module):
 def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
     """The blocks of all cells, the last parameter changing fastest; what all blocks share is there once."""
     grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
+    made = with_checks(lambda *each: block(**dict(zip(axes, each))))
     try:
-        blocks = jax.vmap(lambda *each: block(**dict(zip(axes, each))))(*(jnp.asarray(x.ravel()) for x in grid))
+        found = jax.vmap(made)(*(jnp.asarray(x.ravel()) for x in grid))
     except TypeError as error:
         raise ValueError(f"Argument `block` must make a block of {sorted(axes)}, but: {error}.") from error
+    for message, failed in zip(found.messages, found.failed):
+        _check_cells(message, np.asarray(failed), dict(zip(axes, grid)))
+    blocks = found.results
     for leaf in leaves_of(blocks):
         if leaf.is_shared and not _is_one(np.asarray(leaf.value)):
             axes = leaf.declared.axes
@@ -103,6 +108,19 @@ def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
                 said = f"shares its lists, but `{leaf.name}` is declared as one (axes={axes}), and differs"
             raise ValueError(f"Argument `block` must make blocks of a class that {said} from cell to cell.")
     return jax.tree.map(lambda x, own: x[0] if own else x, blocks, shared(blocks))
+
+
+def _check_cells(message: str, failed: np.ndarray, grid: dict[str, np.ndarray]) -> None:
+    """Raise ValueError where a check of the block has failed, with the parameters of the first such cell."""
+    failed = np.broadcast_to(failed, next(iter(grid.values())).size)
+    cells = np.flatnonzero(failed)
+    if cells.size:
+        at = ", ".join(f"{name} = {values.ravel()[cells[0]]:.4g}" for name, values in grid.items())
+        raise ValueError(
+            f"Argument `block` must make a block in every cell of the grid, but fails in {cells.size} of {failed.size}"
+            f", the first of which is {at}: {message[0].lower()}{message[1:]}. The grid goes {_BEYOND} of the largest "
+            "`scatter` beyond the ranges of `unknowns`."
+        )
 
 
 def _is_one(values: np.ndarray) -> bool:

@@ -291,6 +291,11 @@ def _number(name: str, text: str) -> float | None:
     try:
         if "_" in text:  # which Python reads over
             raise ValueError
-        return float(text)
+        value = float(text)
     except ValueError:
         raise ValueError(f"`{name}` must be a number, but is {text!r}.") from None
+    if not np.isfinite(value):
+        raise ValueError(f"`{name}` must be a finite number, but is {text!r}; an empty field is not known.")
+    if name.endswith("_sd") and value < 0:
+        raise ValueError(f"`{name}` must be 0 or more, but is {value:g}.")
+    return value

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import if_traced, is_traced, of_each, one_program, placed, ratio, scalar, watched
-from jaxrock._parameters import broadcast, leaves_of, one_of_many
+from jaxrock._parameters import broadcast, in_real_numbers, leaves_of, one_of_many
 from jaxrock._quickly import quickly
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -120,6 +120,7 @@ def critical_amplitudes(
     **Source:** Voyagaki et al. (2012), 3.11 (the balance); derivatives by the implicit function of the margin.
     """
     low, high = _rising("intensity", intensity)
+    block, motion = in_real_numbers(block, motion)
     model = current_model(model, block, motion)
     scenes = _Scenes.of(block, motion, model)
     # Dense where the least amplitudes are: overturning intervals crowd towards the threshold.
@@ -154,6 +155,7 @@ def critical_durations(
     depend on the speed of impacts, or on p.
     """
     low, high = _rising("factor", factor)
+    block, motion = in_real_numbers(block, motion)
     model = current_model(model, block, motion)
     check_sizeless(block, model)
     scenes = _Scenes.of(block, motion, model)
@@ -193,9 +195,9 @@ class _Scenes(eqx.Module):
         threshold, peak, amplitude, least = _facts(both, model, size)
         message = "Argument `motion` must move the ground"
         if is_traced(peak):
-            least = watched(least, message, ~(peak > _LEAST).all())
-        elif not (np.asarray(peak) > _LEAST).all():
-            raise ValueError(f"{message}, but its peak is {np.asarray(peak).min():g} g.")
+            least = watched(least, message, (peak <= _LEAST).any())
+        elif (np.asarray(peak) <= _LEAST).any():
+            raise ValueError(f"{message}, but its peak is {np.nanmin(np.asarray(peak)):g} g.")
         return cls(both, threshold, amplitude, least, single=not shape)
 
 

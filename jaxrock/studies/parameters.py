@@ -1,6 +1,7 @@
 """The parameters of a scene by name: what derivatives are taken by, and what is fitted."""
 
 import operator
+from collections import Counter
 
 import equinox as eqx
 import jax
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
 from jaxrock._checks import not_negative, share
-from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of
+from jaxrock._guard import as_array
+from jaxrock._parameters import Leaf, Parameter, declared, is_ours, leaves_of, with_values
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.restitution import Constant, PerSide, tells_sides
@@ -30,10 +32,15 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
     parameters of its own these, as `restitution.gentle`), and those of the motion as it names them; `amplitude` [g]
     also of a motion that does not (a record): its peak, which scales all of it.
 
-    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name.
+    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name, and for two
+    parameters of one name, as of `{"a.b": 1.0, "a": {"b": 2.0}}`.
     """
+    for owner, leaves in {"block": _of_own(block), "motion": _numbers(motion)}.items():
+        for name, count in Counter(leaf.name for leaf in leaves).items():
+            if count > 1:
+                raise ValueError(f"Argument `{owner}` has {count} parameters {name!r}: they need names of their own.")
     found = {name: getattr(block, name) for name in _declared(block)} | _of_law(block)
-    moving = {leaf.name: leaf.value for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
+    moving = {leaf.name: as_array(leaf.value) for leaf in _numbers(motion)} | {"amplitude": amplitude_of(motion)}
     for name in found.keys() & moving:
         raise ValueError(f"Argument `motion` has a parameter {name!r}, as the block has: it needs another name.")
     return found | moving
@@ -41,7 +48,7 @@ def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
 
 def amplitude_of(motion: AbstractMotion) -> Real:
     """The amplitude that a motion names, or its peak [g]."""
-    own = [leaf.value for leaf in _numbers(motion) if leaf.name == "amplitude"]
+    own = [as_array(leaf.value) for leaf in _numbers(motion) if leaf.name == "amplitude"]
     return own[0] if own else peak_of(motion)
 
 
@@ -98,9 +105,7 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
             new = eqx.tree_at(operator.attrgetter(field), new, value, is_leaf=lambda x: x is None)
     own = _of_own(block)
     if own:
-        law = eqx.tree_at(
-            lambda law: [_at(law, leaf.path[1:]) for leaf in own], block.law, [values[x.name] for x in own]
-        )
+        law = with_values(block.law, {".".join(leaf.path[1:]): values[leaf.name] for leaf in own})
     elif not _of_law(block):
         return new
     elif len(_of_law(block)) == 1:
@@ -114,13 +119,17 @@ def _rebuilt_block(block: AnyBlock, values: dict[str, Real]) -> AnyBlock:
 
 
 def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: Real | None) -> AbstractMotion:
-    numbers = _numbers(motion)
-    new = [values[leaf.name] for leaf in numbers]
-    changed = eqx.tree_at(lambda m: [_at(m, leaf.path) for leaf in numbers], motion, new) if numbers else motion
-    if "amplitude" not in [leaf.name for leaf in numbers]:
+    names = [leaf.name for leaf in _numbers(motion)]
+    changed = with_values(motion, {name: values[name] for name in names})
+    if "amplitude" not in names:
         peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
-        changed = Scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
+        changed = scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
     return changed
+
+
+def scaled(motion: AbstractMotion, factor: Real) -> AbstractMotion:
+    """A motion times a factor, which is not checked: it may be NaN, and so is the outcome of the scene then."""
+    return eqx.tree_at(lambda changed: changed.factor, Scaled(motion, jnp.ones_like(factor)), factor)
 
 
 def _declared(block: AnyBlock) -> dict[str, Parameter]:
@@ -141,7 +150,7 @@ def _of_law(block: AnyBlock) -> dict[str, Real]:
     """Parameters of the restitution; none of a law without numbers that is not one for each side either."""
     own = _of_own(block)
     if own:
-        return {leaf.name: leaf.value for leaf in own}
+        return {leaf.name: as_array(leaf.value) for leaf in own}
     if block.law.depends_on_speed:
         return {}
     if not isinstance(block, AsymmetricBlock) and tells_sides(block.law, block.corners):
@@ -159,9 +168,3 @@ def _numbers(motion: AbstractMotion) -> list[Leaf]:
     while isinstance(inner, Scaled | Shifted):
         inner, place = inner.motion, f"{place}motion."
     return [leaf for leaf in leaves_of(motion) if leaf.is_number and not (place and leaf.name == f"{place}amplitude")]
-
-
-def _at(owner, path: tuple[str, ...]):
-    for part in path:
-        owner = getattr(owner, part)
-    return owner

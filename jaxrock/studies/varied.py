@@ -16,10 +16,9 @@ from jaxrock.blocks.rigid import Block
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.models.equation import AbstractEquation, Angle
 from jaxrock.models.user_equation import Equation
-from jaxrock.motions.motion import Scaled
 from jaxrock.responses.outcome import outcome
 from jaxrock.status import Status
-from jaxrock.studies.parameters import named, rebuilt
+from jaxrock.studies.parameters import named, rebuilt, scaled
 
 
 class AbstractVaried(eqx.Module):
@@ -85,8 +84,8 @@ class Amplitude(AbstractVaried):
     """A larger motion."""
 
     def scene(self, z, block, motion):
-        """What is asked for at a factor."""
-        return block, Scaled(motion, jnp.exp(z))
+        """What is asked for at a factor, which is NaN where nothing is known of the scene: so is its outcome then."""
+        return block, scaled(motion, jnp.exp(z))
 
     def unit(self, block, motion):
         """What the factor multiplies: the amplitude [g]."""
@@ -152,7 +151,7 @@ def check_sizeless(block: Block | AsymmetricBlock, model: AbstractEquation) -> N
     two = block, faster(block, 1.7)
     names = ("restitution",) if isinstance(block, Block) else ("restitution1", "restitution2")
     one, other = ([getattr(each, name) for name in names] for each in two)
-    if not np.allclose(one, other, rtol=1e-9, atol=0):
+    if not np.allclose(one, other, rtol=1e-9, atol=0, equal_nan=True):
         raise ValueError("Argument `block` must have a restitution that does not depend on its p.")
     if is_ours(model) and not isinstance(model, Equation):
         return

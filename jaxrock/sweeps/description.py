@@ -1,6 +1,7 @@
 """What a store says of itself: one text with its own checksum, twice on disk, by which all else in it is judged."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from jaxrock.sweeps.labels import RECORDS, layout_name
 
 TWINS = ("zarr.json", f"{RECORDS}/store.json")  # the root of a Zarr group, and the same once more
 _ABOUT, _CHECKSUM = "jaxrock_store", "jaxrock_checksum"  # attributes
+_UNFINISHED, _FINISHED = "unfinished", "finished"
 
 
 def fingerprint(
@@ -53,14 +55,25 @@ class Description:
 
     @classmethod
     def of(
-        cls, axes: list[str], results: dict[str, str], block: tuple[int, ...], made_by: dict[str, str], metadata: dict
+        cls,
+        axes: list[str],
+        results: dict[str, str],
+        block: tuple[int, ...],
+        made_by: dict[str, str],
+        metadata: dict,
+        marks: dict[str, dict[str, dict]],
     ) -> "Description":
-        """From names of axes, results with their types, and what Zarr says of every array."""
-        about = {"axes": axes, "results": results, "block": block, "made_by": made_by}
+        """From names of axes, results with their types, and what Zarr says of every array; `marks`: attributes of
+        arrays in an unfinished store and in a finished one."""
+        about = {"axes": axes, "results": results, "block": block, "made_by": made_by, "marks": marks}
+        return cls._of(about, metadata)
+
+    @classmethod
+    def _of(cls, about: dict, metadata: dict) -> "Description":
         root: dict[str, Any] = {
             "zarr_format": 3,
             "node_type": "group",
-            "attributes": {"layout": made_by["layout"], _ABOUT: json.dumps(about)},
+            "attributes": {"layout": about["made_by"]["layout"], _ABOUT: json.dumps(about)},
             "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": metadata},
         }
         root["attributes"][_CHECKSUM] = _checksum(root)
@@ -76,27 +89,40 @@ class Description:
         """What Zarr says of every array."""
         return self.root["consolidated_metadata"]["metadata"]
 
-    @property
+    @functools.cached_property
     def checksum(self) -> str:
-        """What tells this store from others."""
-        return self.root["attributes"][_CHECKSUM]
+        """Checksum of the description while the store is unfinished, which tells it from others, finished too."""
+        return self.marked(_UNFINISHED).root["attributes"][_CHECKSUM]
+
+    def marked(self, state: str) -> "Description":
+        """Return the description of the store in a state: "unfinished", where arrays tell what stands for missing
+        values, or "finished", where none is missing. A store without marks has one description."""
+        about, metadata = self.about, dict(self.metadata)
+        if not about.get("marks"):
+            return self
+        for name, attributes in about["marks"].items():
+            metadata[name] = metadata[name] | {"attributes": attributes[state]}
+        about.pop("state", None)
+        return self._of(about if state == _UNFINISHED else about | {"state": state}, metadata)
 
     def files(self) -> dict[str, dict]:
         """Every file, below the path of the store, that says something of it, and what it says."""
         return {name: self.root for name in TWINS} | {f"{name}/zarr.json": said for name, said in self.metadata.items()}
 
     def damaged(self, path: Path) -> list[Path]:
-        """Those of the files that do not say what they should."""
-        return [path / name for name, said in self.files().items() if _read(path / name) != said]
+        """List the files that do not say what they should, in either state: a session may end between two of them."""
+        states = [self.marked(state).files() for state in (_UNFINISHED, _FINISHED)]
+        return [path / name for name in states[0] if _read(path / name) not in [files[name] for files in states]]
 
     def write(self, path: Path) -> None:
-        """Write the files that do not say what they should."""
-        for file in self.damaged(path):
+        """Write the files that do not say what they should in this state."""
+        for name, said in self.files().items():
+            file = path / name
+            if _read(file) == said:
+                continue
             file.parent.mkdir(exist_ok=True)
             with written_aside(file, replace=True) as aside:
-                aside.write_text(
-                    json.dumps(self.files()[str(file.relative_to(path).as_posix())], indent=1), encoding="utf-8"
-                )
+                aside.write_text(json.dumps(said, indent=1), encoding="utf-8")
 
 
 def described(path: Path, wanted: str) -> Description:

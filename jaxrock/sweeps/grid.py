@@ -92,8 +92,8 @@ class Grid(eqx.Module):
 
         **Arguments:**
 
-        - `path`: ends with .nc for NetCDF, with .zarr for Zarr. In Zarr, whole numbers and booleans are marked as such
-          that may be missing: xarray reads them as floating-point numbers.
+        - `path`: ends with .nc for NetCDF, with .zarr for Zarr. No value is marked as missing: xarray reads every
+          number as it is, in its own type.
 
         **Raises:** ValueError for another ending, for object stores (`s3://...`), and for results with names that files
         cannot have; FileExistsError; OSError where it cannot be written, on a full disk, say: then nothing is left of
@@ -120,7 +120,7 @@ class Grid(eqx.Module):
         uninterrupted(netcdf.write, self.to_xarray(), path, stopped, stop=stopped.set)
 
     def _to_zarr(self, path: Path) -> None:
-        axes, words = numbered({name: np.asarray(values) for name, values in self.axes.items()})
+        axes, words = numbered({name: _in_order(np.asarray(values)) for name, values in self.axes.items()})
         leaves = self._leaves()
         plan = Plan.of(tuple(axes.values()), self.outer)
         like = {name: jax.ShapeDtypeStruct(x.shape[len(self.shape) :], x.dtype) for name, x in leaves.items()}
@@ -128,7 +128,7 @@ class Grid(eqx.Module):
 
         def written():
             with written_aside(path) as aside:
-                store = create(aside, axes, self.outer, like, plan.block, made_by, words)
+                store = create(aside, axes, self.outer, like, plan.block, made_by, words, whole=True)
                 for number in range(store.count):
                     if stopped.is_set():
                         raise InterruptedError
@@ -170,6 +170,11 @@ def known_again(example: Callable[[], Any]) -> None:
     - `example`: makes one of this kind, with numbers of any values; called when something is loaded.
     """
     _examples.append(example)
+
+
+def _in_order(values: np.ndarray) -> np.ndarray:
+    """Values in this machine's order of bytes, as a store has them."""
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 def _known(values: np.ndarray) -> np.ndarray:

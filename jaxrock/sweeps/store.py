@@ -22,6 +22,7 @@ from jaxrock._tables import needed
 from jaxrock.sweeps.description import Description, described, digest_of_axis
 from jaxrock.sweeps.labels import POINT, RECORDS, dimensions, layout_name, shape_of
 from jaxrock.sweeps.plan import Plan
+from jaxrock.sweeps.stored import stored
 
 _DIGEST = hashlib.sha256().digest_size
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:(/|:)")  # a letter alone is a drive
@@ -54,6 +55,7 @@ class Store:
         self._types = [np.dtype(kind) for kind in self._about["results"].values()]
         self._metadata = description.metadata
         self._arrays, self._records = [self._array(name) for name in self.names], self._array(RECORDS)
+        self._stored = [array.dtype for array in self._arrays]
         axes = [np.broadcast_to(0.0, self._metadata[name]["shape"]) for name in self._about["axes"]]
         self._plan = Plan(tuple(axes), self.outer, tuple(self._about["block"]))  # where blocks lie
 
@@ -98,6 +100,11 @@ class Store:
             self._array(name)[...] = axes[name]
         return damaged + [self.path / name for name in lost]
 
+    def mark(self, state: str) -> None:
+        """Tell other readers that the store is "unfinished", so values may be missing, or "finished"."""
+        self._description = self._description.marked(state)
+        self._description.write(self.path)
+
     def begun(self) -> list[int]:
         """The blocks of which there is a record, good or not: to look for one after the other takes long where there
         are many, and few of them are finished. What lies beside them is nobody's."""
@@ -119,8 +126,9 @@ class Store:
     def write(self, number: int, leaves: list[np.ndarray]) -> None:
         """Write one block: its results, and when all are there, its record."""
         place = self._plan.place(number)
+        leaves = [leaf.astype(kind, copy=False) for kind, leaf in zip(self._stored, leaves)]
         for array, leaf in zip(self._arrays, leaves):
-            array[place] = leaf.view(np.int8) if leaf.dtype == bool else leaf
+            array[place] = leaf
         told = np.stack([self._digest(number, name, leaf) for name, leaf in zip(self.names, leaves)])
         self._records[self._index(number)] = np.stack([*told, self._digest(number, RECORDS, told)])
 
@@ -163,7 +171,7 @@ class Store:
             if part is None or (self._digest(number, name, part) != told).any():
                 damaged.append(self._file(name, number))
             else:
-                leaves.append(part.view(kind))
+                leaves.append(part.astype(kind, copy=False))
         return None if damaged else leaves, damaged
 
     @staticmethod
@@ -257,19 +265,6 @@ def _made_or_mended(path, axes, outer, leaves, block, made_by, words) -> list[Pa
     return of_sweep(path, made_by).mend(axes)
 
 
-def _empty(kind: np.dtype) -> tuple[np.dtype, object, dict]:
-    """How a result is stored, what stands where nothing was computed, and the attributes that say so.
-
-    Readers of NetCDF's conventions, such as xarray, take whole numbers and verdicts as what is not a number there.
-    """
-    if kind.kind in "fc":
-        return kind, np.nan, {}
-    if kind.kind == "b":
-        return np.dtype(np.int8), -1, {"_FillValue": -1}
-    empty = int(np.iinfo(kind).min if kind.kind == "i" else np.iinfo(kind).max)
-    return kind, empty, {"_FillValue": empty}
-
-
 def create(
     path: Path,
     axes: dict[str, np.ndarray],
@@ -278,9 +273,11 @@ def create(
     block: tuple[int, ...],
     made_by: dict[str, str],
     words: Mapping[str, Sequence[str]],
+    *,
+    whole: bool = False,
 ) -> Store:
     """Make a store of which no block is done. `leaves`: results by name, as of one point; `words`: what the numbers of
-    axes stand for."""
+    axes stand for; `whole`: all blocks are written before anybody reads it."""
     zarr = needed("zarr")
     for name, values in (axes | leaves).items():
         if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):
@@ -292,17 +289,18 @@ def create(
     usual: dict[str, Any] = {"compressors": (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())}
     usual["config"] = {"write_empty_chunks": True}
     shape = shape_of(axes.values(), outer)
+    forms = {name: stored(np.dtype(leaf.dtype), whole) for name, leaf in leaves.items()}
     for name, leaf in leaves.items():
-        kind, empty, attributes = _empty(np.dtype(leaf.dtype))
+        form = forms[name]
         group.create_array(
-            name, shape=(*shape, *leaf.shape), dtype=kind, chunks=(*block, *(max(n, 1) for n in leaf.shape)),
-            dimension_names=dimensions(axes, outer, name, len(leaf.shape)), fill_value=empty, attributes=attributes,
-            **usual,
+            name, shape=(*shape, *leaf.shape), dtype=form.kind, chunks=(*block, *(max(n, 1) for n in leaf.shape)),
+            dimension_names=dimensions(axes, outer, name, len(leaf.shape)), fill_value=form.fill,
+            attributes=form.unfinished, **usual,
         )  # fmt: skip
     for name, values in axes.items():
         array = group.create_array(
             name, shape=values.shape, dtype=values.dtype, chunks=(min(values.size, _AXIS_CHUNK),),
-            dimension_names=(name if outer else POINT,), fill_value=_empty(values.dtype)[1],
+            dimension_names=(name if outer else POINT,), fill_value=stored(values.dtype, True).fill,
             attributes={_WORDS: list(words[name])} if name in words else {}, **usual,
         )  # fmt: skip
         array[...] = values
@@ -314,7 +312,12 @@ def create(
         dimension_names=dimensions((), True, RECORDS, len(blocks) + 2), **usual,
     )  # fmt: skip
     metadata = {name: json.loads((path / name / "zarr.json").read_text()) for name in (*axes, *leaves, RECORDS)}
-    kinds = {name: np.dtype(leaf.dtype).str for name, leaf in leaves.items()}
-    description = Description.of(list(axes), kinds, block, made_by, metadata)
+    kinds = {name: np.dtype(leaf.dtype).newbyteorder("=").str for name, leaf in leaves.items()}
+    marks = {
+        name: {"unfinished": form.unfinished, "finished": form.finished}
+        for name, form in forms.items()
+        if form.unfinished != form.finished
+    }
+    description = Description.of(list(axes), kinds, block, made_by, metadata, marks)
     description.write(path)
     return Store(path, description)

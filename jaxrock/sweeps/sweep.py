@@ -194,19 +194,39 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
         array = np.asarray(values)
     except ValueError as error:  # lists of unlike lengths
         raise ValueError(f"Argument `{name}` must be a list of numbers, but is {shown(values)}.") from error
+    whole = [value for value in values if isinstance(value, int)] if isinstance(values, (list, tuple)) else []
+    if array.ndim == 1 and len(whole) == array.size > 0 and array.dtype.kind in "fO":
+        largest = max(whole, key=abs)
+        raise ValueError(f"Argument `{name}` must be whole numbers of one type of 64 bits, but has {largest}.")
     if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"Argument `{name}` must be a list of at least one number, but has shape {array.shape} and type "
             f"{array.dtype}."
         )
-    array = native(array)
-    found = array.astype(jax.dtypes.canonicalize_dtype(array.dtype))  # in the precision of the session
+    with np.errstate(over="ignore", under="ignore"):
+        found = native(array)
+        found = found.astype(jax.dtypes.canonicalize_dtype(found.dtype))  # in the precision of the session
     if array.dtype.kind in "iu" and (found != array).any():
         raise ValueError(
             f"Argument `{name}` must be whole numbers of the precision of the session ({found.dtype}), but has "
             f"{array[found != array][0]}: enable double precision, or give them as floats."
         )
+    if array.dtype.kind == "f":
+        _check_size(name, array, found)
     return found
+
+
+def _check_size(name: str, given: np.ndarray, found: np.ndarray) -> None:
+    """Refuse numbers that are infinite or zero in the precision of the session, and were not; processors take what is
+    below the least normal number as zero."""
+    known = np.finfo(found.dtype)
+    bad = (np.isinf(found) & ~np.isinf(given)) | ((np.abs(found) < known.tiny) & (given != 0))
+    if bad.any():
+        raise ValueError(
+            f"Argument `{name}` must be numbers of the precision of the session ({found.dtype}: 0, or from "
+            f"{known.tiny:.2g} to {known.max:.2g} in size), but has {given[bad][0]!s}: take another unit"
+            f"{'' if found.dtype == np.float64 else ', or enable double precision'}."
+        )
 
 
 def surface(
@@ -278,6 +298,8 @@ def compute(
     results = [] if store else [np.empty((*plan.shape, *x.shape), x.dtype) for x in run.shapes]
 
     with all_or_none():
+        if store and own == 0:
+            _mark(store, "unfinished" if left else "finished")
         for number in mine:
             place = plan.place(number)
             shape = tuple(p.stop - p.start for p in place)
@@ -288,6 +310,9 @@ def compute(
             else:
                 for leaf, part in zip(results, leaves):
                     leaf[place] = part
+    with all_or_none():  # all processes have written theirs
+        if store and own == 0:
+            _mark(store, "finished")
     if count > 1 and not store:
         _gather(results, plan, left)
     if store and not load:
@@ -303,8 +328,17 @@ def _at_once(run: Runner, plan: Plan, label: str, progress: bool | None, columns
 
 
 def _write(store: Store, number: int, leaves: list[np.ndarray]) -> None:
+    _kept(store, store.write, number, leaves)
+
+
+def _mark(store: Store, state: str) -> None:
+    _kept(store, store.mark, state)
+
+
+def _kept(store: Store, write: Callable, *given) -> None:
+    """Write to a store, or say that what is finished stays."""
     try:
-        uninterrupted(store.write, number, leaves)
+        uninterrupted(write, *given)
     except OSError as error:
         said = f"{error.strerror or error}. Blocks that are finished are kept: the same sweep goes on from there"
         raise OSError(error.errno, said, str(store.path)) from error

@@ -29,6 +29,7 @@ from jaxrock.engines.diffrax.guards import (
     Illinois,
     StepControl,
     field,
+    field_of_trials,
     first_guard,
     first_step,
     is_hop,
@@ -171,7 +172,9 @@ class Diffrax(AbstractEngine):
         first = first_step(arc, rtol)
         first = jax.lax.stop_gradient(jnp.where(first > 0, first, 1.0))
         controller = self.controller or StepControl(rtol, limits[0], dtmax=limits[1], first=first)
-        term, zero, y0 = diffrax.ODETerm(field), jnp.zeros_like(length), jnp.stack([arc.opening, arc.velocity])
+        implicit = isinstance(self.solver, diffrax.AbstractImplicitSolver)
+        term, zero = diffrax.ODETerm(field_of_trials if implicit else field), jnp.zeros_like(length)
+        y0 = jnp.stack([arc.opening, arc.velocity])
         return diffrax.diffeqsolve(
             term,
             self.solver,

@@ -16,6 +16,7 @@ from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking
+from jaxrock.status import still_where
 
 Scalar = Inexact[Array, ""]
 Flag = Bool[Array, ""]
@@ -206,6 +207,16 @@ def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) 
 def field(t, y, args: Arc):
     """The right-hand side, as diffrax calls it."""
     return args.flow(t, y)
+
+
+def field_of_trials(t, y, args: Arc):
+    """The right-hand side for an implicit solver, without derivatives where it is not finite.
+
+    A trial of its root finder may leave the domain of a user's equation. The step is rejected then, but JAX
+    differentiates it, and lineax raises for a linear equation that is not finite, in all scenes of a batch.
+    """
+    found = args.flow(t, y)
+    return still_where(~jnp.isfinite(found).all(), found)
 
 
 def first_guard(t, y, args: Arc, **kwargs):

@@ -1,0 +1,39 @@
+"""Types of results in a store, and attributes that mark missing values for readers of NetCDF's conventions, as xarray.
+
+Such readers take a value that equals the attribute `_FillValue` as missing, and turn whole numbers into floating-point
+numbers to say so. An unfinished store has whole numbers in a wider type, so no value of its own equals the fill value.
+A finished store and a saved grid have no fill value: nothing is missing in them.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_WIDER: dict[int, np.dtype[Any]] = {1: np.dtype(np.int16), 2: np.dtype(np.int32), 4: np.dtype(np.int64)}  # by bytes
+
+
+class Stored(NamedTuple):
+    """Type of a result in a store, value that stands where nothing was computed, and attributes of the array."""
+
+    kind: np.dtype
+    fill: Any
+    unfinished: dict[str, Any]
+    finished: dict[str, Any]
+
+
+def stored(kind: np.dtype[Any], whole: bool) -> Stored:
+    """Return how a result of a type is stored; `whole`: all of it is written at once, so nothing can be missing.
+
+    No type holds all whole numbers of 64 bits and one more: their least (greatest, without a sign) is the fill value,
+    and readers round the others beyond 2^53 while something may be missing.
+    """
+    kind = kind.newbyteorder("=")
+    if kind.kind in "fc":  # NaN says itself that it is missing
+        return Stored(kind, np.nan, {}, {})
+    if kind.kind == "b":
+        if whole:
+            return Stored(kind, False, {}, {})
+        return Stored(np.dtype(np.int8), -1, {"_FillValue": -1}, {"dtype": "bool"})  # xarray's attribute
+    wide: np.dtype[Any] = kind if whole else _WIDER.get(kind.itemsize, kind)
+    fill = int(np.iinfo(wide).min if wide.kind == "i" else np.iinfo(wide).max)
+    return Stored(wide, fill, {} if whole else {"_FillValue": fill}, {})
