@@ -79,8 +79,9 @@ class Likelihood(eqx.Module):
       it stands in a gap between two ways of overturning that is too narrow to be resolved. One rock can then speak
       against a motion no more strongly than 2/lapse to 1.
     - `accuracy`: about the root mean square error that the quadrature over scatter and rocks may leave in a probability
-      [-], in [0.001, 0.05]. Scenes for each rock: 42 at 0.02, 208 at 0.01, 1,100 at 0.005 and 50,000 at 0.001; where
-      all rocks are known far better than the motion at them 38, 74, 146 and 722. `survival_error` tells what is left.
+      [-], in [0.001, 0.05]. Scenes for each rock: 54 at 0.02, 272 at 0.01, 1,452 at 0.005 and 66,332 at
+      0.001; 42, 82, 162 and 802 where rocks are known well beside the motion at them. Single probabilities
+      may be off by four times as much: `survival_error` estimates what is left of each.
 
     **Raises:** ValueError for a value outside its range.
     """

@@ -13,7 +13,8 @@ _ROOT = np.sqrt(2 * _RATIO)
 _PARABOLAS, _SETTLED = 4, 0.3  # fits of a parabola at most; change of the lengths of its axes that calls for none more
 _TELLING = 0.16  # bend over a range, squared, with which it falls by 0.02 over half of it: less may be steps
 _NOTHING = 50.0  # a fall after which the likelihood is none
-_BEYOND = (0.25, 0.5, 0.75)  # of the way from the end of the region to that of the range: where it is looked for more
+_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of a range, outside of an end, where the region may go on
+_OUTWARD = 4  # times that it is looked for there
 _BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # rounds at most; width of a bracket, in ranges, and root that will do
 _MULTIPLES = 1.5, 3.0, np.inf  # standard deviations from the maximum at which profiles begin
 _SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the scan of the other parameters before
@@ -131,16 +132,17 @@ def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
         inside = [np.clip(v, low[j], high[j]) for v, (j, _) in zip(values, sides.rows)]
         sides.follow(dict(zip(sides.rows, inside)))
     sides.recall()
-    # Beyond a valley the region may go on.
-    for share in _BEYOND:
-        sides.follow(sides.hopeful({side: sides.beyond(side, share) for side in sides.rows}))
-    for _ in range(_BRACKETS):
-        brackets = {side: sides.bracket(side) for side in sides.rows}
-        wide = {side: pair for side, pair in brackets.items() if pair is not None and sides.is_wide(side, pair)}
-        if not wide:
-            break
-        sides.follow({side: _secant(*pair, 0.1) for side, pair in wide.items()})
+    # Beyond a valley the region may go on: near its end, as a likelihood has steps, and farther away.
+    for _ in range(_OUTWARD):
+        sides.narrow()
+        before = {side: sides.outermost(side) for side in sides.rows}
+        tried = [{(j, s): sides.outside(before[j, s], j, s, x) for j, s in sides.rows} for x in _BEYOND]
+        for wanted in tried:
+            sides.follow(sides.hopeful(wanted))
         sides.recall()
+        if all(abs(sides.outermost(side) - before[side]) < _NARROW * size[side[0]] for side in before):
+            break
+    sides.narrow()
     ends, open_ = np.stack([low, high], axis=1), np.ones((low.size, 2), bool)
     for j, s in sides.rows:
         pair = sides.bracket((j, s))
@@ -165,8 +167,8 @@ class _Sides:
         self.highest = (-np.inf, None)
 
     def follow(self, wanted: dict[tuple[int, int], float]) -> None:
-        """Climb with one parameter held at a value, for each of some sides, from two of the places below: the highest by a
-        scan, and the nearest on the profile or the best of all nearby."""
+        """Climb with one parameter held at a value, for each of some sides, from two places: the highest of a scan, and
+        the nearest on the profile or the best of all nearby."""
         if not wanted:
             return
         begin, free = [], []
@@ -206,11 +208,24 @@ class _Sides:
         highest = self._scanned(wanted)[1]
         return {side: x for (side, x), top in zip(wanted.items(), highest) if top > self.best - _RATIO - _HOPE}
 
-    def beyond(self, side: tuple[int, int], share: float) -> float:
-        """A value so far from the outermost within 95 % to the end of the range."""
-        j, s = side
-        inside = max(s * row.value for row in self.rows[side] if row.root < _ROOT)
-        return s * inside + share * (self.evaluate.ends[(s + 1) // 2, j] - s * inside)
+    def narrow(self) -> None:
+        """Follow secants until all ends are known well enough."""
+        for _ in range(_BRACKETS):
+            brackets = {side: self.bracket(side) for side in self.rows}
+            wide = {side: pair for side, pair in brackets.items() if pair is not None and self.is_wide(side, pair)}
+            if not wide:
+                return
+            self.follow({side: _secant(*pair, 0.1) for side, pair in wide.items()})
+            self.recall()
+
+    def outermost(self, side: tuple[int, int]) -> float:
+        """The value farthest out within 95 %."""
+        return max((row for row in self.rows[side] if row.root < _ROOT), key=lambda row: side[1] * row.value).value
+
+    def outside(self, value: float, j: int, s: int, share: float) -> float:
+        """A value farther out by a share of the range, or at its end."""
+        low, high = self.evaluate.ends
+        return float(np.clip(value + s * share * (high - low)[j], low[j], high[j]))
 
     def is_wide(self, side: tuple[int, int], pair: tuple[_Row, _Row]) -> bool:
         """Whether the end is not known well enough from its bracket."""

@@ -37,11 +37,11 @@ from jaxrock.inverse.observations import Observations
 Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
 MOST_ACCURATE, LEAST_ACCURATE = 1e-3, 0.05  # errors of a probability that can be asked for
-_APART, _APART_EXACT = 30.0, 10.0  # distance of nodes, in standard deviations for each unit of the error
+_APART, _APART_EXACT = 25.0, 10.0  # distance of nodes, in standard deviations for each unit of the error
 _LEAST_APART, _MOST_APART = 0.01, 0.8
 _ROCKS, _ROCKS_POWER = 0.045, 1.4  # possible rocks: (0.045/error)^1.4
 _WELL_KNOWN = 10.0  # scatter by rocks over that of the motion, for each unit of the error, below which one will do
-_REACH = 3.6  # standard deviations to each side, within which nodes are
+_REACH = 4.0  # standard deviations to each side, within which nodes are
 _SMEAR = 0.5  # of the difference between nodes
 _LEAST_WIDTH = 1e-3
 _SLOPE_OVER = 1.2  # standard deviations at each end from which y goes on
