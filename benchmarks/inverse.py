@@ -264,7 +264,7 @@ def grid(kept: dict, rocks: int, points: int) -> None:
         "fit": float(found.log_likelihood),
         "plain": plain,
         "fine": best(near),
-        "fit_points": found.responses // (NODES * rocks),
+        "fit_points": found.responses // problem.likelihood.scenes,
         "fine_points": float(np.prod((high - low) / spacing)),
         "spacing": float(spacing),
     }

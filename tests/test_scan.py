@@ -199,3 +199,17 @@ def test_summits_that_compete_are_told():
     low, high = np.asarray(found.interval).T
     if np.isfinite(low).all():
         assert ((others >= low) & (others <= high)).all()
+
+
+KINDS = {
+    rk.inverse.EstimateStatus: ("successful", "several_maxima", "no_information", "contradictory", "open_interval"),
+    rk.inverse.RecordStatus: ("successful", "useless_slopes", "spectrum_changed", "not_reached"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_no_status_claims_more_than_was_tried(kind):
+    """No search proves that there is no other maximum, no nearer record and no motion that it did not meet."""
+    words = " ".join(kind[getattr(kind, name)] for name in KINDS[kind])
+    for claim in ("One maximum stands out", "No record near", "every motion in the range", "under no motion"):
+        assert claim not in words

@@ -55,12 +55,13 @@ class EstimateStatus(Enumeration):
         "observations end it. More rocks near the boundary, or a prior, would close it."
     )
     no_information = item(
-        "The observations tell nothing: every motion in the range explains them about equally well. Intervals are the "
-        "ranges that were searched."
+        "The observations tell nothing: every motion that was looked at explains them about equally well. Intervals "
+        "are the ranges that were searched."
     )
     contradictory = item(
-        "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
-        "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
+        "The observations contradict each other: under none of the motions that were tried are they likely, given how "
+        "well rocks and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no "
+        "intervals."
     )
     not_computed = item(
         "Under the best motion the responses of rocks were mostly too close to call, or could not be computed: nothing "
@@ -97,7 +98,7 @@ class Estimate(AbstractTable):
     - `competing`, `competing_values`: (n, parameters) and (n,), other maxima that were found less than 1.92 below the
       highest in log-likelihood, the highest first, with a fall of more than 0.5 on the straight lines between.
     - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
-      least with which they would not; infinite if there is none up to ten times as large.
+      least with which they would not; infinite if none of those tried up to ten times as large will do.
     - `summits`, `summit_values`: (climbs, parameters) where each climb arrived, and (climbs,) the log-likelihood there:
       those from points beside the best of the others first, then those from the starts.
     - `trace`: a `Trace` of the search from these starts, but for what was looked at beside their best; with
@@ -261,7 +262,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
         else:
-            remarks += ("With no scatter up to ten times as large would the observations agree.",)
+            remarks += ("With no scatter that was tried, up to ten times as large, would the observations agree.",)
     arrays = {
         "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
         "directions": shape.directions, "deviations": shape.deviations, "log_likelihood": summits.values[best],
