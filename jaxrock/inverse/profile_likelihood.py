@@ -18,6 +18,7 @@ _OUTWARD = 4  # times that it is looked for there
 _BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # rounds at most; width of a bracket, in ranges, and root that will do
 _MULTIPLES = 1.5, 3.0, np.inf  # standard deviations from the maximum at which profiles begin
 _SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the scan of the other parameters before
+_BESIDE = 0.2  # extent of another as many around the nearest place, in ranges: ridges are narrow
 _HOPE = 1.5  # of a scan below the region, within which climbers may yet come to it
 _AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
@@ -190,14 +191,15 @@ class _Sides:
 
     def _scanned(self, wanted: dict[tuple[int, int], float]) -> tuple[list[np.ndarray], np.ndarray]:
         """For each side places with its parameter held, at which climbers begin, and the highest of a scan of these and
-        of some spread over the other parameters."""
+        of some spread over the other parameters, and around the nearest."""
         low, high = self.evaluate.ends
         tried = []
         for (j, s), value in wanted.items():
             nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
             nearby = self._nearby(j, value, abs(nearest.value - value), nearest.place)
             others = low + (high - low) * evenly(_SCANNED, low.size)
-            tried.append(np.concatenate([[nearest.place, nearby], others]))
+            beside = np.clip(nearest.place + _BESIDE * (others - (low + high) / 2), low, high)
+            tried.append(np.concatenate([[nearest.place, nearby], others, beside]))
             tried[-1][:, j] = value
         values = self.evaluate.scan(np.concatenate(tried)).reshape(len(tried), -1)
         first = np.argmax(values, axis=1)
