@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxrock as rk
-from jaxrock.inverse.scatter import NODES, rocks_at
+from jaxrock.inverse.scatter import rocks_at
 from jaxrock.inverse.unknowns import Problem
 
 TRUTH = {"amplitude": 0.35, "period": 0.8}
@@ -91,7 +91,7 @@ def coverage(kept: dict, rocks: int, repetitions: int, scatter: float, starts: i
                 "interval": np.asarray(found.interval).tolist(),
                 "open": bool(found.open.any()),
                 "contradictory": bool(found.status == rk.inverse.EstimateStatus.contradictory),
-                "points": found.responses // (NODES * rocks),
+                "points": found.responses // rk.inverse.Likelihood(seen, rk.SinePulse, scatter).scenes,
                 "cpu": spent,
                 "least": least_deviation(seen, scatter).tolist(),
             }
@@ -152,7 +152,12 @@ def samplers(kept: dict, rocks: int = 20) -> None:
             seen, rk.ExponentialPulse, three(), estimate=found, sampler=sampler, steps=steps, **given
         )
         size, r_hat = float(drawn.effective_size.min()), float(drawn.r_hat.max())
-        return size, r_hat, drawn.responses // (NODES * rocks), np.asarray(drawn[drawn.names[0]])
+        return (
+            size,
+            r_hat,
+            drawn.responses // rk.inverse.Likelihood(seen, rk.ExponentialPulse, 0.2).scenes,
+            np.asarray(drawn[drawn.names[0]]),
+        )
 
     def nuts_of_blackjax(density):
         scale = jnp.asarray(np.std(of_own[1], axis=0) ** 2)  # what its own warm-up would have to find
@@ -259,7 +264,7 @@ def grid(kept: dict, rocks: int, points: int) -> None:
         "fit": float(found.log_likelihood),
         "plain": plain,
         "fine": best(near),
-        "fit_points": found.responses // (NODES * rocks),
+        "fit_points": found.responses // problem.likelihood.scenes,
         "fine_points": float(np.prod((high - low) / spacing)),
         "spacing": float(spacing),
     }

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from jaxrock.inverse.scatter import NODES
-
 
 def text(kept: dict, truth: dict[str, float]) -> str:
     """The report of all that was measured; `truth`: the parameters of the motion that was to be found."""
@@ -80,7 +78,7 @@ def _grid_text(row: dict) -> list[str]:
     plain, fine = row["points"] ** 2, row["fine_points"]
     return [
         f"{row['rocks']} rocks and a sine pulse; log-likelihoods of the best point, and the points that it took "
-        f"({NODES} responses a rock each):",
+        "(each as many responses a rock as its quadrature has scenes):",
         "",
         "| | log-likelihood | below the best | points | fit's share of them |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -122,7 +120,7 @@ def _coverage_text(rows: list[dict], truth: dict[str, float]) -> list[str]:
         "",
         f"- An interval is open in {np.mean([row['open'] for row in rows]):.2f} of them; "
         f"{sum(row['contradictory'] for row in rows)} were called contradictory (they count as not held).",
-        f"- A fit with its intervals took a median of {np.median(points):.0f} points ({NODES} responses a rock), "
+        f"- A fit with its intervals took a median of {np.median(points):.0f} points, "
         f"1/{65536 / np.median(points):.0f} of those of a plain grid of 256 x 256 points, whose steps are 1.4 % of the "
         "amplitude and 1.1 % of the period.",
     ]

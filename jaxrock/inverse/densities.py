@@ -13,7 +13,7 @@ from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, check_shapes
 from jaxrock._quickly import quickly
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.unknowns import Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
@@ -113,6 +113,7 @@ def log_density(
     scatter: ArrayLike = 0.3,
     *,
     lapse: ArrayLike = 0.02,
+    accuracy: Annotated[float, quadrature_accuracy] = 0.02,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
 ) -> LogDensity:
@@ -126,6 +127,5 @@ def log_density(
     """
     if not unknowns:
         raise ValueError("Argument `unknowns` must name at least one parameter.")
-    return LogDensity(
-        Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns)).current()
-    )
+    likelihood = Likelihood(observations, motion, scatter, model, engine, lapse, accuracy=accuracy)
+    return LogDensity(Problem(likelihood, dict(unknowns)).current())

@@ -1,9 +1,10 @@
 """The motion that rocks allow: parameters of a pulse, with intervals, from rocks that stand, fell, or rocked so far.
 
-The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals: it is climbed from
-many starts. Intervals are those of the profile likelihood: all values of a parameter with which some values of the
-others explain the observations nearly as well as the best. Where the observations leave a side open they end at the
-range that was searched, and say so.
+The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals: it is scanned, and
+climbed from the best places of the scan. No search can tell that there is no higher one between its places. Intervals
+are those of the profile likelihood: all values of a parameter with which some values of the others explain the
+observations nearly as well as the best. Where the observations leave a side open they end at the range that was
+searched, and say so.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,10 +19,10 @@ from jaxrock._checks import placed
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.profile_likelihood import Profile, Shape, profile, shape_at
-from jaxrock.inverse.scatter import NODES
+from jaxrock.inverse.scan import Competing, competing, scan, spread, starts as starts_of
 from jaxrock.inverse.search import Trace, optimizer_or_none, summits_of
 from jaxrock.inverse.unknowns import Evaluator, Problem, Unknown
 from jaxrock.models.equation import AbstractEquation
@@ -30,10 +31,10 @@ from jaxrock.numerics.climb import Summits, climb
 from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
-_SCREENED = 4  # points for each start, of which the best are taken
-_LEAST_SCREENED = 64
-_AROUND = 0.15  # of the ranges
-_ROUNDS_BESIDE, _SCREENED_BESIDE, _BESIDE = 3, 64, 0.08  # rounds, points in each, and their extent in ranges
+_SCANNED, _LEAST_SCANNED = 16, 256  # places of the scan for each start, and at least
+_ROUNDS_BESIDE, _SCANNED_BESIDE, _BESIDE = 3, 128, 0.08  # rounds, points in each, and their extent in ranges
+_CLIMBING_BESIDE = 8  # of these
+_UNSURE = 0.5  # standard error of a log-likelihood from which on it is told
 _GAIN = 1e-6  # of a round that calls for another
 _RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
@@ -46,24 +47,32 @@ _FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not 
 class EstimateStatus(Enumeration):
     """What became of an estimate; `EstimateStatus[estimate.status]` is the message."""
 
-    successful = item("One maximum stands out, and every interval lies within the range that was searched.")
+    successful = item(
+        "One of the maxima that were found stands out, and every interval lies within the range that was searched."
+    )
     open_interval = item(
         "The observations leave a parameter open: an interval ends at the range that was searched, not where the "
         "observations end it. More rocks near the boundary, or a prior, would close it."
     )
     no_information = item(
-        "The observations tell nothing: every motion in the range explains them about equally well. Intervals are the "
-        "ranges that were searched."
+        "The observations tell nothing: every motion that was looked at explains them about equally well. Intervals "
+        "are the ranges that were searched."
     )
     contradictory = item(
-        "The observations contradict each other: under no motion of this kind are they likely, given how well rocks "
-        "and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no intervals."
+        "The observations contradict each other: under none of the motions that were tried are they likely, given how "
+        "well rocks and motion are said to be known. Look at the rocks named, or state a larger scatter. There are no "
+        "intervals."
     )
     not_computed = item(
         "Under the best motion the responses of rocks were mostly too close to call, or could not be computed: nothing "
         "can be said. Look at the motion, or set the engine."
     )
     not_converged = item("The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none.")
+    several_maxima = item(
+        "Several maxima explain the observations about equally well: others are less than 1.92 below the highest in "
+        "log-likelihood (see `competing`). Every interval covers those that were found and what lies between, and ends "
+        "within the range that was searched."
+    )
 
 
 class Estimate(AbstractTable):
@@ -84,8 +93,12 @@ class Estimate(AbstractTable):
     - `surprise`: how many standard deviations less probable the observations are than is to be expected; above 3 they
       contradict each other.
     - `probability`: (rocks,) that each rock does what it did (that it stands, where a rotation was measured).
+    - `probability_error`, `log_likelihood_error`: (rocks,) and (), standard errors that the quadrature over scatter and
+      rocks leaves in `probability` and `log_likelihood`, as eight quadratures at random places estimate them.
+    - `competing`, `competing_values`: (n, parameters) and (n,), other maxima that were found less than 1.92 below the
+      highest in log-likelihood, the highest first, with a fall of more than 0.5 on the straight lines between.
     - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
-      least with which they would not; infinite if there is none up to ten times as large.
+      least with which they would not; infinite if none of those tried up to ten times as large will do.
     - `summits`, `summit_values`: (climbs, parameters) where each climb arrived, and (climbs,) the log-likelihood there:
       those from points beside the best of the others first, then those from the starts.
     - `trace`: a `Trace` of the search from these starts, but for what was looked at beside their best; with
@@ -109,6 +122,10 @@ class Estimate(AbstractTable):
     consistent_scatter: Real
     summits: Real
     summit_values: Real
+    competing: Real
+    competing_values: Real
+    probability_error: Real
+    log_likelihood_error: Real
     trace: Trace
     responses: int = eqx.field(static=True)
     remarks: tuple[str, ...] = eqx.field(static=True)
@@ -140,6 +157,7 @@ def estimate_motion(
     lapse: ArrayLike = 0.02,
     starts: Annotated[int, at_least(1, 10**6)] = 64,
     optimizer: Annotated[Any, optimizer_or_none] = None,
+    accuracy: Annotated[float, quadrature_accuracy] = 0.02,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -154,12 +172,14 @@ def estimate_motion(
     - `unknowns`: an `Unknown` for each of these parameters.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
       observation says nothing; see `Likelihood`. They are not estimated.
-    - `starts`: points from which the maximum is looked for, at least 1: the best of four times as many, spread over the
-      ranges.
+    - `starts`: points from which the maximum is looked for, at most; at least 1. They are the best places, with no
+      better one beside them, of a scan over the ranges of 16 times as many (at least 256) and then around its best.
     - `optimizer`: what climbs from them: an `optax.GradientTransformation`, such as `optax.adam(0.1)`, or a minimiser
       of optimistix, such as `optimistix.BFGS(rtol=1e-6, atol=1e-6)`, over angles: a parameter goes from one end of its
       range to the other within pi. None: own climbers, by BFGS, in rounds that wait for nobody. Intervals are found by
       these in any case.
+    - `accuracy`: about the root mean square error that the quadrature leaves in a probability [-], in [0.001, 0.05]:
+      see `Likelihood`, also for what it costs.
     - `model`, `engine`: as in `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -169,10 +189,12 @@ def estimate_motion(
     """
     if not unknowns:
         raise ValueError("Argument `unknowns` must name at least one parameter.")
-    problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
-    bar = Progress(_LEAST_SCREENED + starts * 60, "fit", progress)
+    likelihood = Likelihood(observations, motion, scatter, model, engine, lapse, accuracy=accuracy)
+    problem = Problem(likelihood, dict(unknowns))
+    bar = Progress(_LEAST_SCANNED + starts * 60, "fit", progress)
     evaluate = Evaluator(problem, lambda more: bar.add(min(more, bar.total - bar.done - 1)))
-    summits = summits_of(evaluate, _starts(starts, evaluate), optimizer)
+    scan(evaluate, max(_SCANNED * starts, _LEAST_SCANNED))
+    summits = summits_of(evaluate, starts_of(evaluate, starts), optimizer)
     trace = Trace.of(evaluate, summits)
     if not np.isfinite(evaluate.lowest):
         raise ValueError("Argument `unknowns` must have ranges in which there are motions, but all its values are bad.")
@@ -194,44 +216,20 @@ def estimate_motion(
     return result
 
 
-def _starts(count: int, evaluate: Evaluator) -> np.ndarray:
-    """The best of several times as many points that are spread over the ranges; first those that are best around."""
-    places = _spread(max(_SCREENED * count, _LEAST_SCREENED), evaluate)
-    order = np.argsort(-evaluate.at(places)[0], kind="stable")
-    low, high = evaluate.ends
-    share = (places[order] - low) / (high - low)
-    near = np.max(np.abs(share[:, None] - share[None]), axis=2) < _AROUND
-    beside = np.tril(near, -1).any(axis=1)
-    return evaluate.points(places[np.concatenate([order[~beside], order[beside]])[:count]])
-
-
 def _beside(evaluate: Evaluator, summits: Summits) -> np.ndarray:
     """The best of some points around the highest summit: gaps that are narrower than the scatter make small summits
     beside it."""
     low, high = evaluate.ends
     best = evaluate.places(summits.points[np.argmax(summits.values)])
-    places = best + _BESIDE * (_spread(_SCREENED_BESIDE, evaluate) - (low + high) / 2)
+    places = best + _BESIDE * (spread(_SCANNED_BESIDE, evaluate) - (low + high) / 2)
     places = np.clip(places, low, high)
-    order = np.argsort(-evaluate.at(places)[0], kind="stable")
-    return evaluate.points(places[order[: _SCREENED_BESIDE // _SCREENED]])
+    order = np.argsort(-evaluate.scan(places), kind="stable")
+    return evaluate.points(places[order[:_CLIMBING_BESIDE]])
 
 
 def _joined(more: Summits, summits: Summits) -> Summits:
     points, values, arrived = (np.concatenate(pair) for pair in zip(more[:3], summits[:3]))
     return Summits(points, values, arrived)
-
-
-def _spread(count: int, evaluate: Evaluator) -> np.ndarray:
-    """Places spread evenly over the ranges: multiples of irrational numbers, modulo one.
-
-    From starts by Halton's sequence (of SciPy) five of eight fits ended on a lower summit, and one on a higher.
-    """
-    low, high = evaluate.ends
-    size = low.size
-    root = np.roots([1, *[0] * (size - 1), -1, -1])
-    ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
-    share = (0.5 + np.outer(np.arange(count), ratio ** -np.arange(1.0, size + 1))) % 1
-    return low + (high - low) * (0.01 + 0.98 * share)
 
 
 def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Profile, trace: Trace) -> Estimate:
@@ -242,8 +240,9 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
     stands, computed, *facts = evaluate.facts(evaluate.places(summits.points[best]))
     surprise = _surprise(facts)
     probability = np.where(np.asarray(problem.likelihood.observations.seen) == TOPPLED, 1 - stands, stands)
-    remarks, consistent = _remarks(problem, shape, profiled), np.inf
-    status = EstimateStatus.successful
+    others, errors = competing(evaluate, summits), evaluate.errors(evaluate.places(summits.points[best]))
+    remarks, consistent = _remarks(problem, shape, profiled, others, errors[1]), np.inf
+    status = EstimateStatus.several_maxima if len(others.values) else EstimateStatus.successful
     if profiled.open.any():
         status = EstimateStatus.open_interval
     if summits.values[best] - evaluate.lowest < _RATIO:
@@ -263,20 +262,20 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
         else:
-            remarks += ("With no scatter up to ten times as large would the observations agree.",)
-    per_point = problem.likelihood.observations.ways.size * NODES
+            remarks += ("With no scatter that was tried, up to ten times as large, would the observations agree.",)
     arrays = {
         "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
         "directions": shape.directions, "deviations": shape.deviations, "log_likelihood": summits.values[best],
         "surprise": surprise, "probability": probability, "consistent_scatter": consistent, "summits": parameters,
-        "summit_values": summits.values,
+        "summit_values": summits.values, "competing": problem.parameters(others.places),
+        "competing_values": others.values, "probability_error": errors[0], "log_likelihood_error": errors[1],
     }  # fmt: skip
     return Estimate(
         **placed({name: np.asarray(x) for name, x in arrays.items()}),
         names=problem.names,
         scatter=problem.likelihood.scatter,
         trace=trace,
-        responses=evaluate.count * per_point,
+        responses=evaluate.scenes,
         remarks=remarks,
         status=status,
     )
@@ -311,17 +310,26 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
         scatter = evaluate.problem.likelihood.scatter * factor
         problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)
         again = Evaluator(problem)
-        starts = np.concatenate([point[None], _starts(_RETRIES, again)])
+        scan(again, _LEAST_SCANNED)
+        starts = np.concatenate([point[None], starts_of(again, _RETRIES)])
         summits = climb(again, starts)
-        evaluate.count += again.count
+        evaluate.count += again.scenes // evaluate.problem.likelihood.scenes
         if _surprise(again.facts(again.places(summits.points[np.argmax(summits.values)]))[2:]) <= _SURPRISED:
             return float(scatter)
     return np.inf
 
 
-def _remarks(problem: Problem, shape: Shape, profiled: Profile) -> tuple[str, ...]:
-    """Open intervals and flat directions in words."""
+def _remarks(problem: Problem, shape: Shape, profiled: Profile, others: Competing, error: float) -> tuple[str, ...]:
+    """Open intervals, flat directions, other maxima and errors of the quadrature in words."""
     remarks = []
+    for place, value in zip(problem.parameters(others.places), others.values):
+        named = ", ".join(f"{name} {x:.3g}" for name, x in zip(problem.names, place))
+        remarks.append(
+            f"Another maximum explains the observations about as well: {named} (log-likelihood {value:.2f})."
+        )
+    if error > _UNSURE:
+        said = f"The quadrature leaves a standard error of {error:.2g} in the log-likelihood at its maximum"
+        remarks.append(f"{said}: a smaller `accuracy` tells more.")
     for name, (below, above) in zip(problem.names, profiled.open):
         if below and above:
             remarks.append(f"The observations do not determine {name}.")

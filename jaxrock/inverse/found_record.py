@@ -1,8 +1,8 @@
 """Critical excitation: the least-changed record that topples blocks, spares them, or brings them to a margin.
 
-There are as many unknowns as samples, and margins are neither convex nor continuous in them: what is found is a local
-minimum of the change, the least of those from several starts. Each start is a direction of change: louder or softer,
-where an optimiser of optax goes, and against the slopes of the margins under records nearby.
+There are as many unknowns as samples, and margins are neither convex nor continuous in them: what is found is the
+least change of those to which several starts lead, each about a local minimum. Each start is a direction of change:
+louder or softer, where an optimiser of optax goes, and against the slopes of the margins under records nearby.
 """
 
 from collections.abc import Sequence
@@ -35,6 +35,7 @@ Target = str | ArrayLike | Sequence[str | float]
 _ROUNDS = 6  # of the search, each of which keeps the peaks of the spectrum that have grown in the one before
 _APPROACH = 40  # steps of the optimiser
 _NEARBY = 0.15  # root mean square of what is added to a record to start nearby, over the record's
+_UNRELATED, _TURNED = 6, 0.7  # first starts; root mean square of what is added to the best direction after them
 _SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that, or above
 _USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth digit decides
 
@@ -42,11 +43,14 @@ _USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth d
 class RecordStatus(Enumeration):
     """What became of a search for a record; `RecordStatus[found.status]` is the message."""
 
-    successful = item("The margins are as wanted. No record near this one that does as much is nearer to the start.")
+    successful = item(
+        "The margins are as wanted. Of the records to which the search came from its starts this is the nearest (see "
+        "`changes`); a search from others may find a nearer one."
+    )
     unchanged = item("The margins are as wanted under the record as it is.")
     useless_slopes = item(
         "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
-        "long that slopes lead nowhere, and digits of the record decide that nobody measures. There are nearer ones."
+        "long that slopes lead nowhere, and digits of the record decide that nobody measures. Nearer ones are likely."
     )
     spectrum_changed = item(
         "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "
@@ -69,8 +73,8 @@ class FoundRecord(AbstractTable):
     - `slope`: by how much the margin that changes most does so for a change of root mean square 1 g [1/g], where the
       search turned last. (At the verge itself a block in balance may wait for what is left of the record, and slopes
       grow as exp(p t).)
-    - `changes`: (starts,) root mean squares of the changes to which each start came [g]; infinite where it did not
-      come to anything. Those that differ are local minima.
+    - `changes`: (starts,) root mean squares of the changes to which each start came [g], of which `change` is the
+      least; infinite where it did not come to anything. Those that differ are other places where the search ends.
     - `path`: (steps,) root mean squares on the way from the start that came farthest [g].
     - `spectrum`: by which share the response spectrum changes at most at the periods that are kept; not a number where
       none is.
@@ -120,14 +124,14 @@ def find_record(
     band: Annotated[tuple[float, float] | None, pair] = None,
     baseline: bool = True,
     spectrum: Values | None = None,
-    starts: Annotated[int, at_least(1, 10**4)] = 6,
+    starts: Annotated[int, at_least(1, 10**4)] = 10,
     steps: Annotated[int, at_least(1, 10**6)] = 60,
     seed: Annotated[int, at_least(0)] = 0,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> FoundRecord:
-    """Find the record nearest to a given one that topples a block, spares it, or brings it to a margin.
+    """Look for the record nearest to a given one that topples a block, spares it, or brings it to a margin.
 
     **Arguments:**
 
@@ -142,11 +146,13 @@ def find_record(
     - `baseline`: whether velocity and displacement of the ground at the end of the record stay as they are.
     - `spectrum`: (periods,) of oscillators of 5 % damping whose peaks the change leaves as they are, within 5 % [s],
       10 steps of the record or more; None: whatever becomes of them.
-    - `starts`: directions from which the nearest record is looked for, at least 1: three, and others from records
-      nearby by `seed`. `steps`: for each, at most.
+    - `starts`: directions from which the nearest record is looked for, at least 1: louder or softer, by the optimiser,
+      by slopes here, three by slopes under records nearby, and then by turns near the best so far and under records
+      nearby, by `seed`. `steps`: for each, at most.
     - `model`, `engine`, `progress`: as in `estimate_motion`.
 
-    **Returns:** a `FoundRecord`.
+    **Returns:** a `FoundRecord`: the nearest of those that were found, which no search of this kind proves to be the
+    nearest of all.
 
     **Raises:** ValueError for arguments outside their ranges, and for a record that does not shake.
 
@@ -185,7 +191,8 @@ def _nearest(search: Search, directions: "_Directions", starts: int, steps: int,
     """The lengths to which all starts come, and what the shortest is of."""
     found = []
     for number in range(starts):
-        reached = search.in_direction(directions(number), fine=number == 0)
+        best = min(found, key=_length, default=None)
+        reached = search.in_direction(directions(number, best), fine=number == 0)
         found.append(reached and search.nearer(reached, steps, lambda: bar.add(1)))
         bar.add((number + 1) * steps - bar.done)
     lengths = [_length(each) for each in found]
@@ -247,8 +254,9 @@ class _Directions(NamedTuple):
     penalty: float
     random: np.random.Generator
 
-    def __call__(self, number: int) -> np.ndarray:
-        """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby."""
+    def __call__(self, number: int, nearest: Found | None) -> np.ndarray:
+        """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby; later
+        every other one near the best direction so far, where a nearer record is likelier than elsewhere."""
         if number == 0:
             louder, softer = (
                 self.search.in_direction(self.search.allowed(x), fine=True) for x in (self.samples, -self.samples)
@@ -257,6 +265,9 @@ class _Directions(NamedTuple):
             return self.samples * 0.0 if best is None else best.direction
         if number == 1:
             return self._by_optimizer()
+        if number >= _UNRELATED and number % 2 == 0 and nearest is not None:
+            noise = self._noise()
+            return self.search.allowed(nearest.direction + _TURNED * noise / max(rms(noise), 1e-300))
         nearby = self.search.allowed(self._noise()) if number > 2 else np.zeros_like(self.samples)
         excess, slopes = self.search.slopes(nearby)
         straight = least_change(slopes, -excess)

@@ -11,10 +11,9 @@ margin:
 
 A probit of the margin over its slope (the delta method) would give that where the margin is straight; but overturning
 sets are unions of intervals, narrower than the scatter or wider, and a probit with one slope would be certain where the
-slope vanishes, in the middle of one. So the margin is computed at many amplitudes (see `possible`). No derivatives are
-needed for the likelihood, and only first ones for its slope. Beside counted verdicts probabilities are off by 0.01 to
-0.04 (root of the mean square), and by up to 0.13 where shape and size are known to a tenth or two only
-(`benchmarks/inverse.md`).
+slope vanishes, in the middle of one. So the margin is computed at many amplitudes (see `scatter`). No derivatives are
+needed for the likelihood, and only first ones for its slope. How far probabilities are off is chosen by `accuracy` and
+told by `survival_error`; beside counted verdicts it stands in `benchmarks/inverse.md`.
 
 Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
 both ways.
@@ -22,7 +21,7 @@ both ways.
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -32,11 +31,11 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import as_real, below_one, check_shapes, positive, put_down, scalar, shown
+from jaxrock._checks import as_real, below_one, check_shapes, placed, positive, put_down, scalar, shown
 from jaxrock._quickly import quickly
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
-from jaxrock.inverse.scatter import Possible, levels_around
+from jaxrock.inverse.scatter import LEAST_ACCURATE, MOST_ACCURATE, Possible, Quadrature, are_known_well, levels_around
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.motion import AbstractMotion
@@ -51,7 +50,16 @@ Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
 _Found = tuple[Real, Flags, Flags]  # margin and rotation, overturned, known
 _NO_STRENGTH = 1e-30  # [g]
+_DRAWS = 8  # quadratures from which its error is estimated
 _FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is known but that the rock stands
+
+
+def quadrature_accuracy(name: str, value: Any) -> float:
+    """An error of a probability that the quadrature may have."""
+    known = float(scalar(name, positive(name, value)))
+    if not MOST_ACCURATE <= known <= LEAST_ACCURATE:
+        raise ValueError(f"Argument `{name}` must be in [{MOST_ACCURATE:g}, {LEAST_ACCURATE:g}], but is {known:g}.")
+    return known
 
 
 class Likelihood(eqx.Module):
@@ -70,6 +78,10 @@ class Likelihood(eqx.Module):
     - `lapse`: probability that what was seen of a rock says nothing, in [0, 1): somebody moved it, it was misjudged, or
       it stands in a gap between two ways of overturning that is too narrow to be resolved. One rock can then speak
       against a motion no more strongly than 2/lapse to 1.
+    - `accuracy`: about the root mean square error that the quadrature over scatter and rocks may leave in a probability
+      [-], in [0.001, 0.05]. Scenes for each rock: 54 at 0.02, 272 at 0.01, 1,452 at 0.005 and 66,332 at
+      0.001; 42, 82, 162 and 802 where rocks are known well beside the motion at them. Single probabilities
+      may be off by four times as much: `survival_error` estimates what is left of each.
 
     **Raises:** ValueError for a value outside its range.
     """
@@ -77,6 +89,7 @@ class Likelihood(eqx.Module):
     observations: Observations
     scatter: Real
     lapse: Real
+    quadrature: Quadrature
     motion: Callable[..., AbstractMotion]
     model: AbstractEquation
     engine: AbstractEngine | None
@@ -90,6 +103,8 @@ class Likelihood(eqx.Module):
         model: AbstractEquation = Housner(),
         engine: AbstractEngine | None = None,
         lapse: ArrayLike = 0.02,
+        *,
+        accuracy: Annotated[float, quadrature_accuracy] = 0.02,
     ):
         if isinstance(motion, AbstractMotion):
             raise ValueError(f"Argument `motion` must make a motion of its parameters, but is one: {motion}.")
@@ -97,6 +112,13 @@ class Likelihood(eqx.Module):
         self.motion = motion if isinstance(motion, eqx.Module) else ByIdentity(motion)
         self.scatter = scalar("scatter", positive("scatter", scatter))
         self.lapse = scalar("lapse", below_one("lapse", lapse))
+        exact = are_known_well(observations, self.scatter, accuracy)
+        self.quadrature = Quadrature.of(accuracy, exact)
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes are computed for one motion."""
+        return self.observations.ways.size * self.quadrature.scenes
 
     def current(self, names: Sequence[str]) -> "Likelihood":
         """The same with motion and model as they are now, for parameters of such names: a pytree for `jax.jit`.
@@ -153,6 +175,17 @@ class Likelihood(eqx.Module):
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
 
+    def survival_error(self, values: Mapping[str, ArrayLike]) -> Real:
+        """Estimated standard error of `survival`, (..., rocks), which its quadrature leaves: from eight others with as
+        many nodes at random places (Cranley & Patterson 1976). It costs as much as eight times `survival`."""
+        found = [np.asarray(each.survival(values)) for each in self.drawn()]
+        return placed(np.std(found, axis=0, ddof=1))
+
+    def drawn(self) -> list["Likelihood"]:
+        """Likelihoods by other quadratures of as many nodes, at random places: they scatter by their errors."""
+        draws = (self.quadrature.drawn(seed) for seed in range(_DRAWS))
+        return [eqx.tree_at(lambda it: it.quadrature, self, each) for each in draws]
+
     def _survival(self, values: Mapping[str, ArrayLike]) -> Real:
         return jnp.exp(self._possible(values)[0].log_probabilities()[0])
 
@@ -207,16 +240,17 @@ class Likelihood(eqx.Module):
         outer = parameters.shape[:-1]
         strength, impossible = jax.vmap(lambda x: self._strength(names, x))(parameters.reshape(-1, len(names)))
         strength, impossible = strength.reshape(outer), impossible.reshape(outer)
-        levels, where = levels_around(seen, self.scatter, strength)
+        levels, where = levels_around(seen, self.quadrature, self.scatter, strength)
         if wanted is not None:  # a scene of no strength that is a number ends at once
-            levels = levels._replace(strength=jnp.where(wanted[..., None], levels.strength, jnp.nan))
+            levels = levels._replace(strength=jnp.where(wanted[..., None, None], levels.strength, jnp.nan))
             impossible |= ~wanted
-        shape = (*levels.strength.shape[:-1], *seen.ways.shape)
+        shape = (*levels.strength.shape[:-1], *seen.ways.shape)  # (nodes, ..., possible, ways, rocks)
 
         def lanes(x):
             return jnp.broadcast_to(x[..., None, :], shape).ravel()
 
-        parameters = jnp.broadcast_to(parameters[..., None, None, :], (*shape, len(names))).reshape(-1, len(names))
+        parameters = jnp.broadcast_to(parameters[..., None, None, None, :], (*shape, len(names)))
+        parameters = parameters.reshape(-1, len(names))
         blocks = jax.tree.map(lanes, seen.blocks_at(levels.alpha, levels.p, levels.restitution))
         ways = jnp.broadcast_to(seen.ways, shape).ravel()
         # Values whose derivatives are known: JAX has to go through this product only, and not through the engine.
@@ -227,10 +261,14 @@ class Likelihood(eqx.Module):
             real = _sloping(real, rows, parameters, scene, level, ways, blocks)
         else:
             real, lost, known = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
-        margin, rotation, lost, known = (x.reshape(shape) for x in (*real.T, lost, known))
-        verge = jnp.broadcast_to((levels.alpha * seen.weaker_alpha / seen.alpha)[..., None, :], shape)
+        verge = lanes(levels.alpha * seen.weaker_alpha / seen.alpha)
+        # Which way round a rock stands and which of the possible ones it is are one axis: all are equally likely.
+        merged = (*shape[:-3], -1, shape[-1])
+        where, margin, rotation, lost, known, verge = (
+            x.reshape(merged) for x in (lanes(where), *real.T, lost, known, verge)
+        )
         margin, rotation = (jnp.where(known, x, 0.0) for x in (margin, rotation))
-        return Possible.of(where[..., None, :], margin, rotation, known, lost, verge), impossible
+        return Possible.of(where, margin, rotation, known, lost, verge, self.quadrature.apart), impossible
 
     def _strength(self, names: tuple[str, ...], parameters: Real) -> tuple[Real, Bool[Array, ""]]:
         """Logarithm of the strength of a motion, and whether there is no such motion."""

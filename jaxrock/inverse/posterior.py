@@ -20,14 +20,12 @@ from jaxrock._checks import inner_share, scalar
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
-from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.densities import LogDensity
 from jaxrock.inverse.estimate import Estimate, EstimateStatus, estimate_motion
-from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
 from jaxrock.inverse.observations import Observations
 from jaxrock.inverse.samplers import rounds_of
-from jaxrock.inverse.scatter import NODES
-from jaxrock.inverse.unknowns import Problem, Unknown
+from jaxrock.inverse.unknowns import Problem, Unknown, densities
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
 from jaxrock.motions.pulses import UNITS
@@ -37,7 +35,6 @@ from jaxrock.status import Enumeration, item
 Real = Inexact[Array, "..."]
 _CHAINS = 8
 _ROUND = 512  # points of a round: those of all chains together
-_LANES = 64  # points in one call of the compiled program
 _PATIENCE, _POOR = 512, 0.03  # steps after which chains begin anew where samples are worth less than that
 _DEPTH = 6.0  # log-density below the best maximum down to which maxima are places to begin at
 _JITTER, _INSIDE = 0.1, 6.0  # of the points at which other samplers begin, around maxima, and how far out
@@ -135,6 +132,7 @@ def sample_motion(
     steps: Annotated[int, at_least(1, 10**9)] = 4000,
     seed: Annotated[int, at_least(0)] = 0,
     sampler: Callable | None = None,
+    accuracy: Annotated[float, quadrature_accuracy] = 0.02,
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
@@ -146,7 +144,7 @@ def sample_motion(
 
     **Arguments:**
 
-    - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `model`, `engine`: as in `estimate_motion`.
+    - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `accuracy`, `model`, `engine`: as in `estimate_motion`.
     - `estimate`: what `estimate_motion` found: where to look first. None makes one.
     - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
     - `steps`: of each of eight chains, at most; at least 1. Those before chains began anew are counted, but not used.
@@ -171,9 +169,18 @@ def sample_motion(
         raise ImportError('Sampling needs NumPyro: pip install "jaxrock[posterior]".') from error
     if estimate is None:
         estimate = estimate_motion(
-            observations, motion, unknowns, scatter, lapse=lapse, model=model, engine=engine, progress=progress
+            observations,
+            motion,
+            unknowns,
+            scatter,
+            lapse=lapse,
+            accuracy=accuracy,
+            model=model,
+            engine=engine,
+            progress=progress,
         )
-    problem = Problem(Likelihood(observations, motion, scatter, model, engine, lapse), dict(unknowns))
+    likelihood = Likelihood(observations, motion, scatter, model, engine, lapse, accuracy=accuracy)
+    problem = Problem(likelihood, dict(unknowns))
     wanted = _Wanted(effective_size, steps, seed)
     if sampler is None:
         bar = Progress(ROUNDS + -(-steps * _CHAINS // _ROUND), "posterior", progress)
@@ -248,11 +255,6 @@ def _by_another(make: Callable, problem: Problem, estimate: Estimate, wanted: _W
     return _Drawn(places[: wanted.steps], values, *diagnostics(places[: wanted.steps]), count)
 
 
-@eqx.filter_jit
-def _log_density(problem: Problem, places: Real, wanted: Bool[Array, " lanes"]) -> Real:
-    return problem.log_density(places, slopes=False, wanted=wanted)
-
-
 class _Density:
     """Log-densities at any number of places, in batches of one compiled program; it counts."""
 
@@ -261,8 +263,7 @@ class _Density:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         self.count += len(places)
-        (density,) = in_batches(lambda *part: [_log_density(self.problem, *part)], places, _LANES)
-        return np.where(np.isnan(density), -np.inf, density)
+        return densities(self.problem, places)
 
 
 def _summits(problem: Problem, estimate: Estimate) -> np.ndarray:
@@ -314,7 +315,7 @@ def _conclude(problem: Problem, estimate: Estimate, drawn: _Drawn, wanted: int) 
         effective_size=jnp.asarray(sizes),
         r_hat=jnp.asarray(r_hat),
         open=jnp.asarray(open_),
-        responses=points * problem.likelihood.observations.ways.size * NODES,
+        responses=points * problem.likelihood.scenes,
         estimate=estimate,
         status=status,
     )

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxrock.inverse.scan import evenly
 from jaxrock.inverse.unknowns import Evaluator
 from jaxrock.numerics.climb import Summits, climb
 
@@ -12,6 +13,13 @@ _ROOT = np.sqrt(2 * _RATIO)
 _PARABOLAS, _SETTLED = 4, 0.3  # fits of a parabola at most; change of the lengths of its axes that calls for none more
 _TELLING = 0.16  # bend over a range, squared, with which it falls by 0.02 over half of it: less may be steps
 _NOTHING = 50.0  # a fall after which the likelihood is none
+_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of a range, outside of an end, where the region may go on
+_OUTWARD = 4  # times that it is looked for there
+_BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # rounds at most; width of a bracket, in ranges, and root that will do
+_MULTIPLES = 1.5, 3.0, np.inf  # standard deviations from the maximum at which profiles begin
+_SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the scan of the other parameters before
+_BESIDE = 0.2  # extent of another as many around the nearest place, in ranges: ridges are narrow
+_HOPE = 1.5  # of a scan below the region, within which climbers may yet come to it
 _AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
 
@@ -111,22 +119,31 @@ class _Row(NamedTuple):
 def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
     """Ends of the intervals in which the profile of the log-likelihood is less than 1.92 below its maximum.
 
-    For every parameter and side: some values outward to the end of the range, the others climbing at each; then the
-    root of the likelihood ratio, which is nearly straight, by secants in the outermost bracket.
+    For every parameter and side: some values outward to the end of the range, the others climbing at each; then where
+    the likelihood ratio crosses, by secants in the outermost bracket until that is narrow. Climbers begin at the best
+    places nearby, also of a scan over the other parameters: from place to place they would stay on a lower summit.
     """
     low, high = evaluate.ends
     size = high - low
     sides = _Sides(evaluate, summits.values.max(), shape.place)
     variance = np.diagonal(shape.covariance)
     spread = np.minimum(np.sqrt(np.where(np.isfinite(variance), variance, np.inf)), size / 8)
-    for multiple in (1.0, 2.0, 3.5, np.inf):
+    for multiple in _MULTIPLES:
         values = [shape.place[j] + s * multiple * spread[j] for j, s in sides.rows]
         inside = [np.clip(v, low[j], high[j]) for v, (j, _) in zip(values, sides.rows)]
         sides.follow(dict(zip(sides.rows, inside)))
     sides.recall()
-    for _ in range(4):
-        brackets = {side: sides.bracket(side) for side in sides.rows}
-        sides.follow({side: _secant(*pair, 0.05) for side, pair in brackets.items() if pair is not None})
+    # Beyond a valley the region may go on: near its end, as a likelihood has steps, and farther away.
+    for _ in range(_OUTWARD):
+        sides.narrow()
+        before = {side: sides.outermost(side) for side in sides.rows}
+        tried = [{(j, s): sides.outside(before[j, s], j, s, x) for j, s in sides.rows} for x in _BEYOND]
+        for wanted in tried:
+            sides.follow(sides.hopeful(wanted))
+        sides.recall()
+        if all(abs(sides.outermost(side) - before[side]) < _NARROW * size[side[0]] for side in before):
+            break
+    sides.narrow()
     ends, open_ = np.stack([low, high], axis=1), np.ones((low.size, 2), bool)
     for j, s in sides.rows:
         pair = sides.bracket((j, s))
@@ -151,28 +168,73 @@ class _Sides:
         self.highest = (-np.inf, None)
 
     def follow(self, wanted: dict[tuple[int, int], float]) -> None:
-        """Climb with one parameter held at a value, for each of some sides: from the nearest place on the profile, and
-        from the best of all places nearby."""
+        """Climb with one parameter held at a value, for each of some sides, from two places: the highest of a scan, and
+        the nearest on the profile or the best of all nearby."""
         if not wanted:
             return
         begin, free = [], []
-        for (j, s), value in wanted.items():
-            nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
-            for place in (nearest.place, self._nearby(j, value, abs(nearest.value - value), nearest.place)):
-                held = np.arange(place.size) == j
-                begin.append(np.where(held, value, place))
-                free.append(~held)
+        for (j, _), places in zip(wanted, self._scanned(wanted)[0]):
+            held = np.arange(places.shape[1]) == j
+            begin.extend(places)
+            free.extend([~held] * _SEEDS)
         low, high = self.evaluate.ends
-        inner = np.clip(begin, low + _AWAY * (high - low), high - _AWAY * (high - low))
+        inner = np.clip(np.array(begin), low + _AWAY * (high - low), high - _AWAY * (high - low))
         points = self.evaluate.points(np.where(free, inner, begin))
-        group = np.repeat(np.arange(len(wanted)), 2)
+        group = np.repeat(np.arange(len(wanted)), _SEEDS)
         reached = climb(self.evaluate, points, np.array(free), rounds=25, promise=1e-3, group=group)
         places, values = self.evaluate.places(reached.points), reached.values
         for number, (side, value) in enumerate(wanted.items()):
-            best = 2 * number + int(values[2 * number + 1] > values[2 * number])
+            best = _SEEDS * number + int(np.argmax(values[_SEEDS * number : _SEEDS * (number + 1)]))
             self.rows[side].append(_Row(value, np.sqrt(2 * max(self.best - values[best], 0.0)), places[best]))
         top = int(np.argmax(values))
         self.highest = max(self.highest, (values[top], reached.points[top]), key=lambda pair: pair[0])
+
+    def _scanned(self, wanted: dict[tuple[int, int], float]) -> tuple[list[np.ndarray], np.ndarray]:
+        """For each side places with its parameter held, at which climbers begin, and the highest of a scan of these and
+        of some spread over the other parameters, and around the nearest."""
+        low, high = self.evaluate.ends
+        tried = []
+        for (j, s), value in wanted.items():
+            nearest = min(self.rows[j, s], key=lambda row: abs(row.value - value))
+            nearby = self._nearby(j, value, abs(nearest.value - value), nearest.place)
+            others = low + (high - low) * evenly(_SCANNED, low.size)
+            beside = np.clip(nearest.place + _BESIDE * (others - (low + high) / 2), low, high)
+            tried.append(np.concatenate([[nearest.place, nearby], others, beside]))
+            tried[-1][:, j] = value
+        values = self.evaluate.scan(np.concatenate(tried)).reshape(len(tried), -1)
+        first = np.argmax(values, axis=1)
+        return [places[[k, int(k == 0)]] for places, k in zip(tried, first)], values.max(axis=1)
+
+    def hopeful(self, wanted: dict[tuple[int, int], float]) -> dict[tuple[int, int], float]:
+        """Those at which a scan comes near to the region."""
+        highest = self._scanned(wanted)[1]
+        return {side: x for (side, x), top in zip(wanted.items(), highest) if top > self.best - _RATIO - _HOPE}
+
+    def narrow(self) -> None:
+        """Follow secants until all ends are known well enough."""
+        for _ in range(_BRACKETS):
+            brackets = {side: self.bracket(side) for side in self.rows}
+            wide = {side: pair for side, pair in brackets.items() if pair is not None and self.is_wide(side, pair)}
+            if not wide:
+                return
+            self.follow({side: _secant(*pair, 0.1) for side, pair in wide.items()})
+            self.recall()
+
+    def outermost(self, side: tuple[int, int]) -> float:
+        """The value farthest out within 95 %."""
+        return max((row for row in self.rows[side] if row.root < _ROOT), key=lambda row: side[1] * row.value).value
+
+    def outside(self, value: float, j: int, s: int, share: float) -> float:
+        """A value farther out by a share of the range, or at its end."""
+        low, high = self.evaluate.ends
+        return float(np.clip(value + s * share * (high - low)[j], low[j], high[j]))
+
+    def is_wide(self, side: tuple[int, int], pair: tuple[_Row, _Row]) -> bool:
+        """Whether the end is not known well enough from its bracket."""
+        low, high = self.evaluate.ends
+        inner, outer = pair
+        narrow = abs(outer.value - inner.value) < _NARROW * (high - low)[side[0]]
+        return not (narrow or min(_ROOT - inner.root, outer.root - _ROOT) < _NEAR)
 
     def recall(self) -> None:
         """Add to each side the outermost of all known places that are within 95 %: it may lie beyond a valley."""

@@ -1,59 +1,123 @@
 """What may have become of rocks under a motion that is not the same at each of them, and how probable that is.
 
 The motion at each rock differs from that of the site by a lognormal factor, and alpha, p and restitution are uncertain.
-Margins and rotations are computed at nodes along the logarithm of the factor and are straight between them:
+Margins and rotations are computed at nodes along the logarithm of the factor, for a few possible rocks, and are
+straight between nodes:
 
-    P(stands) = sum_k w_k Phi(y_k/s_k),
+    P(stands) = mean over possible rocks of sum_k w_k Phi(y_k/s_k),
 
 over the quarter points of the intervals between nodes, with y a function of the margin that is nearly straight in ln
 amplitude, w_k the normal probability of the quarter's surroundings, and s_k half of what y changes by from node to
 node: a probit that smears each interval so far that the sum is smooth.
 
-Nodes are fixed levels of the strength of the motion over the rock's tan(alpha): a motion that grows moves the weights
-along, and not the nodes. So the probability is as smooth in the amplitude as the normal distribution is, however rough
-the margin: overturning sets are unions of intervals, some of them narrower than what is between two nodes, and nodes
-that move with the amplitude would flicker through these. What is narrower than two fifths of the scatter is either
-met by a node or not, and counts for an interval or for nothing.
+Nodes are fixed levels of the strength of the motion: a motion that grows moves the weights along, and not the nodes.
+So the probability is as smooth in the amplitude as the normal distribution is, however rough the margin: overturning
+sets are unions of intervals, some of them narrower than what is between two nodes, and nodes that move with the
+amplitude would flicker through these. What is narrower than the distance of nodes is either met by a node or not, and
+counts for an interval or for nothing.
 
-From node to node alpha, p and restitution change, too, in patterns that have no mean and no correlation: whatever the
-normal weights, the variance of something straight is the sum of what each of them adds.
+Possible rocks are a Latin hypercube (McKay, Beckman & Conover 1979), whose first direction is that in which a rock
+becomes easier to topple. A slenderer rock acts like a stronger motion, so what its strata leave out of the variance is
+added to that of the amplitude: the total is right for any number of rocks.
 """
 
+import functools
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp, ndtr
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
+from jaxrock._checks import is_traced, placed
 from jaxrock.inverse.observations import Observations
 
 Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
-_APART = 0.4  # distance of nodes, in standard deviations
-_EACH_SIDE = 9  # nodes on each side of the motion itself: 3.6 standard deviations
-NODES = 2 * _EACH_SIDE + 2  # scenes that are computed for each rock
+MOST_ACCURATE, LEAST_ACCURATE = 1e-3, 0.05  # errors of a probability that can be asked for
+_APART, _APART_EXACT = 25.0, 10.0  # distance of nodes, in standard deviations for each unit of the error
+_LEAST_APART, _MOST_APART = 0.01, 0.8
+_ROCKS, _ROCKS_POWER = 0.045, 1.4  # possible rocks: (0.045/error)^1.4
+_WELL_KNOWN = 10.0  # scatter by rocks over that of the motion, for each unit of the error, below which one will do
+_REACH = 4.0  # standard deviations to each side, within which nodes are
 _SMEAR = 0.5  # of the difference between nodes
 _LEAST_WIDTH = 1e-3
-_SLOPE_OVER = 4  # nodes at each end from which y goes on
+_SLOPE_OVER = 1.2  # standard deviations at each end from which y goes on
 _LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the last nodes
 _END_WIDTH = 0.1  # of y there, so that the probability is smooth
-
-# Turns of the patterns from node to node: far from none and from each other, and so are their doubles.
-_FAST, _FASTEST = 1.6, np.pi
 _BY_P = 0.5  # a higher p acts like so much of the amplitude: between none for long pulses and all for short ones
-_SPREAD = np.sqrt(1 + _APART**2 * (_SMEAR**2 - 1 / 48))  # of straight y through quarter points, with the smear
+_GOLDEN = (np.sqrt(5) - 1) / 2
+_DESIGNS = 200  # Latin hypercubes that are drawn, of which the least correlated is taken
 
 
-def _amplitude(turn: float) -> float:
-    """Amplitude with which a cosine of so much turn from node to node adds a variance of 1, likewise."""
-    mean_square = 1.0 if turn == np.pi else 0.5
-    return 1 / np.sqrt(mean_square * (5 / 8 + 3 / 8 * np.cos(turn) + 2 * _SMEAR**2 * (1 - np.cos(turn))))
+class Quadrature(eqx.Module):
+    """Where margins are computed: nodes of the strength, and possible rocks.
+
+    - `apart`: distance of nodes, in standard deviations; `each_side`: how many on each side of the motion itself.
+    - `absorbed`: share of the rocks' variance that counts as one of the amplitude.
+    - `phases`: (possible,) by which share of the distance the nodes of each possible rock are shifted.
+    - `normals`: (3, possible) standard normal: how easily it topples, what else alpha and p differ by, restitution.
+    """
+
+    apart: float = eqx.field(static=True)
+    each_side: int = eqx.field(static=True)
+    absorbed: float = eqx.field(static=True)
+    phases: Real
+    normals: Real
+
+    @classmethod
+    def of(cls, accuracy: float, exact: bool) -> "Quadrature":
+        """That of an error of about `accuracy` in a probability; `exact`: rocks are known so well that it is enough to
+        add what they differ by to the scatter of the amplitude."""
+        apart = float(np.clip((_APART_EXACT if exact else _APART) * accuracy, _LEAST_APART, _MOST_APART))
+        rocks = 1 if exact else max(round((_ROCKS / accuracy) ** _ROCKS_POWER), 1)
+        normals = _latin_hypercube(rocks)
+        absorbed = float(1 - np.mean(normals[0] ** 2))
+        phases = (np.arange(rocks) * _GOLDEN) % 1
+        return cls(apart, int(np.ceil(_REACH / apart)), absorbed, *placed((phases, normals)))
+
+    @classmethod
+    def coarse(cls) -> "Quadrature":
+        """That of the fewest nodes: it is enough to see where a likelihood is large."""
+        return cls.of(_MOST_APART / _APART_EXACT, True)
+
+    @property
+    def scenes(self) -> int:
+        """How many are computed for each rock, one way round."""
+        return (2 * self.each_side + 2) * self.phases.size
+
+    def drawn(self, seed: int) -> "Quadrature":
+        """Another of as many nodes: its phases, and the places in the inner halves of strata, are random."""
+        rng, count = np.random.default_rng(seed), self.phases.size
+        phases = (np.asarray(self.phases) + rng.uniform()) % 1
+        normals = np.asarray(self.normals)
+        if count > 1:
+            share = np.stack([(rng.permutation(count) if i else np.arange(count)) for i in range(3)])
+            normals = _quantile((share + rng.uniform(0.25, 0.75, share.shape)) / count)
+        return eqx.tree_at(lambda it: (it.phases, it.normals), self, placed((phases, normals)))
+
+
+@functools.cache
+def _latin_hypercube(count: int) -> np.ndarray:
+    """Means of the standard normal over as many strata in each of three directions, (3, count), hardly correlated."""
+    ends = _quantile(np.arange(1, count) / count)
+    density = np.concatenate([[0.0], np.exp(-(ends**2) / 2) / np.sqrt(2 * np.pi), [0.0]])
+    means, rng = -count * np.diff(density), np.random.default_rng(0)
+    drawn = np.stack([[means, rng.permutation(means), rng.permutation(means)] for _ in range(_DESIGNS)])
+    correlation = np.abs(drawn @ drawn.transpose(0, 2, 1))[:, [0, 0, 1], [1, 2, 2]]
+    return drawn[np.argmin(correlation @ [1.0, 0.5, 0.25])]
+
+
+def _quantile(share: np.ndarray) -> np.ndarray:
+    from scipy.special import ndtri
+
+    return ndtri(share)
 
 
 class Levels(NamedTuple):
-    """Nodes, (nodes, ..., rocks): how strong the motion is, and which rocks stand there."""
+    """Nodes, (nodes, ..., possible, rocks): how strong the motion is, and which rocks stand there."""
 
     strength: Real  # logarithm
     alpha: Real
@@ -61,32 +125,52 @@ class Levels(NamedTuple):
     restitution: Real
 
 
-def levels_around(observations: Observations, scatter: ArrayLike, strength: Real) -> tuple[Levels, Real]:
+def levels_around(
+    observations: Observations, quadrature: Quadrature, scatter: ArrayLike, strength: Real
+) -> tuple[Levels, Real]:
     """Nodes around motions whose logarithm of the strength is known, (...), and how far they are from it, (nodes, ...,
-    rocks), in standard deviations."""
+    possible, rocks), in standard deviations."""
     seen = observations
+    by_alpha, by_p = _as_amplitudes(seen)
+    by_rock = by_alpha**2 + by_p**2
+    variance = scatter**2 + quadrature.absorbed * by_rock
+    # Straight y through quarter points, with the smear, has a variance that is larger by this factor.
+    spread = 1 + quadrature.apart**2 * (_SMEAR**2 - 1 / 48)
+    # A change of the scatter moves weights, and not the nodes: what the intervals between them add stays, too.
+    deviation = jnp.sqrt(variance - jax.lax.stop_gradient((1 - 1 / spread) * variance))
+    step = quadrature.apart * jax.lax.stop_gradient(deviation)
+    strength = strength[..., None, None]
+    base = jnp.floor(jax.lax.stop_gradient(strength) / step)
+    number = np.arange(2 * quadrature.each_side + 2) - quadrature.each_side
+    level = (base + quadrature.phases[:, None] + _in_front(number - 0.5, base[None])) * step
+    where = (level - strength) / deviation
+    length = jnp.sqrt(jnp.where(by_rock > 0, by_rock, 1.0))
+    easier, other, bouncier = quadrature.normals[..., None]
+    offsets = (
+        (-by_alpha * easier + by_p * other) / length * (seen.alpha_sd / seen.alpha),
+        (by_p * easier + by_alpha * other) / length * (seen.p_sd / seen.p),
+        bouncier * seen.restitution_sd,
+    )
+    rocks = (jnp.broadcast_to(x, level.shape) for x in rocks_at(seen, offsets))
+    return Levels(level, *rocks), where
+
+
+def _as_amplitudes(seen: Observations) -> tuple[Real, Real]:
+    """Standard deviations of ln amplitude, (rocks,), that have about the effect of those of alpha and of p."""
     weaker = seen.weaker_alpha
     by_alpha = seen.alpha_sd / seen.alpha * weaker / (jnp.sin(weaker) * jnp.cos(weaker))  # of ln tan(alpha)
-    by_p = _BY_P * seen.p_sd / seen.p
-    variance = scatter**2 + by_alpha**2 + by_p**2
-    # A change of the scatter moves weights, and not the nodes: what the intervals between them add stays, too.
-    deviation = jnp.sqrt(variance - jax.lax.stop_gradient((1 - 1 / _SPREAD**2) * variance))
-    step = _APART * jax.lax.stop_gradient(deviation)
-    strength = strength[..., None]
-    base = jnp.floor(jax.lax.stop_gradient(strength) / step)
-    number = base + _in_front(np.arange(NODES) - _EACH_SIDE, base[None])
-    turned = _FAST * number
-    fast, fastest = _amplitude(_FAST), _amplitude(_FASTEST)
-    offsets = (
-        fast * jnp.cos(turned) * (seen.alpha_sd / seen.alpha),
-        fast * jnp.sin(turned) * (seen.p_sd / seen.p),
-        fastest * jnp.cos(_FASTEST * number) * seen.restitution_sd,
-    )
-    alpha, p, restitution = rocks_at(seen, offsets)
-    # Levels are of strength p^(1/2)/tan(alpha): the same for a slenderer or smaller rock takes less.
-    needs = jnp.log(jnp.tan(weaker * alpha / seen.alpha) / jnp.tan(weaker)) - _BY_P * jnp.log(p / seen.p)
-    where = (number * step - strength) / deviation
-    return Levels(number * step + needs, alpha, p, restitution), where
+    return by_alpha, _BY_P * seen.p_sd / seen.p
+
+
+def are_known_well(observations: Observations, scatter: Real, accuracy: float) -> bool:
+    """Whether rocks are known so well beside the motion at them that one possible rock stands for all."""
+    seen = observations
+    known = seen.alpha, seen.alpha_sd, seen.p, seen.p_sd, seen.restitution_sd, scatter
+    if is_traced(known):
+        return False
+    alpha, alpha_sd, p, p_sd, restitution_sd, scatter = (np.asarray(x) for x in known)
+    by_rock = np.hypot(alpha_sd / np.sin(alpha), _BY_P * p_sd / p)  # tan(alpha), or more where the rock is wide
+    return bool((by_rock <= _WELL_KNOWN * accuracy * scatter).all() and (restitution_sd <= accuracy).all())
 
 
 def rocks_at(observations: Observations, offsets: tuple[Real, Real, Real] | Real) -> tuple[Real, Real, Real]:
@@ -101,7 +185,10 @@ def rocks_at(observations: Observations, offsets: tuple[Real, Real, Real] | Real
 
 
 class Possible(NamedTuple):
-    """What becomes of rocks in possible scenes, (scenes, ..., ways, rocks): the quarter points of intervals."""
+    """What becomes of rocks in possible scenes, (scenes, ..., ways, rocks): the quarter points of intervals.
+
+    Ways are all that is equally likely of a rock: which way round it stands, and which of the possible ones it is.
+    """
 
     weight: Real  # probability of the surroundings of each
     y: Real  # the margin, straightened
@@ -112,9 +199,9 @@ class Possible(NamedTuple):
     rotation_width: Real
 
     @classmethod
-    def of(cls, where, margin, rotation, known, lost, verge) -> "Possible":
-        """From the results at nodes, (nodes, ..., ways, rocks), which are so many standard deviations away; `verge` is
-        the rotation from which a rock at rest overturns.
+    def of(cls, where, margin, rotation, known, lost, verge, apart: float) -> "Possible":
+        """From the results at nodes, (nodes, ..., ways, rocks), which are so many standard deviations away and
+        `apart`; `verge` is the rotation from which a rock at rest overturns.
 
         On the way to overturning the rotation grows without bounds with the amplitude; what is left of the energy to
         overturn, about (1 - rotation/verge)^2, does not, and passes zero with y, of which it is twice as much there.
@@ -125,7 +212,7 @@ class Possible(NamedTuple):
         ends_of_parts = jnp.concatenate([verge[:1], _halves(verge)]), jnp.concatenate([left[:1], _halves(left)])
         y, known = _bridged(_straightened(jnp.where(known, margin, 0.0)), known)
         width = jnp.sqrt((_SMEAR * jnp.diff(y, axis=0)) ** 2 + _LEAST_WIDTH**2)
-        few = _SLOPE_OVER - 1
+        few = min(max(round(_SLOPE_OVER / apart), 1), len(y) - 1)
         # As far apart as they are by this scatter: it changes that, and not the nodes.
         slope = jnp.stack(
             [(y[0] - y[few]) / (where[few] - where[0]), (y[-1 - few] - y[-1]) / (where[-1] - where[-1 - few])]

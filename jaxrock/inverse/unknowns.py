@@ -15,10 +15,12 @@ from jaxrock._described import described
 from jaxrock._quickly import quickly
 from jaxrock.inverse.batches import in_batches
 from jaxrock.inverse.likelihood import Likelihood
+from jaxrock.inverse.scatter import Quadrature
 
 Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
-_LANES = 4  # points in one call of the compiled program
+_LANES = 4  # points in one call of the compiled program with slopes
+_SCANNED = 64  # and of that without
 _FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
 
 
@@ -159,6 +161,18 @@ def _batch(problem: Problem, places: Real, wanted: Flags) -> tuple[Real, Real, t
     return value, back(jnp.ones_like(value))[0], facts
 
 
+@quickly(eqx.filter_jit, follows_scenes=True)
+def _log_density(problem: Problem, places: Real, wanted: Flags) -> Real:
+    return problem.log_density(places, slopes=False, wanted=wanted)
+
+
+def densities(problem: Problem, places: np.ndarray, progress: Callable[[int], None] = lambda more: None) -> np.ndarray:
+    """Log-densities (n,) of a `current` problem at any number of places, (n, parameters), without slopes; minus
+    infinity where there is none."""
+    (found,) = in_batches(lambda *part: [_log_density(problem, *part)], places, _SCANNED, progress)
+    return np.where(np.isnan(found), -np.inf, found)
+
+
 class Evaluator:
     """Values and slopes at any number of points, in batches of one compiled program; it counts.
 
@@ -168,7 +182,9 @@ class Evaluator:
 
     def __init__(self, problem: Problem, progress: Callable[[int], None] = lambda more: None):
         self.problem, self.count, self.progress = problem.current(), 0, progress
+        self._coarse = eqx.tree_at(lambda it: it.likelihood.quadrature, self.problem, Quadrature.coarse())
         self.ends = np.asarray(problem.ends).T
+        self.scanned = np.empty((0, len(problem.names))), np.empty(0)
         self.known = np.empty((0, len(problem.names))), np.empty(0)  # places and values, of all that it was asked for
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -181,6 +197,18 @@ class Evaluator:
         values, slopes = in_batches(lambda *part: _batch(self.problem, *part)[:2], places, _LANES, self.progress)
         self.note(places, values)
         return values, slopes
+
+    def scan(self, places: np.ndarray) -> np.ndarray:
+        """Values at places by few scenes and without slopes: about those of the likelihood, for much less."""
+        values = densities(self._coarse, places, self.progress)
+        self.scanned = np.concatenate([self.scanned[0], places]), np.concatenate([self.scanned[1], values])
+        return values
+
+    @property
+    def scenes(self) -> int:
+        """How many were computed so far."""
+        few, many = (problem.likelihood.scenes for problem in (self._coarse, self.problem))
+        return few * len(self.scanned[1]) + many * self.count
 
     def note(self, places: np.ndarray, values: np.ndarray) -> None:
         """Count, and keep, values at places that somebody else has computed."""
@@ -196,6 +224,20 @@ class Evaluator:
         """`survival`, share of scenes computed, and `surprise` of the likelihood at a place, (rocks,) each."""
         self.count += 1
         return tuple(x[0] for x in in_batches(lambda *part: _batch(self.problem, *part)[2], place[None], _LANES))
+
+    def errors(self, place: np.ndarray) -> tuple[np.ndarray, float]:
+        """Estimated standard errors that the quadrature leaves at a place: of the probabilities that rocks stand,
+        (rocks,), and of the log-likelihood."""
+
+        def found(problem):
+            value, _, facts = _batch(problem, np.tile(place, (_LANES, 1)), np.arange(_LANES) < 1)
+            return np.asarray(value)[0], np.asarray(facts[0])[0]
+
+        drawn = self.problem.likelihood.drawn()
+        self.count += len(drawn)
+        problems = (eqx.tree_at(lambda problem: problem.likelihood, self.problem, each) for each in drawn)
+        values, stands = zip(*map(found, problems))
+        return np.std(stands, axis=0, ddof=1), float(np.std(values, ddof=1))
 
     def places(self, points: np.ndarray) -> np.ndarray:
         """Places of points."""

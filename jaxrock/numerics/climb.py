@@ -18,7 +18,8 @@ _SHORTEST_STEP = 1e-9  # below which there is a jump
 
 # Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
 # points, and finds a higher summit now and then; more starts do, too.
-_HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1))
+_HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1), (30, 0.02), (40, 0.005))
+_PATIENCE, _LEAST_GAIN = 12, 2e-6  # rounds in which a climber must gain so much: at a kink none ends otherwise
 _SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
 _NOWHERE = -1e300  # the value where there is none
 
@@ -38,7 +39,7 @@ def climb(
     starts: np.ndarray,
     free: np.ndarray | bool = True,
     rounds: int = 150,
-    promise: float = 1e-8,
+    promise: float = 1e-7,
     group: np.ndarray | int = 0,
 ) -> Summits:
     """Climb from many starts.
@@ -63,7 +64,7 @@ def climb(
     inverse = np.tile(np.eye(size), (count, 1, 1))  # of minus the Hessian
     fresh, done, arrived = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
     search, step = np.zeros_like(points), np.ones(count)
-    path = []
+    path, since, reached = [], np.zeros(count, int), values.copy()
     for number in range(rounds):
         on_the_way = ~done & (values > _NOWHERE)
         path.append((np.where(done[:, None], np.nan, points), np.where(on_the_way, values, np.nan)))
@@ -74,7 +75,9 @@ def climb(
         level = fresh & ~done & (promised < promise)
         arrived |= level & (values > _NOWHERE)
         done |= level | (step < _SHORTEST_STEP)
-        done |= _given_up(number, points, values, group)
+        gaining = values > reached + _LEAST_GAIN
+        since, reached = np.where(gaining, number, since), np.where(gaining, values, reached)
+        done |= _given_up(number, points, values, group) | (number - since >= _PATIENCE)
         if done.all():
             break
         active = np.flatnonzero(~done)
