@@ -26,7 +26,7 @@ from jaxrock.inverse.kept_spectrum import TOLERANCE, KeptSpectrum
 from jaxrock.inverse.nearest_change import Found, Search, Site, allowed_changes, least_change, rms
 from jaxrock.models.equation import AbstractEquation
 from jaxrock.models.rigid import Housner
-from jaxrock.motions.record import Record
+from jaxrock.motions.record import Record, record_in_g
 from jaxrock.responses.current_model import current_model
 from jaxrock.status import Enumeration, item
 
@@ -321,7 +321,7 @@ def _result(
     }  # fmt: skip
     name = f"{start.name}, changed".removeprefix(", ")
     return FoundRecord(
-        record=start if found is None else Record(start.samples + change, start.dt, name),
+        record=start if found is None else record_in_g(start.samples + change, start.dt, name),
         start=start,
         status=status,
         **placed({name: np.asarray(x) for name, x in numbers.items()}),
