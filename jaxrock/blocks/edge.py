@@ -13,7 +13,7 @@ from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine, sine_cosine_of_any, sine_lag
-from jaxrock.numerics.lookup import count_up_to, pick
+from jaxrock.numerics.lookup import count_up_to, pick, stretch_from
 
 Real = Inexact[Array, "..."]
 
@@ -162,12 +162,8 @@ class EdgePieces(eqx.Module):
     def ahead(self, opening: Real, outward: Bool[Array, ""]) -> tuple["EdgePieces", Real]:
         """Of many pieces the one on which a block rolls from an opening angle on, outward or inward, and the angle at
         which it leaves it; beyond pi/2 where there is none."""
-        rounding = 64 * float(jnp.finfo(opening.dtype).eps)  # so that it never leaves a piece at once
-        piece = count_up_to(self.start, opening * where(outward, 1 + rounding, 1 - rounding)) - 1
-        following = where(outward, piece + 1, piece)
-        inside = (following > 0) & (following < self.start.size)
-        angle = pick(self.start, jnp.clip(following, 0, self.start.size - 1))
-        return self._piece(piece), where(inside & (angle > 0), angle, jnp.pi)
+        piece, angle, ends = stretch_from(self.start, opening, outward)
+        return self._piece(piece), where(ends, angle, jnp.pi)
 
     def _piece(self, index: Int[Array, ""]) -> "EdgePieces":
         start, slope, *numbers = (pick(x, jnp.maximum(index, 0)) for x in (self.start, self.slope, *self.before))
