@@ -162,11 +162,13 @@ class EdgePieces(eqx.Module):
     def ahead(self, opening: Real, outward: Bool[Array, ""]) -> tuple["EdgePieces", Real]:
         """Of many pieces the one on which a block rolls from an opening angle on, outward or inward, and the angle at
         which it leaves it; beyond pi/2 where there is none."""
-        piece, angle, ends = stretch_from(self.start, opening, outward)
+        piece, angle, ends = stretch_from(cast(Array, self.start), opening, outward)
         return self._piece(piece), where(ends, angle, jnp.pi)
 
     def _piece(self, index: Int[Array, ""]) -> "EdgePieces":
-        start, slope, *numbers = (pick(x, jnp.maximum(index, 0)) for x in (self.start, self.slope, *self.before))
+        start, slope, *numbers = (
+            pick(x, jnp.maximum(index, 0)) for x in (cast(Array, self.start), self.slope, *self.before)
+        )
         return EdgePieces(start, Rounded(*numbers), slope)
 
 

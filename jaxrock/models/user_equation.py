@@ -1,15 +1,16 @@
 """An equation of motion of the user's own, written as functions."""
 
 from collections.abc import Callable
+from typing import cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock._arguments import arguments
-from jaxrock._checks import checked, positive
+from jaxrock._checks import Values, checked, positive
 from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
@@ -65,7 +66,7 @@ class Equation(AbstractEquation):
         *,
         acceleration: Callable | None = None,
         falls_flat: bool = True,
-        bends: ArrayLike | None = None,
+        bends: Values | None = None,
     ):
         if (restoring is None) == (acceleration is None) or (acceleration is not None and (arm or dissipation)):
             raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
@@ -74,9 +75,10 @@ class Equation(AbstractEquation):
         self._falls_flat, self.bends = falls_flat, None
         if bends is not None:
             set_parameters(self, bends=bends)
-            if self.bends.ndim != 1:
-                raise ValueError(f"Argument `bends` must be a list of angles, but has shape {self.bends.shape}.")
-            self.bends = checked("bends", self.bends, "grow from each to the next", _grow)
+            angles = cast(Array, self.bends)
+            if angles.ndim != 1:
+                raise ValueError(f"Argument `bends` must be a list of angles, but has shape {angles.shape}.")
+            self.bends = checked("bends", angles, "grow from each to the next", _grow)
 
     def moments(self, block: Block | Side) -> "FunctionMoments":
         """What the engine asks of the equation, for one block."""
@@ -206,7 +208,7 @@ class FunctionMoments(AbstractMoments):
 
     def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["FunctionMoments", Scalar]:
         """As for any moments."""
-        starts = jnp.concatenate([jnp.zeros(1, opening.dtype), self.bends_at])
+        starts = jnp.concatenate([jnp.zeros(1, opening.dtype), cast(Array, self.bends_at)])
         number, angle, ends = stretch_from(starts, opening, outward)
         inside = 4 * float(jnp.finfo(opening.dtype).eps)  # where it bends a function is of one side or the other
         low, high = pick(starts, number), pick(jnp.append(starts, 4.0), number + 1)

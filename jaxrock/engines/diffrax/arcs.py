@@ -5,8 +5,8 @@ an angle at which the moments bend, a knot of the motion. All are roots of one f
 that are positive at first. A guard that starts at zero (the opening angle after an impact, the velocity after a turning
 point) is divided by the power of time with which it leaves zero, so that a hop of any size is seen and its start is not
 an event. The signs of velocity and acceleration are guards too, so that a dip through the ground inside one step cannot
-hide: it needs a turning point. Knots and bends end arcs, so that the right-hand side of every solve is smooth: a step across a
-jump of its derivative keeps values within the tolerance, but not slopes.
+hide: it needs a turning point. Knots and bends end arcs, so that the right-hand side of every solve is smooth: a step
+across a jump of its derivative keeps values within the tolerance, but not slopes.
 """
 
 from collections.abc import Callable
