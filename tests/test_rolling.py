@@ -4,7 +4,9 @@ The judge knows no height of the centre of mass as a function of the angle: it s
 a circle that rolls without slipping (`Wheel`).
 """
 
+import json
 import warnings
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -389,6 +391,90 @@ def test_slopes_of_an_outcome_by_a_radius_of_many():
     (value, slope), (above, _), (below, _) = map(peak, (1.0, 1.0005, 0.9995))
     assert 0.005 < float(value) < 0.2
     assert float(slope) == pytest.approx(float(above - below) / 1e-3, rel=1e-5)
+
+
+KNOWN = json.loads((Path(rolling.__file__).parent / "rolling_lists.json").read_text())["scenes"]
+PULSES = {"sine": rk.SinePulse, "cosine": rk.CosinePulse, "ricker symmetric": rk.RickerPulse}
+
+
+def scene_of(known):
+    """A function that makes block, motion and model of the numbers of a reference, in its order; and these numbers."""
+    first = known["block"] + known["motion"]
+    end = len(first) + len(known["radius"])
+
+    def made(numbers):
+        alpha, p, restitution, ratio, amplitude, length = numbers[: len(first)]
+        edge = rk.blocks.Edge(numbers[len(first) : end], numbers[end:]) if known["angle"] else numbers[len(first)]
+        motion = PULSES[known["kind"]](amplitude, length)
+        return rk.Block(alpha, p, restitution), motion, rk.models.Rolling(edge, inertia_ratio=ratio)
+
+    return made, np.array(first + known["radius"] + known["angle"])
+
+
+def agrees(known, names, found, slopes, within, slopes_within):
+    """Values, and slopes by all numbers but an angle of zero: relative to themselves, or to a value over a number."""
+    numbers = scene_of(known)[1]
+    moving = np.flatnonzero(numbers)
+    for name, value, row in zip(names, found, slopes, strict=True):
+        exact, gradient = float(known[name]["value"]), np.array(known[name]["gradient"], float)[moving]
+        assert float(value) == pytest.approx(exact, rel=within), name
+        scale = np.maximum(np.abs(gradient), np.abs(exact / numbers[moving]) / 100)
+        np.testing.assert_allclose((np.asarray(row)[moving] - gradient) / scale, 0, atol=slopes_within, err_msg=name)
+
+
+@pytest.mark.parametrize("index", [8, *(pytest.param(k, marks=pytest.mark.slow) for k in range(len(KNOWN)) if k != 8)])
+def test_slopes_on_lists_beside_more_digits(index):
+    """Peak, its time and margin, by block, pulse, and every radius and angle of the edge."""
+    known, names = KNOWN[index], ("max_rotation", "time_of_max", "margin")
+    made, numbers = scene_of(known)
+
+    def told(numbers):
+        found = rk.outcome(*made(numbers), **EXACT)
+        told = jnp.stack([getattr(found, name) for name in names])
+        return told, (told, found.status)
+
+    slopes, (found, status) = jax.jit(jax.jacfwd(told, has_aux=True))(numbers)
+    assert bool(status == rk.Status.successful)
+    agrees(known, names, found, slopes, 1e-9, 3e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", [1, 6, 17])
+def test_histories_on_lists_beside_more_digits(index):
+    """A rotation on the way, and the last impact before."""
+    known, names = KNOWN[index], ("rotation", "last_impact")
+    made, numbers = scene_of(known)
+
+    def told(numbers):
+        response = rk.simulate(*made(numbers), duration=known["at"], **EXACT)
+        told = jnp.stack([response.rotation[-1], response.impact_times[known["impacts"] - 1]])
+        return told, (told, response.impact_count)
+
+    slopes, (found, count) = jax.jacfwd(told, has_aux=True)(numbers)
+    assert int(count) == known["impacts"]
+    agrees(known, names, found, slopes, 1e-9, 1e-8)
+
+
+def test_slopes_do_not_depend_on_the_tolerance():
+    """A step across an angle of the list would leave them 3e-4 off; in lanes they are the same."""
+    pulse, edge = (
+        rk.MavroeidisPapageorgiouPulse(0.6, 0.9, 6.0),
+        rk.blocks.Edge([0.795, 0.335, 0.732], [0, 0.051, 0.163]),
+    )
+    peak = lambda alpha: rk.outcome(rk.Block(alpha, 2.77), pulse, rk.models.Rolling(edge)).max_rotation
+    for slope in (jax.jacfwd(peak)(0.3442), *jax.vmap(jax.grad(peak))(jnp.array([0.3442, 0.3442]))):
+        assert float(slope) == pytest.approx(-6.1191421, rel=3e-7)
+
+
+def test_a_free_block_passes_its_balance_on_a_list():
+    """Its acceleration is zero there, and angles of the list come soon after: of 200 blocks none is lost."""
+    random, angle = np.random.default_rng(1), np.linspace(0.0, 0.5, 12)
+    alpha, scale, p = random.uniform(0.12, 0.3, 200), random.uniform(0.6, 1.6, 200), random.uniform(1.5, 4.0, 200)
+    model = rk.models.Rolling(rk.blocks.Edge(0.3 + 0.15 * np.cos(7 * angle), angle))
+    pulse = lambda scale: rk.SinePulse(0.4 * scale, 0.9) + rk.SinePulse(0.3, 0.5)
+    found = jax.vmap(lambda a, p, s: rk.outcome(rk.Block(a, p), pulse(s), model))(alpha, p, scale)
+    assert bool((found.status == rk.Status.successful).all())
+    assert int(found.overturned.sum()) == 168
 
 
 trimesh = pytest.importorskip("trimesh")

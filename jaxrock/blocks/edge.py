@@ -6,13 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int
 
 from jaxrock._checks import Values, checked, not_negative, one_program, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine, sine_cosine_of_any, sine_lag
-from jaxrock.numerics.lookup import count_up_to, pick
+from jaxrock.numerics.lookup import count_up_to, pick, stretch_from
 
 Real = Inexact[Array, "..."]
 
@@ -130,7 +131,8 @@ class Rounded(NamedTuple):
 
 class EdgePieces(eqx.Module):
     """An edge in pieces on which its radius is linear in the opening angle: where they start (None: a circle, which is
-    one), what the edge has added before, and the slope of its radius."""
+    one), what the edge has added before, and the slope of its radius. One of many pieces is such an edge, too, whose
+    numbers are scalars."""
 
     start: Real | None
     before: Rounded
@@ -145,17 +147,29 @@ class EdgePieces(eqx.Module):
         """What the edge has added at one opening angle."""
         if self.start is None:
             return _added(opening, self.before.radius, self.slope)
-        piece = jnp.maximum(count_up_to(self.start, opening) - 1, 0)
-        start, slope, *numbers = (pick(x, piece) for x in (self.start, self.slope, *self.before))
-        before, beyond = Rounded(*numbers), opening - start
+        if self.start.ndim:
+            return self._piece(count_up_to(self.start, opening) - 1).at(opening)
+        before, beyond = self.before, opening - self.start
         sine, cosine = sine_cosine(beyond)
-        added = _added(beyond, before.radius, slope)
+        added = _added(beyond, before.radius, self.slope)
         return Rounded(
             before.rise * cosine + before.run * sine + added.rise,
             before.run * cosine - before.rise * sine + added.run,
             before.length + added.length,
             added.radius,
         )
+
+    def ahead(self, opening: Real, outward: Bool[Array, ""]) -> tuple["EdgePieces", Real]:
+        """Of many pieces the one on which a block rolls from an opening angle on, outward or inward, and the angle at
+        which it leaves it; beyond pi/2 where there is none."""
+        piece, angle, ends = stretch_from(cast(Array, self.start), opening, outward)
+        return self._piece(piece), where(ends, angle, jnp.pi)
+
+    def _piece(self, index: Int[Array, ""]) -> "EdgePieces":
+        start, slope, *numbers = (
+            pick(x, jnp.maximum(index, 0)) for x in (cast(Array, self.start), self.slope, *self.before)
+        )
+        return EdgePieces(start, Rounded(*numbers), slope)
 
 
 def _added(angle: Real, radius: Real, slope: Real) -> Rounded:

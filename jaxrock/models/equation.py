@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock._parameters import Owner, check_declared
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -111,6 +111,16 @@ class AbstractMoments(eqx.Module):
         from there."""
         nodes, weights = (jnp.asarray(values, opening.dtype) for values in _GAUSS)
         return opening * jnp.sum(weights * jax.vmap(lambda x: self.restoring(Angle.of(x)))(opening * nodes))
+
+    @property
+    def bends(self) -> int:
+        """At how many opening angles at most a derivative of these moments jumps."""
+        return 0
+
+    def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["AbstractMoments", Scalar]:
+        """Of moments that bend: those that act from an opening angle on, outward or inward, as if they went on without
+        a bend, and the angle at which they bend next; beyond pi/2 where they do not."""
+        raise NotImplementedError
 
     def rolled(self, angle: Angle) -> Rolled | None:
         """Where the centre of mass is at an opening angle; None for a block that turns about its corner."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._arguments import arguments
 from jaxrock._checks import one_program
@@ -103,6 +103,16 @@ class RollingMoments(AbstractMoments):
     def times(self, factor: Scalar | float) -> "RollingMoments":
         """As for any moments."""
         return replace(self, factor=factor * self.factor)
+
+    @property
+    def bends(self) -> int:
+        """As for any moments: the angles of a list."""
+        return 0 if self.pieces.start is None else self.pieces.start.size
+
+    def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["RollingMoments", Scalar]:
+        """As for any moments."""
+        piece, angle = self.pieces.ahead(opening, outward)
+        return replace(self, pieces=piece), angle
 
     def rolled(self, angle: Angle) -> Rolled:
         """Where the centre of mass is over the point of contact."""

@@ -1,16 +1,22 @@
 """An equation of motion of the user's own, written as functions."""
 
 from collections.abc import Callable
+from typing import cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Inexact
 
 from jaxrock._arguments import arguments
+from jaxrock._checks import Values, checked, positive
+from jaxrock._parameters import parameter, set_parameters
 from jaxrock.blocks.restitution import Constant
 from jaxrock.blocks.rigid import Block, Side
 from jaxrock.models.equation import AbstractEquation, AbstractMoments, Angle, Scalar, first_zero, last_rise
+from jaxrock.numerics.choice import where
+from jaxrock.numerics.lookup import pick, stretch_from
 
 _CREEP = 1e-30  # a velocity at which nothing but what jumps is felt
 
@@ -29,14 +35,19 @@ class Equation(AbstractEquation):
     - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
     - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
     - `falls_flat`: whether a rotation of pi/2 means that the block lies on its side.
+    - `bends`: (k,) opening angles [rad], above 0 and growing, at which a derivative of the functions jumps (where a
+      stop is touched, say): steps end there. None: nowhere.
 
     A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
-    The functions must be smooth (dry friction is nearly k tanh(v/w), with a small w), work on JAX arrays, and be
-    defined somewhat beyond 0 and pi/2. Functions that are Equinox modules may carry parameters to differentiate. They
-    may read what changes: every call of the package sees them as they are then (within a function of yours under
-    `jax.jit`, as when that was traced). A block that has stopped below its unstable equilibrium after the motion
-    counts as safe: what dissipates does not lift.
+    The functions must be smooth but for these angles (dry friction is nearly k tanh(v/w), with a small w), work on JAX
+    arrays, and be defined somewhat beyond 0 and pi/2. They must not jump. Where they bend at an angle that `bends` does
+    not tell, values keep the tolerance, but slopes are off by 1e-5 to 1e-3, with no sign of it.
+
+    Functions that are Equinox modules may carry parameters to differentiate. They may read what changes: every call of
+    the package sees them as they are then (within a function of yours under `jax.jit`, as when that was traced). A
+    block that has stopped below its unstable equilibrium after the motion counts as safe: what dissipates does not
+    lift.
 
     **Raises:** ValueError where neither or both ways are used; where it is used for a block that does not stand by it,
     or if its dissipation jumps at rest or its acceleration is not linear in the push.
@@ -44,6 +55,7 @@ class Equation(AbstractEquation):
 
     _acceleration: Callable
     _falls_flat: bool = eqx.field(static=True)
+    bends: Inexact[Array, " bends"] | None = parameter("rad", positive, axes=1)
 
     @arguments
     def __init__(
@@ -54,16 +66,23 @@ class Equation(AbstractEquation):
         *,
         acceleration: Callable | None = None,
         falls_flat: bool = True,
+        bends: Values | None = None,
     ):
         if (restoring is None) == (acceleration is None) or (acceleration is not None and (arm or dissipation)):
             raise ValueError("Give either `restoring` (with `arm` and `dissipation`) or `acceleration`.")
         parts = (restoring, arm, dissipation) if acceleration is None else (acceleration,)
         self._acceleration = Functions(parts)
-        self._falls_flat = falls_flat
+        self._falls_flat, self.bends = falls_flat, None
+        if bends is not None:
+            set_parameters(self, bends=bends)
+            angles = cast(Array, self.bends)
+            if angles.ndim != 1:
+                raise ValueError(f"Argument `bends` must be a list of angles, but has shape {angles.shape}.")
+            self.bends = checked("bends", angles, "grow from each to the next", _grow)
 
     def moments(self, block: Block | Side) -> "FunctionMoments":
         """What the engine asks of the equation, for one block."""
-        return FunctionMoments(self._acceleration, block)
+        return FunctionMoments(self._acceleration, block, bends_at=self.bends)
 
     def at_rest(self, block: Block | Side) -> tuple[Scalar, Scalar]:
         """Restoring moment and overturning arm just after uplift, which must be positive."""
@@ -138,13 +157,22 @@ class FunctionMoments(AbstractMoments):
     function: Callable
     block: Block | Side
     factor: Scalar | float | None  # of all accelerations (see `times`)
+    bends_at: Inexact[Array, " bends"] | None
+    stretch: tuple[Scalar, Scalar] | None  # beyond it the function goes on as a straight line; None: nowhere
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
     firm: Scalar  # up to where it may right itself again (`last_rise`)
 
-    def __init__(self, function: Callable, block: Block | Side, factor: Scalar | float | None = None):
+    def __init__(
+        self,
+        function: Callable,
+        block: Block | Side,
+        factor: Scalar | float | None = None,
+        bends_at: Inexact[Array, " bends"] | None = None,
+    ):
         self.function, self.block, self.factor = function, as_functions_see(block), factor
+        self.bends_at, self.stretch = bends_at, None
         zero = Angle.of(jnp.zeros_like(block.alpha))
         # What does not stand has no threshold (`standing` raises before).
         self.restoring_at_rest, self.arm_at_rest = (
@@ -161,12 +189,32 @@ class FunctionMoments(AbstractMoments):
     def _value(self, angle: Angle, velocity: Scalar, push: Scalar) -> Scalar:
         if self.factor is not None:  # the function's own unit of time is that of its side
             velocity = velocity / jnp.sqrt(self.factor)
-        value = jnp.asarray(self.function(angle.value, velocity, push, self.block), self.block.alpha.dtype)
+
+        def of(x):
+            return jnp.asarray(self.function(x, velocity, push, self.block), self.block.alpha.dtype)
+
+        value = of(angle.value) if self.stretch is None else _straight_beyond(*self.stretch, of, angle.value)
         return value if self.factor is None else self.factor * value
 
     def times(self, factor: Scalar | float) -> "FunctionMoments":
         """As for any moments."""
-        return FunctionMoments(self.function, self.block, factor if self.factor is None else factor * self.factor)
+        factor = factor if self.factor is None else factor * self.factor
+        return FunctionMoments(self.function, self.block, factor, self.bends_at)
+
+    @property
+    def bends(self) -> int:
+        """As for any moments."""
+        return 0 if self.bends_at is None else self.bends_at.size
+
+    def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["FunctionMoments", Scalar]:
+        """As for any moments."""
+        starts = jnp.concatenate([jnp.zeros(1, opening.dtype), cast(Array, self.bends_at)])
+        number, angle, ends = stretch_from(starts, opening, outward)
+        inside = 4 * float(jnp.finfo(opening.dtype).eps)  # where it bends a function is of one side or the other
+        low, high = pick(starts, number), pick(jnp.append(starts, 4.0), number + 1)
+        stretch = where(number == 0, -1.0, low * (1 + inside)), high * (1 - inside)
+        moments = eqx.tree_at(lambda m: m.stretch, self, stretch, is_leaf=lambda x: x is None)
+        return moments, where(ends, angle, jnp.pi)
 
     def restoring(self, angle: Angle) -> Scalar:
         """Restoring moment over m g R at an opening angle."""
@@ -200,3 +248,15 @@ class FunctionMoments(AbstractMoments):
     def unheld_manifold(self, angle: Angle, hold: Scalar, push: Scalar, weight: Scalar | None = None) -> Scalar:
         """As for any moments."""
         return jnp.where(angle.value < self.firm, jnp.inf, 0.0)
+
+
+def _straight_beyond(low: Scalar, high: Scalar, function: Callable, x: Scalar) -> Scalar:
+    """A function of a number, whose tangents go on where it is not asked."""
+    inside = where(x < low, low, where(x > high, high, x))
+    value, slope = jax.jvp(function, (inside,), (jnp.ones_like(inside),))
+    return value + slope * (x - inside)
+
+
+def _grow(angles):
+    arrays = np if isinstance(angles, np.ndarray) else jnp  # NumPy compiles nothing
+    return angles[1:] > angles[:-1] if angles.size > 1 else arrays.ones(1, bool)

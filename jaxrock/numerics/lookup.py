@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Int, Shaped
 
 from jaxrock.numerics.choice import where
 
@@ -33,3 +33,19 @@ def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Ar
 
     ends = jnp.int32(0), jnp.int32(values.shape[0])
     return jax.lax.while_loop(lambda carry: carry[0] < carry[1], halved, ends)[0]
+
+
+def stretch_from(
+    starts: Shaped[Array, " n"], x: Shaped[Array, ""], upward: Bool[Array, ""]
+) -> tuple[Int[Array, ""], Shaped[Array, ""], Bool[Array, ""]]:
+    """The stretch between sorted numbers that is gone through from x on, upward or downward, and where it ends.
+
+    **Arguments:** `starts`: of the stretches, 0 or more, the first 0.
+
+    **Returns:** its number; its end, beyond x by more than rounding; whether there is one above 0.
+    """
+    rounding = 64 * float(jnp.finfo(x.dtype).eps)
+    stretch = jnp.maximum(count_up_to(starts, x * where(upward, 1 + rounding, 1 - rounding)) - 1, 0)
+    following = where(upward, stretch + 1, stretch)
+    end = pick(starts, jnp.minimum(following, starts.size - 1))
+    return stretch, end, (following < starts.size) & (end > 0)

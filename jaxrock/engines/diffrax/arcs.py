@@ -1,11 +1,12 @@
 """The diffrax engine: one `diffrax.diffeqsolve` for each smooth arc of a rocking block.
 
 An arc runs from one event to the next: impact, turning point, velocity extremum, saddle crossing, certain loss,
-a knot of the motion. All are roots of one function, the smallest of a few guards that are positive at first.
-A guard that starts at zero (the opening angle after an impact, the velocity after a turning point) is divided by
-the power of time with which it leaves zero, so that a hop of any size is seen and its start is not an event. The
-signs of velocity and acceleration are guards too, so that a dip through the ground inside one step cannot hide: it
-needs a turning point. Knots end arcs, so that the right-hand side of every solve is smooth.
+an angle at which the moments bend, a knot of the motion. All are roots of one function, the smallest of a few guards
+that are positive at first. A guard that starts at zero (the opening angle after an impact, the velocity after a turning
+point) is divided by the power of time with which it leaves zero, so that a hop of any size is seen and its start is not
+an event. The signs of velocity and acceleration are guards too, so that a dip through the ground inside one step cannot
+hide: it needs a turning point. Knots and bends end arcs, so that the right-hand side of every solve is smooth: a step
+across a jump of its derivative keeps values within the tolerance, but not slopes.
 """
 
 from collections.abc import Callable
@@ -144,7 +145,9 @@ class Diffrax(AbstractEngine):
 
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of solves."""
-        return self.max_solves or POLICY.solves + 4 * scene.most_pieces
+        usual = POLICY.solves + 4 * scene.most_pieces
+        # From impact to impact it is four arcs or so, and passes twice where the moments bend; a history keeps all.
+        return self.max_solves or usual + scene.moments.bends * (64 if history else usual // 2)
 
     def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:
         """A loop that goes with the adjoint."""
@@ -325,7 +328,7 @@ class ArcStepper(AbstractStepper):
         whole = room <= share
         length = scene.p * jnp.where(whole, room, jax.lax.stop_gradient(share))
         arc = Arc.of(scene, state, forcing, self.history)
-        arc = replace(arc, hop=is_hop(self, state, arc.start_acceleration, forcing))
+        arc = replace(arc, hop=is_hop(self, state, arc))
         eps = float(jnp.finfo(scene.p.dtype).eps)
         event = diffrax.Event(first_guard, Illinois(rtol=4 * eps, atol=0.0), direction=False)
         solution, time, y = engine.locate(arc, engine.limits(scene, state.piece), length, event)
@@ -349,6 +352,8 @@ class ArcStepper(AbstractStepper):
         spread = errors_after(self, state, Angle.of(state.opening), forcing.shaking.now, elapsed, (off[0], off[1]))
         moved = time > 0
         opening, velocity = landed(scene, hits, y[0], y[1])
+        if arc.bend is not None:
+            opening = jnp.where(fired[-1], arc.bend, opening)
         after = replace(
             state,
             piece=piece,

@@ -16,6 +16,7 @@ from jaxrock.engines.stepper import AbstractStepper
 from jaxrock.models.equation import AbstractMoments, Angle
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.shaking import Shaking
+from jaxrock.numerics.choice import where
 from jaxrock.status import still_where
 
 Scalar = Inexact[Array, ""]
@@ -83,14 +84,14 @@ class Forcing(eqx.Module):
         return jax.tree.map(lambda rate: rate / self.unit, self.shaking.steepest(0.25))
 
 
-def is_hop(stepper: AbstractStepper, state: State, acceleration: Scalar, forcing: Forcing) -> Flag:
+def is_hop(stepper: AbstractStepper, state: State, arc: "Arc") -> Flag:
     """Whether a block that leaves the ground comes back at once, without a peak or a speed that matters.
 
     From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
     than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
     faster than 2 v.
     """
-    moments, v = stepper.scene.moments, state.velocity
+    moments, v, forcing, acceleration = stepper.scene.moments, state.velocity, arc.forcing, arc.start_acceleration
     back = jnp.where(acceleration < 0, -acceleration, 1.0)
     flight, height = 4 * v / (back * stepper.scene.p), v * v / back
     weight = forcing.shaking.now[1]
@@ -100,6 +101,8 @@ def is_hop(stepper: AbstractStepper, state: State, acceleration: Scalar, forcing
     least = (moments.restoring(Angle.of(jnp.minimum(height, moments.saddle))) / moments.restoring_at_rest) ** 2
     small = (height <= 0.999 * state.peak) & (2 * v <= state.fastest) & (least >= state.closeness)
     starts = (state.opening == 0) & (v > 0) & (acceleration < 0)
+    if arc.bend is not None:
+        small = small & (height < arc.bend)
     return starts & certain & small & (not stepper.history)
 
 
@@ -117,6 +120,7 @@ class Arc(eqx.Module):
     helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
     hop: Flag  # too small for its turning point to matter, and certain to come back
     flat: Flag  # whether a rotation of pi/2 ends it
+    bend: Scalar | None  # opening angle at which its moments would bend; None: they are smooth everywhere
 
     @classmethod
     def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "Arc":
@@ -124,7 +128,8 @@ class Arc(eqx.Module):
         zero, no = jnp.zeros_like(start.opening), jnp.zeros_like(start.opening, bool)
         flat = (start.opening < jnp.pi / 2) & (history or scene.falls_flat)
         state = start.side, start.opening, start.velocity
-        arc = cls(scene.moments, forcing, *state, zero, zero, zero, scene.outlook.most_helpful(start.piece), no, flat)
+        moments, bend = _smooth(scene.moments, start, forcing)
+        arc = cls(moments, forcing, *state, zero, zero, zero, scene.outlook.most_helpful(start.piece), no, flat, bend)
         y = jnp.stack([start.opening, start.velocity])
         acceleration, jerk = jax.jvp(arc.acceleration, (zero, y), (zero + 1, arc.flow(zero, y)))
         # What is zero by continuity, or but for rounding, is zero: its sign would mean nothing.
@@ -165,18 +170,20 @@ class Arc(eqx.Module):
         return self.leaving & (self.start_acceleration == 0) & ((self.start_jerk <= 0) | nothing)
 
     def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
-        """One for every event, in the order of `Events`, and one for certain loss: the first at zero ends the arc.
-        All start above zero."""
+        """One for every event, in the order of `Events`, one for certain loss, and one where its moments bend: the
+        first at zero ends the arc. All start above zero."""
         jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
         # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
         rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
         most = self.noise / (_NOISE * jnp.finfo(self.noise.dtype).eps)
         directed = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
+        # From the saddle on it is first so little beyond that rounding decides; an end of a piece may be near there.
+        beyond = True if self.bend is None else (self.gap(self.opening) != 0) | (self.gap(y[0]) != 0)
         guards = Events(
             impact=_guard(time, y[0], [jets[0], jets[1], jets[2] / 2, jets[3] / 6], True),
             turning=_guard(time, y[1], [jets[1], jets[2], jets[3] / 2], ~self.hop),
             extremum=jnp.where(self.hop, 1.0, directed / most),
-            saddle=_guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), jets[1]], True),
+            saddle=_guard(time, y[0] - self.moments.saddle, [self.gap(self.opening), jets[1]], beyond),
             flat=_guard(time, jnp.pi / 2 - y[0], [jnp.pi / 2 - self.opening], self.flat),
         )
         held = self._hold(self.opening)
@@ -184,11 +191,24 @@ class Arc(eqx.Module):
         if self.helpful[1] is not None:
             forced = forced | (self.helpful[1] != 1)
         # The arc that ends here leaves a rest that rounding makes: the next must not end at once, and all after it.
-        return jnp.stack([*guards, _guard(time, self._hold(y[0]), [held], forced & (held > self.noise))])
+        lost = _guard(time, self._hold(y[0]), [held], forced & (held > self.noise))
+        if self.bend is None:
+            return jnp.stack([*guards, lost])
+        return jnp.stack([*guards, lost, _guard(time, self.bend - y[0], [self.bend - self.opening], True)])
 
     def _hold(self, opening: Scalar) -> Scalar:
         """What the restoring moment and the most helpful forcing do against overturning."""
         return -self.moments.acceleration(Angle.of(opening), jnp.zeros_like(opening), *self.helpful)
+
+
+def _smooth(moments: AbstractMoments, start: State | Node, forcing: Forcing) -> tuple[AbstractMoments, Scalar | None]:
+    """The moments of an arc, which are smooth, and where they would bend. A turning point ends an arc: it goes outward
+    all the way, or inward."""
+    if not moments.bends:
+        return moments, None
+    acceleration, weight = forcing(jnp.zeros_like(start.opening))
+    begins = moments.acceleration(Angle.of(start.opening), start.velocity, start.side * acceleration, weight)
+    return moments.ahead(start.opening, where(start.velocity == 0, begins >= 0, start.velocity > 0))
 
 
 def _guard(time: Scalar, value: Scalar, jet: list[Scalar], active: Flag | bool) -> Scalar:
