@@ -62,7 +62,28 @@ def under_usual_settings(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return run
 
 
-# ------------------------------------------------------------------------------------- what is wider than the session
+# ------------------------------------------------------------------------------------------ the precision of a session
+
+
+def kept_by_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function that makes arrays of NumPy for programs of JAX: they are kept, those of single and of double
+    precision apart.
+
+    JAX keeps what it makes of an array of NumPy in a program, and gives it to every later program that holds the same
+    array, also after `jax_enable_x64` has changed: that program would not compile, or compute in single precision. Such
+    an array of a module comes to programs by `jnp.asarray`.
+    """
+
+    @functools.cache
+    def kept(double: bool, args: tuple, named: tuple) -> Any:
+        return function(*args, **dict(named))
+
+    @functools.wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        config: Any = jax.config
+        return kept(config.jax_enable_x64, args, tuple(kwargs.items()))
+
+    return run
 
 
 def is_wider(x: Any) -> bool:

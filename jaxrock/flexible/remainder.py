@@ -175,7 +175,7 @@ class _Step(eqx.Module):
         numbers, path, n = self.tangents.numbers, self.path, self.tangents.numbers.rotation.size
         onto, turned = path.phase.project[:, n:-1], path.phase.project[:, -1]
         total = force + shift[:, None] * (numbers.rotation * numbers.squares)
-        drive = self.length * (total @ onto.T) - (_SLOPE @ shift)[:, None] * turned
+        drive = self.length * (total @ onto.T) - (jnp.asarray(_SLOPE, shift.dtype) @ shift)[:, None] * turned
         answer = jnp.einsum("jtm,jm->tm", self.answers, drive)
         slow, start = jnp.abs(path.exponents) < 1, -turned * shift[0]
         amplitudes = path.amplitudes + jnp.where(slow, 0.0, start - answer[0])
@@ -192,7 +192,7 @@ class _Step(eqx.Module):
         state = path.center + (modes @ path.phase.modes.T).real
         rate = ((waves * path.exponents + slopes @ coefficients) @ path.phase.modes.T).real
         state = state.at[:, -1].add(table[:, :POINTS] @ shift)
-        rate = rate.at[:, -1].add(table[:, :POINTS] @ (_SLOPE @ shift))
+        rate = rate.at[:, -1].add(table[:, :POINTS] @ (jnp.asarray(_SLOPE, shift.dtype) @ shift))
         found = jax.vmap(self.tangents.remainder, (0, 0, 0, None))(state, rate / self.length, self.ground, self.side)
         return found, modes
 

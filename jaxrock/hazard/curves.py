@@ -24,7 +24,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 Real = Inexact[Array, "..."]
 Number = Inexact[Array, ""]
-_NODES, _WEIGHTS = gauss_legendre(20)
+_ORDER = 20  # of the quadrature between levels
 
 
 class HazardCurve(eqx.Module):
@@ -182,6 +182,7 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     levels and knots it is as gentle as a polynomial.
     """
     known, exponents = power_laws(curve)
+    points, weights = gauss_legendre(_ORDER)
     logarithms = jnp.log(curve.levels)
     breaks, low, high = jnp.log(knots), logarithms[0], logarithms[-1]
     breaks = jnp.where(breaks <= low, low, jnp.where(breaks >= high, high, breaks))
@@ -192,11 +193,11 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     middle, half = (breaks[1:] + breaks[:-1]) / 2, (breaks[1:] - breaks[:-1]) / 2
     interval = jnp.clip(passed - 1, 0, known.size - 1)
     start, exponent = jnp.where(known, curve.rates[:-1], 0.0)[interval], exponents[interval]
-    nodes = middle[:, None] + half[:, None] * _NODES
+    nodes = middle[:, None] + half[:, None] * points
     density = (start * exponent)[:, None] * jnp.exp(-exponent[:, None] * (nodes - logarithms[interval][:, None]))
     # What exceeds the last known level counts there.
     last = jnp.isfinite(curve.rates) & (curve.rates > 0) & (jnp.append(curve.rates[1:], 0.0) == 0)
     return (
         jnp.concatenate([jnp.exp(nodes).ravel(), curve.levels]),
-        jnp.concatenate([(half[:, None] * _WEIGHTS * density).ravel(), jnp.where(last, curve.rates, 0.0)]),
+        jnp.concatenate([(half[:, None] * weights * density).ravel(), jnp.where(last, curve.rates, 0.0)]),
     )
