@@ -2,8 +2,8 @@
 
 Some settings make JAX stricter: it raises for every NaN (`jax_debug_nans`), for operands of two types
 (`jax_numpy_dtype_promotion`), for numbers that go to a device unasked (`jax_transfer_guard`). They find mistakes in the
-code that their user writes. Results of this package hold NaN and infinity by contract, beside a status that says so. Its
-own programs mix types and place numbers on purpose. So public functions, and the rules by which JAX transforms and
+code that their user writes. Results of this package hold NaN and infinity by contract, beside a status that says so.
+Its own programs mix types and place numbers on purpose. So public functions, and the rules by which JAX transforms and
 compiles them, run under the usual settings; the user's code around them keeps its own. JAX keeps each of these settings
 by thread, and nothing global changes.
 """

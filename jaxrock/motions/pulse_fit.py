@@ -167,7 +167,7 @@ class _Problem(NamedTuple):
 
         names = self.kind.names
         places = np.array(list(itertools.product(*map(self._tried, range(len(names))))))
-        seen, size, found = np.asarray(_models(self.kind, places, self.times)), self.target.size, []
+        seen, size, found = np.asarray(_models(self.kind, places, self.times), float), self.target.size, []
         allowed = (self.times >= self.lower[-1] - 1e-9) & (self.times <= self.upper[-1] + 1e-9)
         for place, one in zip(places, seen):
             products = correlate(self.target, one, method="fft")[size - 1 :]

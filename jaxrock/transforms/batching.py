@@ -14,11 +14,11 @@ Which way `Lanes.__call__` takes:
                                   scenes have lists of their own
 
 On accelerators XLA's chunks have _WIDE lanes. Of a number of scenes that an exported program leaves open
-(`jax.export.symbolic_shape`) all are careful, in chunks of _LANES on CPUs, and at once elsewhere. *Careful* is the function as it was given, *quick* a part of its
-`Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this process, where llvmlite is: not for what users
-export, nor for functions that do not ask for it (`in_lanes`: flexible columns and whole histories do not), nor for
-programs of operations that `native` does not know. Whether a program is traced at all, or was kept, is told by
-`lowering`.
+(`jax.export.symbolic_shape`) all are careful, in chunks of _LANES on CPUs, and at once elsewhere. *Careful* is the
+function as it was given, *quick* a part of its `Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this
+process, where llvmlite is: not for what users export, nor for functions that do not ask for it (`in_lanes`: flexible
+columns and whole histories do not), nor for programs of operations that `native` does not know. Whether a program is
+traced at all, or was kept, is told by `lowering`.
 """
 
 import functools
