@@ -21,7 +21,7 @@ from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin
 import numpy as np
 
 from jaxrock._checks import Range, one_of, shown, truth, whole
-from jaxrock._settings import in_precision_of_session, under_usual_settings
+from jaxrock._settings import called_by_users
 
 Taking = TypeVar("Taking", bound=Callable)
 Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
@@ -42,11 +42,9 @@ def arguments(function: Taking) -> Taking:
     by_place = {each.name for each in parameters if each.kind is each.POSITIONAL_ONLY}  # another may have such a name
     checks = {name: check for name, check in checks.items() if name not in by_place}
 
-    @under_usual_settings
+    @called_by_users
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        args = tuple(map(in_precision_of_session, args))
-        kwargs = {name: in_precision_of_session(value) for name, value in kwargs.items()}
         args = [value if check is None else check(name, value) for (name, check), value in zip(places, args)] + list(
             args[len(places) :]
         )  # too many: Python says so

@@ -13,7 +13,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._guard import as_array, guarded
-from jaxrock._settings import in_precision_of_session, narrowed, under_usual_settings
+from jaxrock._settings import called_by_users, narrowed, under_usual_settings
 from jaxrock._words import meant
 
 Making = TypeVar("Making", bound=Callable)
@@ -69,10 +69,9 @@ def one_program(function: Making) -> Making:
     every shape; of traced ones it is as it is written."""
     compiled = jax.jit(function)
 
-    @under_usual_settings
+    @called_by_users
     @functools.wraps(function)
     def run(*args: Any) -> Any:
-        args = in_precision_of_session(args)
         return function(*args) if is_traced(args) else compiled(*args)
 
     return cast(Making, run)

@@ -71,7 +71,7 @@ def kept_by_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     JAX keeps what it makes of an array of NumPy in a program, and gives it to every later program that holds the same
     array, also after `jax_enable_x64` has changed: that program would not compile, or compute in single precision. Such
-    an array of a module comes to programs by `jnp.asarray`.
+    an array of a module comes to programs by `jnp.asarray` with a type, which makes it anew.
     """
 
     @functools.cache
@@ -104,6 +104,18 @@ def in_precision_of_session(tree: Any) -> Any:
     if not any(map(is_wider, leaves)):
         return tree
     return structure.unflatten([narrowed(x) for x in leaves])
+
+
+def called_by_users(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate what users call: it runs under the package's settings, on arrays of types that are switched on."""
+
+    @under_usual_settings
+    @functools.wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        given = tuple(map(in_precision_of_session, args))  # each by itself: an object that is being made stays as it is
+        return function(*given, **{name: in_precision_of_session(value) for name, value in kwargs.items()})
+
+    return run
 
 
 def narrowed(x: Any) -> Any:

@@ -34,6 +34,11 @@ def pulse(amplitude=0.3):
     return rk.SinePulse(amplitude, 0.8)
 
 
+def at(value):
+    """Numbers that are placed on a device as `jax.transfer_guard` asks for it."""
+    return jax.device_put(np.asarray(value, jnp.result_type(float)))
+
+
 def record():
     return rk.Record(0.4 * np.sin(5 * TIMES), 0.05)
 
@@ -101,11 +106,11 @@ CALLS: dict[str, Callable] = {
     "outcome of no numbers": lambda: rk.outcome(rk.Block(-1.0, 2.0, throw=False), pulse(), throw=False).margin,
     "NaN by contract, in a program of the user": lambda: jax.jit(
         lambda alpha: rk.outcome(rk.Block(alpha, 2.0, throw=False), pulse(), throw=False).margin
-    )(-1.0),
-    "NaN of the user": lambda: jax.jit(nan_of_users)(-1.0),
+    )(at(-1.0)),
+    "NaN of the user": lambda: jax.jit(nan_of_users)(at(-1.0)),
     "infinity by contract, in a program of the user": lambda: jax.jit(
         lambda alpha: rk.outcome(rk.Block(alpha, 2.0), pulse(2.0)).max_rotation
-    )(0.2),
+    )(at(0.2)),
     "simulate": lambda: found(rk.simulate(block(), pulse(), duration=2.0, samples=20), "rotation", "impact_times"),
     "response(t)": lambda: rk.simulate(block(), record(), samples=20)(TIMES),
     "diffrax": lambda: rk.outcome(block(), pulse(), engine=rk.Diffrax(rtol=1e-6)).max_rotation,
@@ -120,21 +125,21 @@ CALLS: dict[str, Callable] = {
     "rolling": lambda: rk.outcome(block(), pulse(), rk.models.Rolling(rk.blocks.Edge(0.1))).margin,
     "laws": laws,
     "contact_forces": forces,
-    "jit": lambda: jax.jit(margin)(0.3),
+    "jit": lambda: jax.jit(margin)(at(0.3)),
     "jit of a block": lambda: jax.jit(lambda block, motion: rk.outcome(block, motion).margin)(block(), record()),
-    "vmap": lambda: jax.vmap(margin)(np.linspace(0.2, 0.4, 3)),
-    "jit(vmap) of many": lambda: jax.jit(jax.vmap(margin))(np.linspace(0.2, 0.4, 70)),
-    "grad": lambda: jax.grad(margin)(0.3),
-    "jit(grad)": lambda: jax.jit(jax.value_and_grad(margin))(0.3),
-    "vmap(grad)": lambda: jax.vmap(jax.grad(margin))(np.linspace(0.2, 0.4, 3)),
-    "hessian": lambda: jax.hessian(margin)(0.3),
+    "vmap": lambda: jax.vmap(margin)(at(np.linspace(0.2, 0.4, 3))),
+    "jit(vmap) of many": lambda: jax.jit(jax.vmap(margin))(at(np.linspace(0.2, 0.4, 70))),
+    "grad": lambda: jax.grad(margin)(at(0.3)),
+    "jit(grad)": lambda: jax.jit(jax.value_and_grad(margin))(at(0.3)),
+    "vmap(grad)": lambda: jax.vmap(jax.grad(margin))(at(np.linspace(0.2, 0.4, 3))),
+    "hessian": lambda: jax.hessian(margin)(at(0.3)),
     "jacrev of a history": lambda: jax.jacrev(
         lambda a: rk.simulate(block(), pulse(a), duration=1.0, samples=5).rotation
     )(0.3),
     "grad by samples": lambda: jax.grad(lambda x: rk.outcome(block(), rk.Record(x, 0.05)).margin)(
         jnp.asarray(0.4 * np.sin(2.5 * np.arange(100) * 0.05))
     ),
-    "scan": lambda: jax.lax.scan(lambda total, a: (total + margin(a), total), 0.0, jnp.linspace(0.2, 0.3, 3))[0],
+    "scan": lambda: jax.lax.scan(lambda total, a: (total + margin(a), total), at(0.0), at(np.linspace(0.2, 0.3, 3)))[0],
     "FlexibleBlock": lambda: found(column(), "first_period", "frequencies"),
     "flexible outcome": lambda: rk.outcome(column(), pulse(0.25), duration=2.0).max_rotation,
     "flexible history": lambda: rk.simulate(column(), pulse(0.4), duration=2.0, samples=10).rotation,
@@ -175,7 +180,7 @@ CALLS: dict[str, Callable] = {
             block(), rk.motions.Suite([pulse(), record()]), [0.2, 0.6], progress=False
         ).medians
     ),
-    "log_density": lambda: rk.inverse.log_density(rocks(), rk.SinePulse, unknowns())(jnp.zeros(2)),
+    "log_density": lambda: rk.inverse.log_density(rocks(), rk.SinePulse, unknowns())(at(np.zeros(2))),
     "estimate_motion": lambda: (
         rk.inverse.estimate_motion(rocks(), rk.SinePulse, unknowns(), starts=2, progress=False).log_likelihood
     ),
@@ -208,7 +213,6 @@ SETTINGS: dict[str, Callable] = {
     "strict promotion of types": lambda: jax.numpy_dtype_promotion("strict"),
     "no promotion of ranks": lambda: jax.numpy_rank_promotion("raise"),
     "transfer_guard": lambda: jax.transfer_guard("disallow"),
-    "transfer_guard of all": lambda: jax.transfer_guard("disallow_explicit"),
     "checking_leaks": jax.checking_leaks,
     "second device": lambda: jax.default_device(jax.devices()[1]),
     "matmul in bfloat16": lambda: jax.default_matmul_precision("bfloat16"),

@@ -183,7 +183,7 @@ class _Step(eqx.Module):
 
     def remainder(self, amplitudes, coefficients, shift) -> tuple[Remainder, Inexact[Array, "points modes"]]:
         """What is beside the linear phase at the points, and its modes there."""
-        path, x = self.path, jnp.asarray(_PLACES)
+        path, x = self.path, jnp.asarray(_PLACES, coefficients.real.dtype)
         terms = np.arange(len(coefficients))
         waves = amplitudes * jnp.exp(path.exponents * x[:, None])
         table = powers(x, terms.size).T
@@ -208,7 +208,7 @@ def nonlinear_arc(
 ) -> NonlinearArc:
     """The arc with what is beside its linear phase; `load`: the ground's acceleration [g] by powers of x."""
     terms = len(path.coefficients)
-    ground = powers(jnp.asarray(_PLACES), load.size).T @ load
+    ground = powers(jnp.asarray(_PLACES, load.dtype), load.size).T @ load
     step = _Step(tangents, path, side, ground, length, answers(path.exponents, POINTS), rising_terms(path.exponents))
     n = tangents.numbers.rotation.size
     force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)

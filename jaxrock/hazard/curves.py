@@ -19,6 +19,7 @@ from jaxrock._checks import (
     share,
 )
 from jaxrock._described import described
+from jaxrock._settings import called_by_users
 from jaxrock.hazard.fragility import alike, beside, rising, the_one_before
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
@@ -86,6 +87,7 @@ class HazardCurve(eqx.Module):
         with np.errstate(divide="ignore"):  # a probability of 1 tells no rate
             return cls(levels, -np.log1p(-np.asarray(probabilities)) / np.asarray(time), measure)
 
+    @called_by_users
     def rate(self, level: Values) -> Real:
         """Annual rate of shakings of intensity `level` or more that the curve knows; of the shape of `level`."""
         check_one(self)
@@ -102,10 +104,12 @@ class HazardCurve(eqx.Module):
         beyond = (level > self.levels[-1]) | (level > self.levels[0]) & (self.rates[after] == 0)
         return jnp.where(beyond, 0.0, within)
 
+    @called_by_users
     def scaled(self, factor: ArrayLike) -> "HazardCurve":
         """The curve of a site where every shaking is `factor` times as intense (positive); rates stay."""
         return scaled(self, scalar("factor", positive("factor", factor)))
 
+    @called_by_users
     def extended(self, lowest: ArrayLike, highest: ArrayLike) -> "HazardCurve":
         """The curve with the power laws of its first and last known interval continued.
 

@@ -34,6 +34,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import as_real, below_one, check_shapes, positive, put_down, scalar, shown
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import Possible, levels_around
@@ -108,6 +109,7 @@ class Likelihood(eqx.Module):
         parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
         return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
+    @called_by_users
     def log_terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
@@ -149,6 +151,7 @@ class Likelihood(eqx.Module):
         """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
         return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
 
+    @called_by_users
     def survival(self, values: Mapping[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
@@ -156,6 +159,7 @@ class Likelihood(eqx.Module):
     def _survival(self, values: Mapping[str, ArrayLike]) -> Real:
         return jnp.exp(self._possible(values)[0].log_probabilities()[0])
 
+    @called_by_users
     def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
         """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
 

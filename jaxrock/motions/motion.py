@@ -105,6 +105,7 @@ class AbstractMotion(Owner):
         """Time at which the ground comes to rest [s]."""
         return of_each(lambda knots: knots[-1], self.knots)
 
+    @arguments
     def acceleration(self, time: Values) -> Inexact[Array, "..."]:
         """Ground acceleration.
 
@@ -112,8 +113,7 @@ class AbstractMotion(Owner):
 
         - `time`: any shape, time from the start of the motion [s].
 
-        **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, and at a jump the
-        value after it.
+        **Returns:** acceleration [g], of the shape of `time`; zero outside the motion, at a jump the value after it.
         """
         return acceleration_at(self, if_known(not_nan, "time", time))
 

@@ -28,7 +28,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.status import Enumeration, item
 
-_NODES, _WEIGHTS = gauss_legendre(6)
+_ORDER = 6  # of the quadrature over parts of pieces
 _PARTS = 64  # of every smooth piece of a pulse
 _LENGTHS = 14  # periods or durations that are tried
 _USUAL = {"oscillations": (1.01, 8.0), "shape": (-30.0, 30.0), "phase": (-np.pi, np.pi)}
@@ -262,7 +262,7 @@ def _with_slopes(kind: _Kind, place, times):
 def _velocity(pulse: AbstractMotion, times: Float[Array, " n"]) -> Float[Array, " n"]:
     """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
     knots, lengths = pulse.knots, pulse.lengths
-    nodes, weights = (jnp.asarray(values) for values in (_NODES, _WEIGHTS))
+    nodes, weights = (jnp.asarray(values) for values in gauss_legendre(_ORDER))
     piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
     local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
     width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / _PARTS
