@@ -98,9 +98,10 @@ def in_precision_of_session(tree: Any) -> Any:
     if config.jax_enable_x64:
         return tree
     try:
-        leaves, structure = jax.tree.flatten(tree)
+        flat: tuple[list, Any] = jax.tree.flatten(tree)
     except (TypeError, ValueError):  # keys of a dictionary that cannot be sorted: the function says what is wrong
         return tree
+    leaves, structure = flat
     if not any(map(is_wider, leaves)):
         return tree
     return structure.unflatten([narrowed(x) for x in leaves])
