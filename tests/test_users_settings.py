@@ -35,6 +35,7 @@ FEW = [
     "fit_fragility, separable", *OF_USERS,
 ]  # fmt: skip
 LATE = ["FlexibleBlock", "toppling_rate, tabulated", "fit_pulse"]
+WITHOUT_CACHES = ["checking_leaks"]  # JAX forgets what it has traced and compiled, at every call
 STRICT = ["strict promotion of types", "transfer_guard", "debug_nans", "global debug_infs", "no promotion of ranks"]
 
 
@@ -100,7 +101,8 @@ def all_usual():
 @pytest.mark.slow
 @pytest.mark.parametrize("setting", [name for name in SETTINGS if name != "usual"])
 def test_every_setting_changes_no_number_of_any_call(setting):
-    check(setting, told(setting)[setting], all_usual())
+    names = [";".join(FEW)] if setting in WITHOUT_CACHES else []
+    check(setting, told(setting, *names)[setting], all_usual())
 
 
 def check_late(found, rel_of_single, usual):
@@ -108,7 +110,10 @@ def check_late(found, rel_of_single, usual):
     for when in ("double", "cleared", "double again"):
         assert not differ(found[when], usual), when
     for when in ("single", "single within"):
-        assert not differ(found[when], usual, rel_of_single), when
+        refused = {name for name, one in found[when].items() if str(one).startswith("ValueError: Argument")}
+        assert refused <= {"flexible with P-Delta"}  # which wants double precision, and says so
+        numbers = {name: one for name, one in found[when].items() if name not in refused}
+        assert not differ(numbers, usual, rel_of_single), when
 
 
 def test_precision_that_is_switched_on_late():
