@@ -178,7 +178,7 @@ CALLS: dict[str, Callable] = {
     "simulated_fragility": lambda: (
         rk.hazard.simulated_fragility(
             block(), rk.motions.Suite([pulse(), record()]), [0.2, 0.6], progress=False
-        ).medians
+        ).verdict
     ),
     "log_density": lambda: rk.inverse.log_density(rocks(), rk.SinePulse, unknowns())(at(np.zeros(2))),
     "estimate_motion": lambda: (
