@@ -21,13 +21,15 @@ from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin
 import numpy as np
 
 from jaxrock._checks import Range, one_of, shown, truth, whole
+from jaxrock._settings import called_by_users
 
 Taking = TypeVar("Taking", bound=Callable)
 Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, or raises ValueError
 
 
 def arguments(function: Taking) -> Taking:
-    """Decorate a function whose arguments are checked by their annotations, before it sees them.
+    """Decorate a function whose arguments are checked by their annotations, before it sees them. It runs under the
+    package's settings of JAX (`_settings`), on numbers of a precision that is switched on.
 
     **Raises:** ValueError, when it is called, for an argument that is not what is asked for: "Argument `x` must ...".
     """
@@ -40,6 +42,7 @@ def arguments(function: Taking) -> Taking:
     by_place = {each.name for each in parameters if each.kind is each.POSITIONAL_ONLY}  # another may have such a name
     checks = {name: check for name, check in checks.items() if name not in by_place}
 
+    @called_by_users
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         args = [value if check is None else check(name, value) for (name, check), value in zip(places, args)] + list(

@@ -13,6 +13,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from jaxrock._guard import as_array, guarded
+from jaxrock._settings import called_by_users, narrowed, under_usual_settings
 from jaxrock._words import meant
 
 Making = TypeVar("Making", bound=Callable)
@@ -44,6 +45,7 @@ def by_numpy_or_one_program(**settings: Any) -> Callable[[Making], Making]:
     def decorate(function: Making) -> Making:
         compiled = jax.jit(function, **settings)
 
+        @under_usual_settings
         @functools.wraps(function)
         def run(*args: Any) -> Any:
             return function(*args) if is_at_hand(args) else compiled(*args)
@@ -67,6 +69,7 @@ def one_program(function: Making) -> Making:
     every shape; of traced ones it is as it is written."""
     compiled = jax.jit(function)
 
+    @called_by_users
     @functools.wraps(function)
     def run(*args: Any) -> Any:
         return function(*args) if is_traced(args) else compiled(*args)
@@ -109,7 +112,7 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
             is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
             with np.errstate(over="ignore"):  # its range tells an infinite number
                 return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
-        array = as_array(known)
+        array = narrowed(as_array(known))
     except (TypeError, ValueError, OverflowError) as error:
         raise _no_number(name, value) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
@@ -272,6 +275,7 @@ def with_throw(function: Making) -> Making:
     all, or of a wrong shape, raises all the same.
     """
 
+    @under_usual_settings
     @functools.wraps(function)
     def made(*args: Any, throw: bool = True, **kwargs: Any) -> Any:
         if truth("throw", throw):

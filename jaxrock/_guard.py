@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from jaxrock._abstract import typed_like, without_mesh
 from jaxrock._foreign import CHECK, has_check
+from jaxrock._settings import under_usual_settings
 
 _guard_p = Primitive("guard")
 _guard_p.multiple_results = True
@@ -51,6 +52,7 @@ def _(failed, *values, message):
     return typed_like([failed, *values], [(x.shape, x.dtype) for x in values])
 
 
+@under_usual_settings
 def _batched(operands, axes, *, message):
     size = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     moved = [
@@ -104,6 +106,7 @@ def _is_alone(axes) -> bool:
     return mesh.size == 1 or set(mesh.axis_names) == set(axes.manual_axes)
 
 
+@under_usual_settings
 def _lowered(context, *operands, message, on_cpu):
     settings = getattr(context.module_context, "lowering_parameters", None)
     if getattr(settings, "for_export", False):

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxrock._checks import is_traced
+from jaxrock._settings import under_usual_settings
 
 Made = TypeVar("Made", bound=Callable)
 
@@ -46,6 +47,7 @@ def quickly(jit: Callable = jax.jit, follows_scenes: bool = False, **settings: A
         def at_once() -> Callable:
             return jit(function, compiler_options=options(), **settings)
 
+        @under_usual_settings
         @functools.wraps(function)
         def run(*args: Any, **named: Any) -> Any:
             few = (not follows_scenes or _has_machine_code()) and _are_few((args, named))

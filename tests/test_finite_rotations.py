@@ -237,12 +237,10 @@ def test_numbers_of_single_precision_among_others(law):
 @pytest.mark.filterwarnings("ignore:jaxrock runs in single precision")
 def test_single_precision_is_refused():
     """Which would be wrong in the third digit, and not say so."""
-    unit_column.cache_clear()  # JAX remembers the precision of its arrays
     with jax.enable_x64(False):
         block = rk.blocks.FlexibleBlock(**TALL, damping_ratio=0.01, masses=2, **WHOLE)
         with pytest.raises(ValueError, match="^Argument `block` must be linear in single precision"):
             rk.outcome(block, rk.SinePulse(0.5, 1.6))
-    unit_column.cache_clear()
 
 
 @pytest.mark.parametrize(

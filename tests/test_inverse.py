@@ -360,7 +360,9 @@ def test_a_rotation_that_no_motion_makes_is_named():
     found = rk.inverse.estimate_motion(seen, rk.SinePulse, unknowns, 0.05, starts=1)
     assert found.status == rk.inverse.EstimateStatus.contradictory and float(found.probability[3]) > 0.9
     assert "rock 4 (its rotation is off by 300.0 standard deviations)" in found.remarks[0]
-    assert np.isinf(found.consistent_scatter) and "no scatter that was tried, up to ten times as large" in found.remarks[1]
+    assert (
+        np.isinf(found.consistent_scatter) and "no scatter that was tried, up to ten times as large" in found.remarks[1]
+    )
 
 
 def test_climbers_find_summits_and_hold_what_is_held():

@@ -1,10 +1,11 @@
 """Vibrations of a clamped column of lumped masses."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from jaxrock._settings import kept_by_precision
 
 
 class UnitColumn(NamedTuple):
@@ -24,7 +25,7 @@ class UnitColumn(NamedTuple):
     buckling: float  # its own weight that a clamped column just bears, over bending stiffness/length^2
 
 
-@functools.cache
+@kept_by_precision
 def unit_column(masses: int) -> UnitColumn:
     """The unit column of `masses` lumped masses (its base included) and `masses` - 1 beam elements.
 

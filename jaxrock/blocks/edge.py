@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact, Int
 from jaxrock._checks import Values, checked, not_negative, one_program, with_throw
 from jaxrock._described import described
 from jaxrock._parameters import parameter, set_parameters
+from jaxrock._settings import called_by_users
 from jaxrock.numerics.choice import where
 from jaxrock.numerics.elementary import sine_cosine, sine_cosine_of_any, sine_lag
 from jaxrock.numerics.lookup import count_up_to, pick, stretch_from
@@ -75,6 +76,7 @@ class Edge(eqx.Module):
         """How far it has rolled along the ground, over R: the integral of the radius."""
         return self._rounded(opening).length
 
+    @called_by_users
     def place(self, opening: ArrayLike) -> tuple[Real, Real]:
         """Where the edge touches the ground when the block has opened by an angle, from the corner outward and upward
         on the block as it stands, over R: the integrals of cos(y) radius(y) and sin(y) radius(y)."""

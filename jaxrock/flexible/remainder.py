@@ -175,7 +175,7 @@ class _Step(eqx.Module):
         numbers, path, n = self.tangents.numbers, self.path, self.tangents.numbers.rotation.size
         onto, turned = path.phase.project[:, n:-1], path.phase.project[:, -1]
         total = force + shift[:, None] * (numbers.rotation * numbers.squares)
-        drive = self.length * (total @ onto.T) - (_SLOPE @ shift)[:, None] * turned
+        drive = self.length * (total @ onto.T) - (jnp.asarray(_SLOPE, shift.dtype) @ shift)[:, None] * turned
         answer = jnp.einsum("jtm,jm->tm", self.answers, drive)
         slow, start = jnp.abs(path.exponents) < 1, -turned * shift[0]
         amplitudes = path.amplitudes + jnp.where(slow, 0.0, start - answer[0])
@@ -183,7 +183,7 @@ class _Step(eqx.Module):
 
     def remainder(self, amplitudes, coefficients, shift) -> tuple[Remainder, Inexact[Array, "points modes"]]:
         """What is beside the linear phase at the points, and its modes there."""
-        path, x = self.path, jnp.asarray(_PLACES)
+        path, x = self.path, jnp.asarray(_PLACES, coefficients.real.dtype)
         terms = np.arange(len(coefficients))
         waves = amplitudes * jnp.exp(path.exponents * x[:, None])
         table = powers(x, terms.size).T
@@ -192,7 +192,7 @@ class _Step(eqx.Module):
         state = path.center + (modes @ path.phase.modes.T).real
         rate = ((waves * path.exponents + slopes @ coefficients) @ path.phase.modes.T).real
         state = state.at[:, -1].add(table[:, :POINTS] @ shift)
-        rate = rate.at[:, -1].add(table[:, :POINTS] @ (_SLOPE @ shift))
+        rate = rate.at[:, -1].add(table[:, :POINTS] @ (jnp.asarray(_SLOPE, shift.dtype) @ shift))
         found = jax.vmap(self.tangents.remainder, (0, 0, 0, None))(state, rate / self.length, self.ground, self.side)
         return found, modes
 
@@ -208,7 +208,7 @@ def nonlinear_arc(
 ) -> NonlinearArc:
     """The arc with what is beside its linear phase; `load`: the ground's acceleration [g] by powers of x."""
     terms = len(path.coefficients)
-    ground = powers(jnp.asarray(_PLACES), load.size).T @ load
+    ground = powers(jnp.asarray(_PLACES, load.dtype), load.size).T @ load
     step = _Step(tangents, path, side, ground, length, answers(path.exponents, POINTS), rising_terms(path.exponents))
     n = tangents.numbers.rotation.size
     force, shift = jnp.zeros((POINTS, n)), jnp.zeros(POINTS)

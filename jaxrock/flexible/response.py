@@ -12,6 +12,7 @@ from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throw
 from jaxrock._parameters import check_single
 from jaxrock._precision import say_if_single
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.engines.trajectory import Trajectory, at_times, followed, times_of
@@ -46,6 +47,7 @@ class FlexibleResponse(AbstractTable):
         units = {"rotation": "rad", "displacement": "m", "bending": "m"}
         return over_time(self.time, {name: (getattr(self, name), unit) for name, unit in units.items()})
 
+    @called_by_users
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Base rotation [rad], displacement of the top [m], and its bending part [m].
 
@@ -59,6 +61,7 @@ class FlexibleResponse(AbstractTable):
         """
         return _at_times(self.trajectory, self.trajectory.checked(time), "outputs")[:3]
 
+    @called_by_users
     def column(self, time: Values) -> Inexact[Array, "..."]:
         """Displacements of the masses relative to the ground [m], from the base (which stays) to the top.
 
@@ -72,6 +75,7 @@ class FlexibleResponse(AbstractTable):
         """
         return _at_times(self.trajectory, self.trajectory.checked(time), "column")
 
+    @called_by_users
     def energy(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Kinetic, strain and base's potential energy, of a block 1 m deep [J]."""
         block = self.scene.block

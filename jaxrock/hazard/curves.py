@@ -19,12 +19,13 @@ from jaxrock._checks import (
     share,
 )
 from jaxrock._described import described
+from jaxrock._settings import called_by_users
 from jaxrock.hazard.fragility import alike, beside, rising, the_one_before
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 Real = Inexact[Array, "..."]
 Number = Inexact[Array, ""]
-_NODES, _WEIGHTS = gauss_legendre(20)
+_ORDER = 20  # of the quadrature between levels
 
 
 class HazardCurve(eqx.Module):
@@ -86,6 +87,7 @@ class HazardCurve(eqx.Module):
         with np.errstate(divide="ignore"):  # a probability of 1 tells no rate
             return cls(levels, -np.log1p(-np.asarray(probabilities)) / np.asarray(time), measure)
 
+    @called_by_users
     def rate(self, level: Values) -> Real:
         """Annual rate of shakings of intensity `level` or more that the curve knows; of the shape of `level`."""
         check_one(self)
@@ -102,10 +104,12 @@ class HazardCurve(eqx.Module):
         beyond = (level > self.levels[-1]) | (level > self.levels[0]) & (self.rates[after] == 0)
         return jnp.where(beyond, 0.0, within)
 
+    @called_by_users
     def scaled(self, factor: ArrayLike) -> "HazardCurve":
         """The curve of a site where every shaking is `factor` times as intense (positive); rates stay."""
         return scaled(self, scalar("factor", positive("factor", factor)))
 
+    @called_by_users
     def extended(self, lowest: ArrayLike, highest: ArrayLike) -> "HazardCurve":
         """The curve with the power laws of its first and last known interval continued.
 
@@ -182,6 +186,7 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     levels and knots it is as gentle as a polynomial.
     """
     known, exponents = power_laws(curve)
+    points, weights = gauss_legendre(_ORDER)
     logarithms = jnp.log(curve.levels)
     breaks, low, high = jnp.log(knots), logarithms[0], logarithms[-1]
     breaks = jnp.where(breaks <= low, low, jnp.where(breaks >= high, high, breaks))
@@ -192,11 +197,11 @@ def shakings(curve: HazardCurve, knots: Inexact[Array, " knots"]) -> tuple[Array
     middle, half = (breaks[1:] + breaks[:-1]) / 2, (breaks[1:] - breaks[:-1]) / 2
     interval = jnp.clip(passed - 1, 0, known.size - 1)
     start, exponent = jnp.where(known, curve.rates[:-1], 0.0)[interval], exponents[interval]
-    nodes = middle[:, None] + half[:, None] * _NODES
+    nodes = middle[:, None] + half[:, None] * points
     density = (start * exponent)[:, None] * jnp.exp(-exponent[:, None] * (nodes - logarithms[interval][:, None]))
     # What exceeds the last known level counts there.
     last = jnp.isfinite(curve.rates) & (curve.rates > 0) & (jnp.append(curve.rates[1:], 0.0) == 0)
     return (
         jnp.concatenate([jnp.exp(nodes).ravel(), curve.levels]),
-        jnp.concatenate([(half[:, None] * _WEIGHTS * density).ravel(), jnp.where(last, curve.rates, 0.0)]),
+        jnp.concatenate([(half[:, None] * weights * density).ravel(), jnp.where(last, curve.rates, 0.0)]),
     )

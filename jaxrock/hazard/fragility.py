@@ -26,6 +26,7 @@ from jaxrock._checks import (
 from jaxrock._described import described
 from jaxrock._parameters import Owner, parameter, set_parameters
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column, scenes
 from jaxrock.hazard.probit_line import probit, probit_line, slope_tests, with_room
 from jaxrock.motions.measures import are_different
@@ -73,6 +74,7 @@ class LogNormalFragility(AbstractFragility):
         set_parameters(self, median=median, dispersion=dispersion)
         self.measure = measure
 
+    @called_by_users
     def __call__(self, level: Values) -> Real:
         level = if_known(at_level, "level", level)
         check_shapes(level=level, median=self.median)
@@ -123,6 +125,7 @@ class TabulatedFragility(AbstractFragility):
         self.probabilities = beside("probabilities", probabilities, levels)
         self.measure = measure
 
+    @called_by_users
     def __call__(self, level: Values) -> Real:
         return _interpolated(if_known(at_level, "level", level), self.levels, self.probabilities)
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, is_traced, not_negative, one_program, positive, shown
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.hazard.fragility import FitStatus, LogNormalFragility, outcomes
 from jaxrock.hazard.probit_line import most_clusters, probit, probit_line, slope_tests, with_room
@@ -69,6 +70,7 @@ class ProbitFit(AbstractTable):
             untold |= self.falls
         return tuple(name for name, bad in zip(self.names, np.asarray(untold)) if bad)
 
+    @called_by_users
     def __call__(self, **measures: Values) -> Float[Array, "..."]:
         """Probability to topple at measures by name, positive, which broadcast.
 

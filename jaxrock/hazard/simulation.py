@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int8
 from jaxrock._arguments import arguments, word_of
 from jaxrock._checks import Values, checked, one_of, placed
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -99,6 +100,7 @@ class SimulatedFragility(AbstractTable):
         """Number of scenes without a verdict."""
         return int(np.sum(self.verdict == UNDECIDED))
 
+    @called_by_users
     def counts(self, bound: str | None = None) -> Float[np.ndarray, "motions levels"]:
         """How many draws toppled under every motion at every level.
 
@@ -120,11 +122,13 @@ class SimulatedFragility(AbstractTable):
         """The same if all that is undecided toppled."""
         return np.mean(self.verdict != STOOD, axis=(0, 2))
 
+    @called_by_users
     def tabulated(self, bound: str | None = None) -> TabulatedFragility:
         """Shares at the levels as a fragility, which rises and falls as they do. `bound`: as in `counts`."""
         motions, _, draws = self.verdict.shape
         return TabulatedFragility(self.levels, self.counts(bound).sum(axis=0) / (motions * draws), self.measure)
 
+    @called_by_users
     def fit(self, bound: str | None = None) -> FragilityFit:
         """The lognormal fragility under which the verdicts are most probable.
 
@@ -156,6 +160,7 @@ class SimulatedFragility(AbstractTable):
         fragility = lognormal_of(fit.fragility.median, fit.fragility.dispersion, self.measure)
         return eqx.tree_at(lambda f: (f.fragility, f.covariance, f.p_value), fit, (fragility, covariance, test))
 
+    @called_by_users
     def intervals(self, bound: str | None = None, confidence: ArrayLike = 0.95) -> FragilityIntervals:
         """Confidence intervals of the fit's median and dispersion, which hold for few motions: Student's t for the
         logarithm of the median, chi-squared for the part of the squared dispersion that is between motions.
@@ -199,6 +204,7 @@ class SimulatedFragility(AbstractTable):
         """
         return capacities(self.verdict, self.levels)
 
+    @called_by_users
     def table(self) -> dict[str, np.ndarray]:
         """Columns with a row for every motion and level: names, level, peaks [g], [m/s], trials, toppled, undecided."""
         motions, levels, draws = self.verdict.shape

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int8
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import Values, checked, positive, shown
 from jaxrock._parameters import leaves_of
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -69,6 +70,7 @@ class SuiteOutcomes(AbstractTable):
         """Number of scenes without a verdict."""
         return int(np.sum(self.verdict == UNDECIDED))
 
+    @called_by_users
     def reaches(self, state: Values) -> tuple[np.ndarray, np.ndarray]:
         """Shares of blocks, both ways round, that come to damage states, for every motion and scale.
 
@@ -100,6 +102,7 @@ class SuiteOutcomes(AbstractTable):
         """(motions, facings, blocks) whether a block stands at a scale above one that topples it."""
         return comes_back(self.verdict)
 
+    @called_by_users
     def table(self, measures: Mapping[str, str | Callable] | Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Columns with a row for every scene: `pandas.DataFrame(found.table())`.
 

@@ -31,6 +31,7 @@ from jaxrock._checks import (
 from jaxrock._described import described
 from jaxrock._parameters import one_of_many
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.engines.stepper import AbstractEngine
@@ -72,6 +73,7 @@ class SurfaceFragility(eqx.Module):
     exponent: Float[Array, ""]
     dispersion: Float[Array, ""]
 
+    @called_by_users
     def __call__(self, acceleration: Values, ratio: Values) -> Inexact[Array, "..."]:
         """Probability to topple at peak accelerations [g] and PGV/PGA [s], which broadcast."""
         acceleration, median = if_known(level, "acceleration", acceleration), self._median(ratio)
@@ -81,10 +83,12 @@ class SurfaceFragility(eqx.Module):
     def _median(self, ratio):
         return _power(self.median, positive("ratio", ratio), self.exponent)
 
+    @called_by_users
     def at(self, ratio: ArrayLike) -> LogNormalFragility:
         """The fragility in peak acceleration of motions of one PGV/PGA [s]."""
         return LogNormalFragility(self._median(ratio), self.dispersion, "PGA")
 
+    @called_by_users
     def acceleration(self, probability: Values, ratio: Values) -> Inexact[Array, "..."]:
         """The peak acceleration [g] at which the rock topples with a given probability in (0, 1): a contour."""
         probability, median = inner_share("probability", probability), self._median(ratio)
@@ -278,6 +282,7 @@ class SimulatedSurface(eqx.Module):
         row = jax.vmap(lambda share: jnp.interp(place, jnp.log(self.ratio), share))(shares)
         return TabulatedFragility(self.acceleration, row, "PGA")
 
+    @called_by_users
     def fit(self, bound: str | None = None) -> SurfaceFit:
         """The two-measure lognormal fragility of all cells: a smooth summary.
 

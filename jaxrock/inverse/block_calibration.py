@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxrock._arguments import arguments, at_least, known, list_of
 from jaxrock._checks import Range, Values, as_real, below_one, share, shown, whole
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.calibration_grid import STILL, Axis, Table, blocks_of_cells, weighed
@@ -87,6 +88,7 @@ class BlockCalibration(AbstractTable):
         """Of the places, by name."""
         return dict(zip(self.values, jnp.sqrt(jnp.diag(self.covariance))))
 
+    @called_by_users
     def log_density(self, values: Mapping[str, ArrayLike]) -> Float[Array, ""]:
         """Log-likelihood and log-prior at values by name: a smooth function for optimisers and samplers of JAX.
 

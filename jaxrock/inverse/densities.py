@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Inexact
 from jaxrock._arguments import arguments, at_least
 from jaxrock._checks import as_real, check_shapes
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.likelihood import Likelihood, quadrature_accuracy
 from jaxrock.inverse.observations import Observations
@@ -37,16 +38,19 @@ class LogDensity(eqx.Module):
         """The parameters, in the order of coordinates."""
         return self.problem.names
 
+    @called_by_users
     def __call__(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-density of points, (..., parameters), with respect to the points themselves, but for a constant: what a
         sampler takes. Many points at once take less time than `jax.vmap` of one."""
         return _at_points(self, self._checked(point), np.array(True))
 
+    @called_by_users
     def objective(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
         """Log-likelihood and log-prior: what `estimate_motion` makes as large as it can. It does not depend on the
         coordinates."""
         return _at_points(self, self._checked(point), np.array(False))
 
+    @called_by_users
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
         """Parameters by name, in their units, at points."""
         return self.problem.values(self.place(self._checked(point)))

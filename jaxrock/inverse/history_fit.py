@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from jaxrock._arguments import arguments, at_least, list_of, pair
 from jaxrock._checks import Values, finite, inner_share, not_negative, positive, scalar
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.rigid import Block
@@ -84,6 +85,7 @@ class HistoryFit(AbstractTable):
             raise KeyError(f"{name!r} is not one of the parameters {', '.join(self.names)}.")
         return float(self.values[self.names.index(name)])
 
+    @called_by_users
     def intervals(self, confidence: float = 0.95, robust: bool | None = None) -> Float[np.ndarray, "parameters 2"]:
         """Confidence intervals, each of one parameter by itself.
 

@@ -33,6 +33,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import as_real, below_one, check_shapes, placed, positive, put_down, scalar, shown
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock.engines.stepper import AbstractEngine
 from jaxrock.inverse.observations import ROTATION, TOPPLED, Observations
 from jaxrock.inverse.scatter import LEAST_ACCURATE, MOST_ACCURATE, Possible, Quadrature, are_known_well, levels_around
@@ -130,6 +131,7 @@ class Likelihood(eqx.Module):
         parts = current_function(self.motion, **dict.fromkeys(names, number)), current_model(self.model, seen.blocks)
         return eqx.tree_at(lambda it: (it.motion, it.model), self, parts)
 
+    @called_by_users
     def log_terms(self, values: Mapping[str, ArrayLike], slopes: bool = True) -> Real:
         """Log-likelihood of each rock, (..., rocks), for `values` (...) of the motion's parameters by name.
 
@@ -171,6 +173,7 @@ class Likelihood(eqx.Module):
         """With the possibility that the observation says nothing: then it is as likely that a rock stands as not."""
         return jnp.logaddexp(jnp.log1p(-self.lapse) + log_probability, jnp.log(self.lapse / 2) + flat)
 
+    @called_by_users
     def survival(self, values: Mapping[str, ArrayLike]) -> Real:
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
@@ -189,6 +192,7 @@ class Likelihood(eqx.Module):
     def _survival(self, values: Mapping[str, ArrayLike]) -> Real:
         return jnp.exp(self._possible(values)[0].log_probabilities()[0])
 
+    @called_by_users
     def surprise(self, values: Mapping[str, ArrayLike]) -> tuple[Real, Real, Real]:
         """For each rock: how badly it fits, what one expects of that, and with which variance; (..., rocks) each.
 

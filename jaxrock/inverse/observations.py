@@ -25,6 +25,7 @@ from jaxrock._checks import (
 )
 from jaxrock._described import described
 from jaxrock._label import Label
+from jaxrock._settings import called_by_users
 from jaxrock._words import meant
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import AngularMomentum, Corners, Housner
@@ -220,6 +221,7 @@ class Observations(eqx.Module):
         """Restitution by angular momentum: Housner's, or the root of the product of both."""
         return _by_momentum(self.other, alpha, self.p)
 
+    @called_by_users
     def blocks_at(self, alpha: ArrayLike, p: ArrayLike, restitution: ArrayLike | None) -> Block | AsymmetricBlock:
         """The rocks, were these their values on side 1, (..., rocks): one block of arrays; they are not checked."""
         with put_down():
@@ -230,6 +232,7 @@ class Observations(eqx.Module):
         """The rocks as they are stated: one `Block` or `AsymmetricBlock` of arrays."""
         return self.blocks_at(self.alpha, self.p, self.restitution)
 
+    @called_by_users
     def of(self, which: ArrayLike) -> "Observations":
         """Some of the rocks: `which` is an array of their numbers, or of a truth value for each."""
         index = _chosen(which, self.alpha.size)

@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import direction, one_program, scalar, shown
 from jaxrock._described import described
+from jaxrock._settings import called_by_users
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
 from jaxrock.motions.files.traces import record_of_trace
@@ -88,6 +89,7 @@ class Components(eqx.Module):
         name = "" if not self.first.name else f"{self.first.name}, turned"
         return record_in_g(samples, self.first.dt, name, self.first.origin._replace(component=""))
 
+    @called_by_users
     def in_plane(self, angle: ArrayLike, vertical: bool) -> AbstractMotion:
         """What shakes a block in one vertical plane: `along`, with the `vertical` component if that is wanted."""
         horizontal = self.along(angle)

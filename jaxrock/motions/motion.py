@@ -106,6 +106,7 @@ class AbstractMotion(Owner):
         """Time at which the ground comes to rest [s]."""
         return of_each(lambda knots: knots[-1], self.knots)
 
+    @arguments
     def acceleration(self, time: Values) -> Inexact[Array, "..."]:
         """Ground acceleration.
 

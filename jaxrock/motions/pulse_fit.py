@@ -28,7 +28,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.status import Enumeration, item
 
-_NODES, _WEIGHTS = gauss_legendre(6)
+_ORDER = 6  # of the quadrature over parts of pieces
 _PARTS = 64  # of every smooth piece of a pulse, at least
 _PER_SCALE = 0.5  # of the time in which its acceleration changes: exact to 1e-9
 _MOST = 1 << 14
@@ -173,7 +173,7 @@ class _Problem(NamedTuple):
 
         names = self.kind.names
         places = np.array(list(itertools.product(*map(self._tried, range(len(names))))))
-        seen, size, found = np.asarray(_models(self.kind, places, self.times)), self.target.size, []
+        seen, size, found = np.asarray(_models(self.kind, places, self.times), float), self.target.size, []
         allowed = (self.times >= self.lower[-1] - 1e-9) & (self.times <= self.upper[-1] + 1e-9)
         for place, one in zip(places, seen):
             products = correlate(self.target, one, method="fft")[size - 1 :]
@@ -295,7 +295,7 @@ def _with_slopes(kind: _Kind, place, times):
 def _velocity(pulse: AbstractMotion, times: Float[Array, " n"], count: int) -> Float[Array, " n"]:
     """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
     knots, lengths = pulse.knots, pulse.lengths
-    nodes, weights = (jnp.asarray(values) for values in (_NODES, _WEIGHTS))
+    nodes, weights = (jnp.asarray(values) for values in gauss_legendre(_ORDER))
     piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
     local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
     width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / count

@@ -18,6 +18,7 @@ from jaxrock._checks import Values, direction, is_traced, placed, shown, watched
 from jaxrock._described import described
 from jaxrock._named import AbstractNamed
 from jaxrock._parameters import broadcast, leaves_of, one_of_many, shared
+from jaxrock._settings import called_by_users
 from jaxrock.motions.components import Components
 from jaxrock.motions.joined_records import Chosen, JoinedRecords
 from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
@@ -121,6 +122,7 @@ class Suite(AbstractNamed):
     def __len__(self) -> int:
         return len(self.names)
 
+    @called_by_users
     def __getitem__(self, number) -> AbstractMotion:
         """One of its motions. Where its number is traced, scenes of all records share their samples.
 

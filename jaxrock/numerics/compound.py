@@ -14,6 +14,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import typed_like, without_mesh
 from jaxrock._precision import setting
+from jaxrock._settings import under_usual_settings, usual_settings
 from jaxrock.numerics.typed import common_type, typed
 from jaxrock.numerics.xla_cpu import marking
 
@@ -61,7 +62,7 @@ class Compound:
         return typed_like(operands, [(shape, operands[0].dtype)] * count)
 
     def _alone(self, *numbers, **settings) -> list:
-        with jax.disable_jit(False):
+        with usual_settings():
             return _compiled(self.primitive, tuple(settings.items()))(*numbers)
 
     def _of_some(self, numbers, chosen: list[bool], settings: dict) -> Callable:
@@ -73,6 +74,7 @@ class Compound:
 
         return of
 
+    @under_usual_settings
     def _pushed(self, numbers, changes, **settings):
         if self.change is not None:
             return self.change(self, numbers, changes, **settings)
@@ -80,6 +82,7 @@ class Compound:
         moving, moved = ([x for x, move in zip(each, moves) if move] for each in (numbers, changes))
         return jax.jvp(self._of_some(numbers, moves, settings), moving, moved)
 
+    @under_usual_settings
     def _transposed(self, cotangents, *numbers, **settings):
         linear = [ad.is_undefined_primal(x) for x in numbers]
         like = [x.aval for x, is_linear in zip(numbers, linear) if is_linear]
@@ -125,6 +128,7 @@ def _kept_by(operands: Sequence, settings: dict) -> tuple[tuple, tuple, bool]:
 
 
 @functools.lru_cache(maxsize=4096)
+@under_usual_settings
 def _program(name: str, kinds: tuple, settings: tuple[tuple[str, Hashable], ...], double: bool) -> ClosedJaxpr:
     like = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
     # It is kept: outside of any mesh, and for any compiler.
@@ -138,10 +142,12 @@ def _called(name: str, kinds: tuple, settings: tuple, double: bool) -> Callable:
     return jax.jit(jaxpr_as_fun(_program(name, kinds, settings, double)))
 
 
+@under_usual_settings
 def _lowered(name: str, context, *operands, **settings):
     return mlir.lower_fun(_called(name, *_kept_by(context.avals_in, settings)))(without_mesh(context), *operands)
 
 
+@under_usual_settings
 def _batched(primitive: Primitive, operands, axes, **settings) -> tuple[list, list]:
     """Numbers fit each other's shapes, so what is not mapped needs no axis."""
     most = max(jnp.ndim(x) - (axis is not None) for x, axis in zip(operands, axes))

@@ -1,12 +1,12 @@
 """Gauss-Legendre quadrature: its nodes and weights."""
 
-import functools
-
 import numpy as np
 from jaxtyping import Float
 
+from jaxrock._settings import kept_by_precision
 
-@functools.cache
+
+@kept_by_precision
 def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
     """Nodes and weights on [-1, 1], exact for polynomials of degree 2 count - 1; the arrays are read-only."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
@@ -14,7 +14,7 @@ def gauss_legendre(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.nd
     return nodes, weights
 
 
-@functools.cache
+@kept_by_precision
 def gauss_legendre_of_unit(count: int) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"]]:
     """The same on [0, 1]."""
     nodes, weights = gauss_legendre(count)

@@ -14,6 +14,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jaxrock._settings import under_usual_settings
+
 Tree = TypeVar("Tree")
 _given_p = Primitive("given")
 _given_p.multiple_results = True
@@ -77,6 +79,7 @@ def along(function: Callable, by: Any, changes: Any) -> Any:
     return jax.jvp(of_moving, [x for x, _ in moving], [d for _, d in moving])[1]
 
 
+@under_usual_settings
 def _moved(leaves, changes, *, rule, structures):
     structure, of_by = structures
     values = _given_p.bind(*leaves, rule=rule, structures=structures)
@@ -104,6 +107,7 @@ def _of_many(rule: Callable, axes: tuple, values: Any, by: Any, changes: Any) ->
     return jax.vmap(one, (0, list(axes), [axis for axis, d in zip(axes, told) if not is_zero(d)]))(values, own, moving)
 
 
+@under_usual_settings
 def _batched(leaves, axes, *, rule, structures):
     count = structures[0].num_leaves
     size = next(x.shape[axis] for x, axis in zip(leaves, axes) if axis is not None)

@@ -9,6 +9,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import is_traced, scalar, shown
 from jaxrock._parameters import check_single
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.asymmetric import AsymmetricBlock
 from jaxrock.blocks.restitution import Housner, ratio_of_inertia
@@ -59,6 +60,7 @@ class Contact(AbstractTable):
         """Whether the ground never had to pull."""
         return self.least_normal > 0
 
+    @called_by_users
     def sticks(self, friction: ArrayLike) -> Bool[Array, "..."]:
         """Whether a coefficient of friction [-] suffices, below the unstable equilibrium and at the impacts."""
         needed = self.largest_friction

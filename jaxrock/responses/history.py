@@ -13,6 +13,7 @@ from jaxrock._arguments import arguments, at_least, pair
 from jaxrock._checks import Values, by_numpy_or_one_program, scalar, span, throwing
 from jaxrock._precision import say_if_single
 from jaxrock._quickly import quickly
+from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, over_time
 from jaxrock.blocks.flexible import FlexibleBlock
 from jaxrock.blocks.rigid import Block
@@ -59,6 +60,7 @@ class Response(AbstractTable):
     def _columns(self):
         return over_time(self.time, {"rotation": (self.rotation, "rad"), "velocity": (self.velocity, "rad/s")})
 
+    @called_by_users
     def __call__(self, time: Values) -> tuple[Inexact[Array, "..."], Inexact[Array, "..."]]:
         """Rotation and angular velocity.
 

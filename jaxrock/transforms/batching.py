@@ -13,11 +13,12 @@ Which way `Lanes.__call__` takes:
                                   chunks of _NATIVE_LANES where       anew; careful what it postpones
                                   scenes have lists of their own
 
-On accelerators XLA's chunks have _WIDE lanes. *Careful* is the function as it was given, *quick* a part of its
-`Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this process, where llvmlite is: not for what users
-export, nor for functions that do not ask for it (`in_lanes`: flexible columns and whole histories do not), nor for
-programs of operations that `native` does not know. Whether a program is traced at all, or was kept, is told by
-`lowering`.
+On accelerators XLA's chunks have _WIDE lanes. Of a number of scenes that an exported program leaves open
+(`jax.export.symbolic_shape`) all are careful, in chunks of _LANES on CPUs, and at once elsewhere. *Careful* is the
+function as it was given, *quick* a part of its `Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this
+process, where llvmlite is: not for what users export, nor for functions that do not ask for it (`in_lanes`: flexible
+columns and whole histories do not), nor for programs of operations that `native` does not know. Whether a program is
+traced at all, or was kept, is told by `lowering`.
 """
 
 import functools
@@ -60,7 +61,7 @@ class Lanes:
     """
 
     def __init__(
-        self, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool, devices: int = 1, portable=False
+        self, recipe: Recipe, own: tuple[bool, ...], size: Any, on_cpu: bool, devices: int = 1, portable=False
     ):
         self.recipe, self.own, self.size, self.on_cpu, self.portable = recipe, own, size, on_cpu, portable
         self.threads = native.threads(devices) if native is not None else 1
@@ -127,7 +128,8 @@ class Lanes:
 
     @property
     def _is_quick(self) -> bool:
-        return bool(self.recipe.passes and self.recipe.passes.quickly) and (self.size or 0) > _FEW
+        has_quick = bool(self.recipe.passes and self.recipe.passes.quickly)
+        return has_quick and isinstance(self.size, int) and self.size > _FEW
 
     def _plans(self) -> list:
         own = self.own if self.size is not None else self._own_of_one
@@ -189,7 +191,7 @@ class Lanes:
 
         if not self._is_quick:
             wait = self.recipe.refilled or not self.recipe.in_lanes  # for the slowest among them
-            return self._chunked(function, scenes.own, _LANES if wait else _WIDE)
+            return self._chunked(function, scenes.own, _LANES if wait or not isinstance(self.size, int) else _WIDE)
         ready, begun = scenes.begin(passes.begin)
 
         def quickly(limit, own, states):
@@ -228,20 +230,22 @@ class Lanes:
         return jax.lax.while_loop(lambda carry: carry[2].any(), body, carry)[1]
 
     def _width(self, most: int, size: int) -> int:
+        if not isinstance(size, int):
+            return most if self.on_cpu else size
         return min(most if self.on_cpu else _WIDE, size)
 
     def _chunked(self, function: Callable, leaves, most: int = _LANES):
         """`function` of leaves with a leading axis, in chunks; the last is filled up with its last scene."""
-        size = self.size or 0  # there is one: a single scene is not cut
+        size = self.size  # there is one: a single scene is not cut
         lanes = self._width(most, size)
         chunks = -(-size // lanes)
 
         def cut(x):
-            x = jnp.concatenate([x, jnp.repeat(x[-1:], chunks * lanes - self.size, axis=0)])
+            x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (chunks * lanes - size, *x.shape[1:]))])
             return x.reshape(chunks, lanes, *x.shape[1:])
 
         results = jax.lax.map(function, jax.tree.map(cut, leaves))
-        return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[: self.size], results)
+        return jax.tree.map(lambda x: x.reshape(chunks * lanes, *x.shape[2:])[:size], results)
 
     def _again(self, function: Callable, leaves, found, which, most: int = _LANES):
         """`found`, with the results of `function(leaves, count)` in the places `which`, in chunks; of a chunk the first

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import jaxpr_as_fun
 
+from jaxrock._settings import narrowed
 from jaxrock.keeping.facts import facts as facts_of
 from jaxrock.numerics.given import given, is_zero
 from jaxrock.transforms.recipe import Derivatives, Passes, Recipe
@@ -66,7 +67,7 @@ def differentiable(
 
 
 def _strong(x: Any) -> Any:
-    x = jnp.asarray(x)
+    x = narrowed(jnp.asarray(x))
     return jax.lax.convert_element_type(x, x.dtype) if getattr(x, "weak_type", False) else x
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxrock._checks import as_real, check_shapes, is_at_hand, placed
+from jaxrock._settings import under_usual_settings
 from jaxrock.transforms.differentiation import differentiable
 
 
@@ -34,6 +35,7 @@ def elementwise(refilled: bool = False, **checks: Callable) -> Callable:
         )
         compiled = jax.jit(functools.partial(_at_elements, one))
 
+        @under_usual_settings
         @functools.wraps(function)
         def checked_and_compiled(*args, **kwargs):
             given = signature.bind(*args, **kwargs).arguments

@@ -25,6 +25,7 @@ from jax.extend.mlir.dialects import func
 from jax.interpreters import mlir
 
 from jaxrock._abstract import without_mesh
+from jaxrock._settings import under_usual_settings
 from jaxrock._undisturbed import undisturbed
 from jaxrock.keeping import facts, folder
 from jaxrock.transforms.batching import Lanes
@@ -36,6 +37,7 @@ _called: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar("call
 
 
 @undisturbed
+@under_usual_settings
 def lowered(context, *leaves, recipe: Recipe, own: tuple[bool, ...], size: int | None, on_cpu: bool):
     """The rule of JAX for the primitive of `scenes`."""
     mesh = getattr(context.module_context.axis_context, "mesh", None)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
+from jaxrock._settings import under_usual_settings
 from jaxrock._undisturbed import undisturbed
 from jaxrock.keeping.facts import settings
 from jaxrock.keeping.folder import name_of
@@ -115,6 +116,7 @@ class Recipe:
         return found
 
     @undisturbed
+    @under_usual_settings
     def _trace(self, function: Callable) -> tuple[ClosedJaxpr, Any]:
         # Outside of any mesh: Equinox compares the types of arguments when it differentiates the solves of Diffrax, and
         # takes those that tell of the mesh of a `shard_map`, and those that do not, for different ones.

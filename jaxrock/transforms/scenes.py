@@ -16,6 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxrock._abstract import summed_like, typed_like, without_mesh
+from jaxrock._settings import under_usual_settings
 from jaxrock.transforms.forward_mode import (
     directions_of,
     in_rows,
@@ -49,9 +50,9 @@ def _compiled(*leaves, recipe, own, size):
 
 
 @scenes_p.def_impl
+@under_usual_settings
 def _(*leaves, recipe, own, size):
-    with jax.disable_jit(False):
-        return _compiled(*leaves, recipe=recipe, own=own, size=size)
+    return _compiled(*leaves, recipe=recipe, own=own, size=size)
 
 
 @scenes_p.def_abstract_eval
@@ -60,6 +61,7 @@ def _(*leaves, recipe, own, size):
     return typed_like(leaves, [((*axis, *x.shape), x.dtype) for x in jax.tree.leaves(recipe.results)])
 
 
+@under_usual_settings
 def _batched(leaves, axes, *, recipe, own, size):
     new = [axis is not None for axis in axes]  # what is not mapped has none
     leaves = [jnp.moveaxis(x, axis, 0) if moved else x for x, axis, moved in zip(leaves, axes, new)]
@@ -114,6 +116,7 @@ def _moves(changes) -> tuple[bool, ...]:
     return tuple(type(d) is not ad.Zero and d.dtype != jax.dtypes.float0 for d in changes)
 
 
+@under_usual_settings
 def _pushed(leaves, changes, *, recipe, own, size):
     moves = _moves(changes)
     if not any(moves):
@@ -216,6 +219,7 @@ def _jacobian_in_rows(leaves, moves, recipe, own, size):
 ad.primitive_jvps[scenes_p] = _pushed
 
 
+@under_usual_settings
 def _transposed(weights, *leaves, recipe, own, size):
     """Of a change on a tape, which is linear in its direction; its value weighs nothing."""
     base, moves = recipe.origin
@@ -257,9 +261,9 @@ def _compiled_alone(*leaves, recipe, moves):
 
 
 @alone_p.def_impl
+@under_usual_settings
 def _(*leaves, recipe, moves):
-    with jax.disable_jit(False):
-        return _compiled_alone(*leaves, recipe=recipe, moves=moves)
+    return _compiled_alone(*leaves, recipe=recipe, moves=moves)
 
 
 @alone_p.def_abstract_eval
@@ -267,6 +271,7 @@ def _(*leaves, recipe, moves):
     return typed_like(leaves, [(x.shape, x.dtype) for x in jax.tree.leaves(value_and_jacobian(recipe, moves).results)])
 
 
+@under_usual_settings
 def _alone_no_more(leaves, axes, *, recipe, moves):
     own = tuple(axis is not None for axis in axes)
     leaves = [jnp.moveaxis(x, axis, 0) if mine else x for x, axis, mine in zip(leaves, axes, own)]
@@ -278,6 +283,7 @@ def _alone_no_more(leaves, axes, *, recipe, moves):
 batching.primitive_batchers[alone_p] = _alone_no_more
 
 
+@under_usual_settings
 def _alone_pushed(leaves, changes, *, recipe, moves):
     moved = _moves(changes)
 
@@ -298,6 +304,7 @@ def _alone_pushed(leaves, changes, *, recipe, moves):
 ad.primitive_jvps[alone_p] = _alone_pushed
 
 
+@under_usual_settings
 def _alone_lowered(context, *leaves, **parameters):
     written = mlir.lower_fun(functools.partial(_by_directions, **parameters), multiple_results=True)
     return written(without_mesh(context), *leaves)
