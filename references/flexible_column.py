@@ -106,8 +106,8 @@ def pieces_of(motion):
 
 
 class Chain:
-    """The same column with any damping, finite rotations, any law of its base and its weight, by SciPy: a chain of rigid
-    elements that springs hold straight, in the angles of its elements.
+    """The same column with any damping, finite rotations, any law of its base and its weight, by SciPy: a chain of
+    rigid elements that springs hold straight, in the angles of its elements.
 
     Its masses move by the sum of the elements before them; forces are turned into moments of the elements by how places
     change with angles.
