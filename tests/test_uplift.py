@@ -147,3 +147,30 @@ def test_random_columns_beside_the_chain(group):
         (count, expected), late, peak, rotation, top = beside_the_chain(*drawn(random, *group))
         assert count == expected
         assert late < 1e-6 and peak < 1e-5 and rotation < 1e-5 and top < 1e-5
+
+
+@pytest.mark.slow
+def test_slopes_through_an_uplift_beside_differences_of_the_chain():
+    """Of rotation and top, while the base is up and after its first return."""
+    shape, _, duration = CASES["stiffness"]
+    times, samples, step = np.array([0.045, 0.058]), np.array(SHAKING), 1e-4
+
+    def scene(factor):
+        block = rk.blocks.FlexibleBlock(**shape | dict(damping_ratio=0.02), restitution=0.6)
+        return block, rk.Record(factor * samples, 0.18)
+
+    @jax.jit
+    def slopes(factor):
+        def numbers(factor):
+            return jnp.stack(rk.simulate(*scene(factor), duration=duration, samples=11)(times)[:2])
+
+        return jax.jvp(numbers, (factor,), (1.0,))[1]
+
+    def by_scipy(factor):
+        chain = Chain(*scene(factor))
+        paths, _ = chain.follow(duration, 1e-12)
+        return np.array([chain.at(paths, t) for t in times]).T
+
+    expected = (by_scipy(1 + step) - by_scipy(1 - step)) / (2 * step)
+    found = slopes(1.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max(1).min())

@@ -50,7 +50,7 @@ class Numbers(eqx.Module):
 
     squares: Inexact[Array, " modes"]
     damping: Inexact[Array, " modes"]
-    damping_at_rest: Inexact[Array, " modes"]  # the same as the moment at a locked base has it
+    damping_at_rest: Inexact[Array, " modes"]  # in the moment at a locked base; differs where weight couples modes
     mass_damping: Scalar
     rotation: Inexact[Array, " modes"]
     load: Inexact[Array, " modes"]  # translation cos(alpha) g/L: per ground acceleration in g
