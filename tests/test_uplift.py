@@ -122,7 +122,7 @@ def beside_the_chain(block, motion):
     assert outcome.impact_count == found.impact_count and outcome.overturned == found.overturned
     assert float(outcome.max_rotation) == pytest.approx(float(found.max_rotation), rel=1e-12)
     chain = Chain(block, motion)
-    paths, impacts = chain.follow(duration)
+    paths, impacts = chain.follow(duration, 1e-12)  # its rotation is 1e-4 off with 1e-10, where little damps
     counts = int(found.impact_count), len(impacts)
     times = np.linspace(0.05, duration, 11)
     expected = np.array([chain.at(paths, t) for t in times]).T
@@ -141,12 +141,12 @@ def beside_the_chain(block, motion):
 @pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS, ids=["-".join(map(str, group)) for group in GROUPS])
 def test_random_columns_beside_the_chain(group):
-    """216 in all; of columns whose phases are linear the chain, not the column, is off by 1e-6."""
+    """216 in all."""
     random = np.random.default_rng(GROUPS.index(group))
     for _ in range(9):
         (count, expected), late, peak, rotation, top = beside_the_chain(*drawn(random, *group))
         assert count == expected
-        assert late < 1e-6 and peak < 1e-5 and rotation < 1e-5 and top < 1e-5
+        assert late < 1e-7 and peak < 1e-5 and rotation < 1e-5 and top < 1e-6
 
 
 @pytest.mark.slow
