@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
 
 import jaxrock as rk
 
@@ -90,12 +91,26 @@ def independent(block, motion, duration):
     return at, impacts
 
 
+def pieces_of(motion):
+    """Start, end and acceleration [g] of each smooth piece of a pulse or a record, by its own formula."""
+    if isinstance(motion, rk.Record):
+        dt, samples = float(motion.dt), np.asarray(motion.samples)
+        lines = zip(dt * np.arange(samples.size - 1), samples, samples[1:])
+        return [(t, t + dt, lambda x, t=t, a=a, b=b: a + (b - a) * (x - t) / dt) for t, a, b in lines]
+    size = float(motion.amplitude)
+    if isinstance(motion, rk.RectangularPulse):
+        return [(0.0, float(motion.duration), lambda t: size)]
+    period = float(motion.period)
+    wave = {rk.SinePulse: np.sin, rk.CosinePulse: np.cos}[type(motion)]
+    return [(0.0, period, lambda t: size * wave(2 * np.pi * t / period))]
+
+
 class Chain:
-    """The same column with finite rotations, any law of its base and its weight, by SciPy: a chain of rigid elements
-    that springs hold straight, in the angles of its elements.
+    """The same column with any damping, finite rotations, any law of its base and its weight, by SciPy: a chain of
+    rigid elements that springs hold straight, in the angles of its elements.
 
     Its masses move by the sum of the elements before them; forces are turned into moments of the elements by how places
-    change with angles. The damping is in proportion to stiffness.
+    change with angles.
     """
 
     def __init__(self, block, motion):
@@ -109,9 +124,11 @@ class Chain:
         self.count = len(self.masses)
         self.arms = np.tri(self.count) * self.length / self.count  # of elements, on masses
         self.bend = self.arms.T @ stiffness @ self.arms
-        slowest = np.linalg.eigvalsh(stiffness / np.sqrt(np.outer(self.masses, self.masses)))[0]
-        self.damping = 2 * ratio / np.sqrt(slowest)
-        self.restitution, self.motion = float(block.restitution), motion
+        self.drag, loss = damping_of(block.damping, ratio, self.masses, stiffness)
+        self.loss = self.arms.T @ loss @ self.arms
+        self.bend_of_base, self.loss_of_base = self.bend.sum(0), self.loss.sum(0)
+        self.restitution, self.every = float(block.restitution), block.impacts == "every"
+        self.pieces = pieces_of(motion)
         self.moment = self.mass * 9.81 * self.length / 2
 
     def places(self, angles):
@@ -129,16 +146,16 @@ class Chain:
 
     def turn(self, angles, speeds, theta, side):
         """Velocity of the base, from the balance of moments there: damping holds it back."""
-        ones = np.ones(self.count)
-        held = ones @ self.bend @ (angles - theta) - self.spring(theta, side)
-        return (held / self.damping + ones @ self.bend @ speeds) / (ones @ self.bend @ ones)
+        held = self.bend_of_base @ angles - self.bend_of_base.sum() * theta - self.spring(theta, side)
+        return (held + self.loss_of_base @ speeds) / self.loss_of_base.sum()
 
-    def rates(self, t, x, side):
+    def rates(self, x, side, ground):
+        """How fast angles, their speeds and the base's rotation change under the ground's acceleration [g]."""
         angles, speeds, theta = x[: self.count], x[self.count : -1], x[-1]
         turn = self.turn(angles, speeds, theta, side) if side else 0.0
         across, up = self.places(angles)
-        push = -self.ground(t) * np.cos(self.alpha) * self.masses
-        moments = across.T @ push - self.bend @ (angles - theta + self.damping * (speeds - turn))
+        push = -9.81 * ground * np.cos(self.alpha) * self.masses
+        moments = across.T @ push - self.bend @ (angles - theta) - self.loss @ (speeds - turn)
         if self.p_delta:
             moments -= up.T @ (9.81 * self.masses) if self.finite else -self.arms.T @ (9.81 * self.masses) * angles
         inertia = across.T @ (self.masses[:, None] * across)
@@ -148,45 +165,44 @@ class Chain:
             moments = (
                 moments - across.T @ (self.masses * (up @ speeds**2)) + up.T @ (self.masses * (across @ speeds**2))
             )
+        moments = moments - self.drag * (inertia @ speeds)
         return np.concatenate([speeds, np.linalg.solve(inertia, moments), [turn]])
-
-    def ground(self, t):
-        """Acceleration of a sine pulse [m/s^2]."""
-        period = float(self.motion.period)
-        return float(self.motion.amplitude) * 9.81 * np.sin(2 * np.pi * t / period) if t < period else 0.0
 
     def held(self, x):
         """Moment at a locked base."""
-        return np.sum(self.bend @ (x[: self.count] + self.damping * x[self.count : -1]))
+        return self.bend_of_base @ x[: self.count] + self.loss_of_base @ x[self.count : -1]
 
     def follow(self, duration, tolerance=1e-10):
         """Paths (start, end, function) and times of impacts."""
         strength = self.moment * np.sin(self.alpha)
-        t, x, side, last = 0.0, np.zeros(2 * self.count + 1), 0, 0
-        pieces, impacts = [], []
+        t, x, side, last, stay, braked = 0.0, np.zeros(2 * self.count + 1), 0, 0, 0.0, 0.0
+        paths, impacts = [], []
+        quiet = (self.pieces[-1][1], np.inf, lambda t: 0.0)
         while t < duration:
-            stop = float(self.motion.period) if t < float(self.motion.period) else duration
+            _, stop, ground = next(piece for piece in [*self.pieces, quiet] if t < piece[1] * (1 - 1e-15))
 
             def edge(t, x, side=side):
                 return side * x[-1] if side else strength - abs(self.held(x))
 
             edge.terminal, edge.direction = True, -1
             path = solve_ivp(
-                lambda t, x, side=side: self.rates(t, x, side), (t, stop), x, "DOP853", events=edge, rtol=tolerance,
-                atol=tolerance / 1000, dense_output=True, max_step=0.02,
+                lambda t, x, side=side, ground=ground: self.rates(x, side, ground(t)), (t, min(stop, duration)), x,
+                "DOP853", events=edge, rtol=tolerance, atol=tolerance / 1000, dense_output=True, max_step=0.02,
             )  # fmt: skip
-            pieces.append((t, path.t[-1], path.sol))
+            paths.append((t, path.t[-1], path.sol))
+            stay = stay + path.t[-1] - t if side else 0.0
             t, x = path.t[-1], path.y[:, -1].copy()
             if path.status == 1 and side:
-                if side != last:
+                if self.every or side != last or stay > braked:
                     impacts.append(t)
                     x[self.count : -1] *= self.restitution
-                x[-1], last = 0.0, side
+                    braked = stay
+                x[-1], last, stay = 0.0, side, 0.0
                 pushed = self.held(x)
                 side = int(np.sign(pushed)) if abs(pushed) > strength else 0
             elif path.status == 1:
                 side = int(np.sign(self.held(x)))
-        return pieces, impacts
+        return paths, impacts
 
     def at(self, pieces, time):
         """Rotation of the base, and displacement of the top [m]."""
@@ -194,3 +210,27 @@ class Chain:
         angles = found[: self.count]
         across = self.length / self.count * np.sum(np.sin(angles) if self.finite else angles)
         return found[-1], np.cos(self.alpha) * across
+
+    def peak(self, paths):
+        """Largest |rotation| of the base: of parabolas through points of all paths."""
+        found = 0.0
+        for start, end, path in paths:
+            turned = np.abs(path(np.linspace(start, end, 800))[-1])
+            k = int(np.clip(np.argmax(turned), 1, turned.size - 2))
+            slope, bend = (turned[k + 1] - turned[k - 1]) / 2, turned[k + 1] - 2 * turned[k] + turned[k - 1]
+            inside = bend < 0 and abs(slope) <= -bend
+            found = max(found, turned.max(), turned[k] - slope**2 / (2 * bend) if inside else 0.0)
+        return found
+
+
+def damping_of(kind, ratio, masses, stiffness):
+    """Decay rate of all masses, and damping matrix of the column's bending."""
+    squares, shapes = eigh(stiffness, np.diag(masses))
+    rates = np.sqrt(squares)
+    if kind == "stiffness":
+        return 0.0, 2 * ratio / rates[0] * stiffness
+    if kind == "modal":
+        weighed = masses[:, None] * shapes
+        return 0.0, weighed @ np.diag(2 * ratio * rates) @ weighed.T
+    part = 2 * ratio / (rates[0] + rates[1])
+    return part * rates[0] * rates[1], part * stiffness

@@ -72,11 +72,6 @@ class NonlinearScene(FlexibleScene):
         )
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), next_, again)
 
-    def moment(self, motion: Inexact[Array, " states"]) -> Scalar:
-        """Moment at a locked base, over m L^2 [1/s^2]."""
-        column, (q, v) = self.tangents.column, self._clamped(motion)
-        return jnp.sum(column.numbers.rotation * column.elastic(q, v, jnp.zeros(()), jnp.zeros(())))
-
     def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
         """Displacements of the masses from the base to the top, over L cos(alpha)."""
         return self.tangents.column.displacements(self._clamped(motion)[0])

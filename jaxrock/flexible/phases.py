@@ -50,6 +50,7 @@ class Numbers(eqx.Module):
 
     squares: Inexact[Array, " modes"]
     damping: Inexact[Array, " modes"]
+    damping_at_rest: Inexact[Array, " modes"]  # in the moment at a locked base; differs where weight couples modes
     mass_damping: Scalar
     rotation: Inexact[Array, " modes"]
     load: Inexact[Array, " modes"]  # translation cos(alpha) g/L: per ground acceleration in g
@@ -78,10 +79,12 @@ class Numbers(eqx.Module):
         # At critical damping two rates coincide and the modes do not span the motion: keep clear of it.
         decay = mass_damping + damping
         critical = jnp.abs(decay**2 - 4 * squares) < 1e-11 * squares
+        damping = jnp.where(critical, damping * (1 + 1e-10), damping)
         rotation = jnp.asarray(column.rotation, dtype)
         return cls(
             squares=squares,
-            damping=jnp.where(critical, damping * (1 + 1e-10), damping),
+            damping=damping,
+            damping_at_rest=damping,
             mass_damping=mass_damping,
             rotation=rotation,
             load=jnp.asarray(column.translation, dtype) * jnp.cos(block.alpha) * block.gravity / block.length,
@@ -99,7 +102,7 @@ class Numbers(eqx.Module):
     def moment(self, state: Inexact[Array, " states"]) -> Scalar:
         """Base moment of the column on a locked base, over m L^2."""
         q, v = jnp.split(state[:-1], 2)
-        return jnp.sum(self.rotation * (self.squares * q + self.damping * v))
+        return jnp.sum(self.rotation * (self.squares * q + self.damping_at_rest * v))
 
 
 class Phase(eqx.Module):
@@ -149,7 +152,7 @@ def locked_phase(numbers: Numbers) -> Phase:
     def both(first, second):
         return jnp.concatenate([first, second, jnp.zeros(1)]) + 0j
 
-    moment = numbers.rotation * (numbers.squares + numbers.damping * rates)
+    moment = numbers.rotation * (numbers.squares + numbers.damping_at_rest * rates)
     top = both(numbers.tip, numbers.tip)
     return Phase(
         rates=jnp.concatenate([rates.ravel(), -jnp.ones(1)]),

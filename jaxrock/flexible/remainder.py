@@ -77,6 +77,7 @@ class Tangents(eqx.Module):
         about = Numbers(
             squares=squares,
             damping=numbers.damping @ turn**2,
+            damping_at_rest=(numbers.rotation * numbers.damping) @ turn / lever,
             mass_damping=numbers.mass_damping,
             rotation=lever,
             load=numbers.load @ turn,
@@ -110,7 +111,7 @@ class Tangents(eqx.Module):
         displaced = column.displacements(self.turn @ q)[-1]
         straight = jnp.sum(about.tip * q)
         bending = (displaced - column.sine(rotation)) - (straight - rotation)
-        return Remainder(force, moment + lost, displaced - straight, bending, -lost)
+        return Remainder(force, moment + lost, displaced - straight, bending)
 
 
 class Remainder(NamedTuple):
@@ -120,7 +121,6 @@ class Remainder(NamedTuple):
     moment: Inexact[Array, "*points"]
     displacement: Inexact[Array, "*points"]
     bending: Inexact[Array, "*points"]
-    locked_moment: Inexact[Array, "*points"]
 
 
 class NonlinearArc(Arc):
@@ -231,12 +231,12 @@ def nonlinear_arc(
 
     held = force, shift, jnp.zeros((POINTS, path.exponents.size), path.exponents.dtype), jnp.asarray(jnp.inf)
     nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(followed, (held, None)))
-    (_, shift, _, change), (amplitudes, coefficients, found, _) = jax.lax.fori_loop(
+    (_, shift, before, change), (amplitudes, coefficients, found, modes) = jax.lax.fori_loop(
         0, _ROUNDS + 1, round_, (held, nothing)
     )
+    unsettled = jax.lax.stop_gradient(jnp.max(jnp.abs(modes - before), 0))
     turned = step.shift(found)
-    locked = jnp.where(side == 0, found.locked_moment, 0.0)
-    outputs = jnp.stack([turned, found.displacement, found.bending - turned, locked], 1)
+    outputs = jnp.stack([turned, found.displacement, found.bending - turned, jnp.zeros(POINTS)], 1)
     tails = _tail(outputs)
     onto = jnp.abs(path.phase.project[:, n:-1])
     rounding = 8 * jnp.finfo(tails.dtype).eps * tangents.numbers.balance  # which no shorter step makes smaller
@@ -247,7 +247,7 @@ def nonlinear_arc(
     error = jax.lax.stop_gradient(forced + change + jnp.max(tails[:3]))
     remainder = jnp.pad((_POWERS @ outputs).T, ((0, 0), (0, terms - POINTS)))
     return NonlinearArc(
-        path.phase, path.center, path.offsets, amplitudes, path.exponents, coefficients, path.errors,
+        path.phase, path.center, path.offsets, amplitudes, path.exponents, coefficients, path.errors + unsettled,
         shift=jnp.pad(shift, (0, terms - POINTS)), remainder=remainder, doubts=jax.lax.stop_gradient(tails),
         error=error,
     )  # fmt: skip

@@ -232,7 +232,7 @@ class FlexibleScene(eqx.Module):
         slowed = still.at[n:-1].multiply(_ratio(self.reset, state.side, jnp.abs(speed)))
         after = jnp.where(counts, slowed, still)
         # A damped column may push the base over at once.
-        pushed = self.moment(after)
+        pushed = numbers.moment(after)
         over = numbers.damped & (jnp.abs(pushed) > numbers.strength)
         side = jnp.where(returned, jnp.where(over, jnp.sign(pushed), 0.0), state.side)
         side = jnp.where(~rocking & (below | above), jnp.where(above, 1.0, -1.0), side)
@@ -260,10 +260,6 @@ class FlexibleScene(eqx.Module):
             status=Status.where(finite, state.status, Status.not_finite),
             steps=state.steps + 1,
         )
-
-    def moment(self, motion: Inexact[Array, " states"]) -> Scalar:
-        """Moment at a locked base, over m L^2 [1/s^2]."""
-        return self.numbers.moment(motion)
 
     def column(self, motion: Inexact[Array, " states"]) -> Inexact[Array, " masses"]:
         """Displacements of the masses from the base to the top, over L cos(alpha)."""
