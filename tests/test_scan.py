@@ -13,7 +13,7 @@ from jaxrock.inverse.scatter import Quadrature, rocks_at
 RATIO = 1.9207  # half of 1.96^2
 UNKNOWNS = {"amplitude": (0.03, 3.0), "period": (0.1, 4.0)}
 GRID = 96  # points along each axis
-FEW, MANY = range(3), range(3, 30)
+FEW, MANY = (1, 2), (0, *range(3, 30))
 
 
 def unknowns():
