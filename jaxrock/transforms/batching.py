@@ -236,7 +236,7 @@ class Lanes:
 
     def _chunked(self, function: Callable, leaves, most: int = _LANES):
         """`function` of leaves with a leading axis, in chunks; the last is filled up with its last scene."""
-        size = self.size  # there is one: a single scene is not cut
+        size = self.size  # a single scene is not chunked
         lanes = self._width(most, size)
         chunks = -(-size // lanes)
 
