@@ -192,8 +192,8 @@ def test_no_change_lies_on_both_sides():
     assert least_change(np.zeros((1, 2)), np.array([-1.0])) is None
 
 
-def test_what_is_claimed_is_what_was_tried():
-    """The nearest of the starts' records; the others are told, and no word says that there is none nearer."""
+def test_texts_claim_only_the_nearest_of_the_starts():
+    """The result is the nearest of the starts' records; its text claims no more, and `changes` has the others."""
     result = found(starts=8, baseline=False)
     assert result.changes.shape == (8,) and float(result.change) == float(np.min(result.changes))
     words = rk.inverse.RecordStatus[result.status]

@@ -1,8 +1,7 @@
 """Ground motions: the interface between every motion and the engines, and motions made of motions.
 
-A motion is smooth on pieces. It gives the times that separate them (`knots`), for each piece a time scale and a bound
-of its acceleration, and its Taylor series at any point of a piece. Accelerations are in units of g; positive
-acceleration drives negative rotation.
+A motion is smooth on pieces. It gives the times that separate them (`knots`), a time scale and a bound of every piece,
+and its Taylor series at any point of a piece. Accelerations are in g; a positive one drives negative rotation.
 """
 
 import abc
