@@ -1,9 +1,9 @@
 """The probability of observations of rocks under a motion.
 
-A survey of a rock shows the sign of the margin of a known block under a known motion. Neither is known. The motion at
-each rock differs from that of the site by a lognormal factor. `scatter` is its standard deviation in ln amplitude:
-variation of the ground, and errors of the model of a rigid block in a plane. The parameters alpha, p and restitution
-are uncertain too. The probability that a rock stands is the share of these possible scenes with a positive margin:
+A known block under a known motion stands or falls by the sign of its margin. Neither is known. The motion at each rock
+differs from that of the site by a lognormal factor. `scatter` is its standard deviation in ln amplitude: variation of
+the ground, and errors of the model of a rigid block in a plane. The parameters alpha, p and restitution are uncertain
+too. The probability that a rock stands is the share of these possible scenes with a positive margin:
 
     P(stands) = E[margin > 0],  over  ln amplitude + scatter e0,  ln alpha + (alpha_sd/alpha) e1,  ln p + (p_sd/p) e2,
     restitution + restitution_sd e3,  all e independent and normal.
