@@ -72,7 +72,7 @@ class EstimateStatus(Enumeration):
     not_converged = item("The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none.")
     several_maxima = item(
         "Several maxima explain the observations about equally well: others are less than 1.92 below the highest in "
-        "log-likelihood (see `competing`). Every interval covers those that were found and what lies between, and ends "
+        "log-likelihood (see `competing`). Every interval covers those that were found and the gaps between, and ends "
         "within the range that was searched."
     )
 
@@ -261,7 +261,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
         else:
-            remarks += ("With no scatter that was tried, up to ten times as large, would the observations agree.",)
+            remarks += ("With no scatter that was tried, up to ten times as large, do the observations agree.",)
     arrays = {
         "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
         "directions": shape.directions, "deviations": shape.deviations, "log_likelihood": summits.values[best],
@@ -328,7 +328,7 @@ def _remarks(problem: Problem, shape: Shape, profiled: Profile, others: Competin
         )
     if error > _UNSURE:
         said = f"The quadrature leaves a standard error of {error:.2g} in the log-likelihood at its maximum"
-        remarks.append(f"{said}: a smaller `accuracy` tells more.")
+        remarks.append(f"{said}: a smaller `accuracy` reduces it.")
     for name, (below, above) in zip(problem.names, profiled.open):
         if below and above:
             remarks.append(f"The observations do not determine {name}.")

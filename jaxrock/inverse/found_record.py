@@ -44,13 +44,13 @@ class RecordStatus(Enumeration):
     """What became of a search for a record; `RecordStatus[found.status]` is the message."""
 
     successful = item(
-        "The margins are as wanted. Of the records to which the search came from its starts this is the nearest (see "
-        "`changes`); a search from others may find a nearer one."
+        "The margins are as wanted. This record is the nearest of those that the starts led to (see `changes`); other "
+        "starts may find a nearer one."
     )
     unchanged = item("The margins are as wanted under the record as it is.")
     useless_slopes = item(
-        "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
-        "long that slopes lead nowhere, and digits of the record decide that nobody measures. Nearer ones are likely."
+        "The margins are as wanted, but they change by more than 1e6 for a change of 1 g. After such long rocking "
+        "slopes lead nowhere, and digits of the record below any measurement decide. Nearer records are likely."
     )
     spectrum_changed = item(
         "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "

@@ -61,7 +61,7 @@ def warn_once(risk: str) -> None:
     """Warn that nothing is cached, with the remedy; once in a process for each reason."""
     warnings.warn(
         f"Compiled programs are not kept between sessions: {risk}. They would run with your rights. Let JAXROCK_CACHE "
-        "name a folder of yours in which others cannot write, or say JAXROCK_CACHE=off.",
+        "name a folder of yours in which others cannot write, or set JAXROCK_CACHE=off.",
         RuntimeWarning,
         stacklevel=frames_of_the_package() + 1,
     )
