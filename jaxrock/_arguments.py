@@ -28,10 +28,10 @@ Check = Callable[[str, Any], Any]  # of a name and a value; returns the value, o
 
 
 def arguments(function: Taking) -> Taking:
-    """Decorate a function whose arguments are checked by their annotations, before it sees them. It runs under the
-    package's settings of JAX (`_settings`), on numbers of a precision that is switched on.
+    """Decorate a function whose arguments are checked against their annotations before it runs. It runs under the
+    package's settings of JAX (`_settings`), on arrays of enabled types.
 
-    **Raises:** ValueError, when it is called, for an argument that is not what is asked for: "Argument `x` must ...".
+    **Raises:** ValueError, when it is called, for an argument outside its range: "Argument `x` must ...".
     """
     parameters = inspect.signature(function).parameters.values()
     checks = {each.name: check_of(each.annotation) for each in parameters}

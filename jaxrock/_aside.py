@@ -16,15 +16,15 @@ _ATTEMPTS, _BETWEEN = 40, 0.05  # to remove what is left over; seconds between t
 
 @contextlib.contextmanager
 def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) -> Iterator[Path]:
-    """Where to write what shall be at `path`: it gets there when all is written, and nothing remains where that fails.
+    """Yield a temporary path; rename it to `path` when the body ends, and remove it when the body fails.
 
     **Arguments:**
 
-    - `replace`: whether it takes the place of a file that is there, and of the file that a link leads to.
-    - `lasting`: whether it has reached the disk before it is renamed, so that it outlives a loss of power.
+    - `replace`: whether to replace an existing file, or the file that a link leads to.
+    - `lasting`: whether to flush it to disk before the rename, so that it survives a power loss.
 
-    **Raises:** FileExistsError where somebody else was faster, unless it replaces; IsADirectoryError; FileNotFoundError
-    where there is no folder for it; OSError where it would replace what is no regular file, such as a device.
+    **Raises:** FileExistsError where `path` exists, unless `replace`; IsADirectoryError; FileNotFoundError where the
+    folder is missing; OSError for an existing path that is not a regular file, such as a device.
     """
     if replace and path.exists():
         _check_replaced(path)
@@ -48,7 +48,7 @@ def written_aside(path: Path, *, replace: bool = False, lasting: bool = True) ->
 
 
 def _check_replaced(path: Path) -> None:
-    """Raise OSError for what is no regular file: a device, for one, which root could replace by a file."""
+    """Raise OSError for a path that is not a regular file; root could replace even a device."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not path.is_file():
@@ -79,9 +79,9 @@ def _reach_the_disk(file: Path) -> None:
 
 
 def move_into_place(aside: Path, path: Path, replace: bool) -> None:
-    """Rename what is written to what it shall be called.
+    """Rename a finished file or folder to its final name.
 
-    **Raises:** FileExistsError where something is there, unless it is replaced.
+    **Raises:** FileExistsError where the name is taken, unless `replace`.
     """
     if replace:
         os.replace(aside, path)

@@ -110,7 +110,7 @@ def _as_real(name: str, value: Values) -> Inexact[Array, "..."]:
         if isinstance(known, np.ndarray) and known.dtype.kind in "fiu":
             known = native(known)
             is_real = known.dtype.kind == "f" and known.dtype.itemsize >= usual.itemsize // 2
-            with np.errstate(over="ignore"):  # its range tells an infinite number
+            with np.errstate(over="ignore"):  # the check of the range reports an infinite number
                 return placed(known if is_real else known.astype(usual))  # of integers, and of half precision
         array = narrowed(as_array(known))
     except (TypeError, ValueError, OverflowError) as error:
@@ -195,7 +195,8 @@ def checked(name: str, value: Values, allowed: str, holds: Callable) -> Inexact[
 
 
 def _as_given(value: Values, known: np.ndarray, bad: np.ndarray) -> str:
-    """Say the first bad number; as it was given, where it becomes zero or infinite in the precision of the session."""
+    """Return the first bad number as text, and as given where the precision of the session makes it zero or
+    infinite."""
     number = known[bad].flat[0]
     given = np.asarray(value) if not isinstance(value, jax.Array) else known
     if given.shape == bad.shape and (number == 0 or np.isinf(number)) and number != given[bad].flat[0]:

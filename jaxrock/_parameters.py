@@ -169,8 +169,8 @@ def leaves_of(owner: Any, path: tuple[str, ...] = (), known: Parameter = _UNDECL
 
 
 def with_values(owner: Any, values: Mapping[str, Any]) -> Any:
-    """Return the owner with other values of those of its numbers that are named, wherever in it they are: in modules,
-    dictionaries, lists or tuples."""
+    """Return the owner with new values of the named parameters, which may lie in modules, dictionaries, lists or
+    tuples."""
     leaves = [values.get(leaf.name, leaf.value) if leaf.is_number else leaf.value for leaf in leaves_of(owner)]
     return jax.tree.unflatten(jax.tree.structure(owner), leaves)
 
@@ -205,8 +205,8 @@ def one_of_many(owners: Any, index: Any) -> Any:
 
 
 def in_precision(owner: Any, dtype: Any) -> Any:
-    """The owner with all its numbers as real ones of this kind, but for what is declared whole, and for booleans that
-    are not declared."""
+    """Return the owner with its numbers cast to a floating-point type, except declared integers and undeclared
+    booleans."""
 
     def of(leaf):
         is_flag = leaf.declared.axes is None and jnp.issubdtype(jnp.result_type(leaf.value), jnp.bool_)

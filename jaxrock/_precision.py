@@ -29,7 +29,7 @@ def _say() -> None:
 
 
 def frames_of_the_package() -> int:
-    """Of those that lead to the caller of this: after them comes who called the package."""
+    """Count the frames of the package above the caller; the next frame is the user's."""
     frame, count = sys._getframe(1), 0
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
         frame, count = frame.f_back, count + 1

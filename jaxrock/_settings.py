@@ -1,11 +1,12 @@
-"""JAX's settings under which the package computes, whatever a user has set to look at own code.
+"""Settings of JAX under which the package computes, independent of those with which users check their own code.
 
-Some settings make JAX stricter: it raises for every NaN (`jax_debug_nans`), for operands of two types
-(`jax_numpy_dtype_promotion`), for numbers that go to a device unasked (`jax_transfer_guard`). They find mistakes in the
-code that their user writes. Results of this package hold NaN and infinity by contract, beside a status that says so.
-Its own programs mix types and place numbers on purpose. So public functions, and the rules by which JAX transforms and
-compiles them, run under the usual settings; the user's code around them keeps its own. JAX keeps each of these settings
-by thread, and nothing global changes.
+Some settings make JAX stricter. It raises for every NaN (`jax_debug_nans`), for operands of two types
+(`jax_numpy_dtype_promotion`), for implicit transfers to a device (`jax_transfer_guard`). They find mistakes in the
+user's own code. Results of this package hold NaN and infinity by contract, beside a status that says so. Its programs
+mix types and transfer numbers on purpose.
+
+So public functions run under the usual settings, as do the rules by which JAX transforms and compiles them. The user's
+code around them keeps its own settings. JAX keeps each of these settings by thread, and nothing global changes.
 """
 
 import contextlib
@@ -21,7 +22,7 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 _LENIENT = (None, "allow", "log", "log_explicit")
-# By name: values that are left as they are, and the context in which the setting is a usual one.
+# By name: the values left as they are, and the context that sets the usual value.
 _USUAL: dict[str, tuple[tuple, Callable]] = {
     "jax_debug_nans": ((False,), lambda: jax.debug_nans(False)),
     "jax_debug_infs": ((False,), lambda: jax.debug_infs(False)),
@@ -36,7 +37,7 @@ _USUAL: dict[str, tuple[tuple, Callable]] = {
 
 @contextlib.contextmanager
 def usual_settings() -> Iterator[None]:
-    """Within it, in this thread, JAX's settings are those under which the package computes."""
+    """Enter, in this thread, the settings of JAX under which the package computes."""
     with contextlib.ExitStack() as stack:
         for _, usual in _unusual():
             stack.enter_context(usual())
@@ -44,13 +45,13 @@ def usual_settings() -> Iterator[None]:
 
 
 def _unusual() -> list[tuple[str, Callable]]:
-    """Settings that a user has made stricter, with the contexts that undo it."""
+    """Return the settings that a user has made stricter, each with the context that undoes it."""
     config: Any = jax.config
     return [(name, usual) for name, (allowed, usual) in _USUAL.items() if getattr(config, name) not in allowed]
 
 
 def under_usual_settings(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a function that runs under the package's settings of JAX, whatever those of its caller are."""
+    """Decorate a function to run under the package's settings of JAX, independent of its caller's settings."""
 
     @functools.wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -66,12 +67,12 @@ def under_usual_settings(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def kept_by_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a function that makes arrays of NumPy for programs of JAX: they are kept, those of single and of double
-    precision apart.
+    """Decorate a function that makes NumPy arrays for programs of JAX: cache its results, separately for single and
+    double precision.
 
-    JAX keeps what it makes of an array of NumPy in a program, and gives it to every later program that holds the same
-    array, also after `jax_enable_x64` has changed: that program would not compile, or compute in single precision. Such
-    an array of a module comes to programs by `jnp.asarray` with a type, which makes it anew.
+    JAX caches the constant of a NumPy array, and reuses it in every later program that holds the same array. That holds
+    also after `jax_enable_x64` has changed: such a program would not compile, or compute in single precision. A
+    module's own array must therefore enter programs by `jnp.asarray` with a type, which converts it anew.
     """
 
     @functools.cache
@@ -87,19 +88,21 @@ def kept_by_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def is_wider(x: Any) -> bool:
-    """Whether an array of JAX is of a type that JAX has switched off, such as double precision."""
+    """Return whether a JAX array has a type that JAX has disabled, such as double precision."""
     return isinstance(x, jax.Array) and jax.dtypes.canonicalize_dtype(x.dtype) != x.dtype
 
 
 def in_precision_of_session(tree: Any) -> Any:
-    """A tree whose arrays of JAX are of types that are switched on: what was made in double precision is single where
-    `jax.enable_x64(False)` holds, as JAX makes of NumPy's arrays."""
+    """Return a tree whose JAX arrays have enabled types.
+
+    Arrays made in double precision become single where `jax.enable_x64(False)` holds, as NumPy arrays do in JAX.
+    """
     config: Any = jax.config
     if config.jax_enable_x64:
         return tree
     try:
         flat: tuple[list, Any] = jax.tree.flatten(tree)
-    except (TypeError, ValueError):  # keys of a dictionary that cannot be sorted: the function says what is wrong
+    except (TypeError, ValueError):  # keys that cannot be sorted: the decorated function raises for them
         return tree
     leaves, structure = flat
     if not any(map(is_wider, leaves)):
@@ -108,19 +111,19 @@ def in_precision_of_session(tree: Any) -> Any:
 
 
 def called_by_users(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate what users call: it runs under the package's settings, on arrays of types that are switched on."""
+    """Decorate a public function: it runs under the package's settings, on arrays of enabled types."""
 
     @under_usual_settings
     @functools.wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        given = tuple(map(in_precision_of_session, args))  # each by itself: an object that is being made stays as it is
+        given = tuple(map(in_precision_of_session, args))  # one by one: a half-built object must stay itself
         return function(*given, **{name: in_precision_of_session(value) for name, value in kwargs.items()})
 
     return run
 
 
 def narrowed(x: Any) -> Any:
-    """One array of JAX, of a type that is switched on; anything else as it is."""
+    """Return a JAX array in an enabled type, and anything else unchanged."""
     if not is_wider(x):
         return x
     kind = jax.dtypes.canonicalize_dtype(x.dtype)

@@ -40,9 +40,9 @@ def _shape(text: str) -> tuple[int, int]:
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a text file, without their ends.
+    """Return the lines of a text file, without line ends.
 
-    **Raises:** OSError if it cannot be opened; ValueError for what is no regular file, no text, empty or too large.
+    **Raises:** OSError if it cannot be opened; ValueError for a file that is not regular, not text, empty or too large.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size

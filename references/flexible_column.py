@@ -92,7 +92,7 @@ def independent(block, motion, duration):
 
 
 def pieces_of(motion):
-    """Start, end and acceleration [g] of each smooth piece of a pulse or a record, by its own formula."""
+    """Return start, end and acceleration [g] of each smooth piece of a pulse or a record, by its own formula."""
     if isinstance(motion, rk.Record):
         dt, samples = float(motion.dt), np.asarray(motion.samples)
         lines = zip(dt * np.arange(samples.size - 1), samples, samples[1:])
@@ -106,11 +106,10 @@ def pieces_of(motion):
 
 
 class Chain:
-    """The same column with any damping, finite rotations, any law of its base and its weight, by SciPy: a chain of
-    rigid elements that springs hold straight, in the angles of its elements.
+    """A column with any damping, finite rotations, any law of its base and its weight, by SciPy.
 
-    Its masses move by the sum of the elements before them; forces are turned into moments of the elements by how places
-    change with angles.
+    It is a chain of rigid elements that springs hold straight, in the angles of its elements. Masses move by the sum of
+    the elements below them. The Jacobian of places by angles turns forces into moments of the elements.
     """
 
     def __init__(self, block, motion):
@@ -150,7 +149,7 @@ class Chain:
         return (held + self.loss_of_base @ speeds) / self.loss_of_base.sum()
 
     def rates(self, x, side, ground):
-        """How fast angles, their speeds and the base's rotation change under the ground's acceleration [g]."""
+        """Return rates of angles, their speeds and the base's rotation under the ground's acceleration [g]."""
         angles, speeds, theta = x[: self.count], x[self.count : -1], x[-1]
         turn = self.turn(angles, speeds, theta, side) if side else 0.0
         across, up = self.places(angles)
@@ -212,7 +211,7 @@ class Chain:
         return found[-1], np.cos(self.alpha) * across
 
     def peak(self, paths):
-        """Largest |rotation| of the base: of parabolas through points of all paths."""
+        """Return the largest |rotation| of the base, at vertices of parabolas through points of all paths."""
         found = 0.0
         for start, end, path in paths:
             turned = np.abs(path(np.linspace(start, end, 800))[-1])
@@ -224,7 +223,7 @@ class Chain:
 
 
 def damping_of(kind, ratio, masses, stiffness):
-    """Decay rate of all masses, and damping matrix of the column's bending."""
+    """Return the decay rate of all masses, and the damping matrix of the column's bending."""
     squares, shapes = eigh(stiffness, np.diag(masses))
     rates = np.sqrt(squares)
     if kind == "stiffness":

@@ -1,17 +1,17 @@
 """Reference responses of blocks that roll on edges told by lists, from 40-digit Taylor series, with derivatives.
 
-A list of radii at angles is a chain of involutes: on a straight line between two of them, with the radius r, its slope
-q, and the height H and the reach N of the centre of mass over the point of contact (all over R),
+A list of radii at angles is a chain of involutes. Let the radius be r on a straight line between two of them, with the
+slope q. Let H and N be the height and the reach of the centre of mass over the point of contact (all over R),
 
     H = A cos x + B sin x + r,    N = B cos x - A sin x + q,
 
-A and B constant on a piece, and such that the block touches the ground at one point where two pieces meet. Newton's
-law for the centre of mass, and about it, with no slip (m = ratio I/R^2 about the corner):
+A and B are constant on a piece, and such that the block touches the ground at one point where two pieces meet. Newton's
+law for the centre of mass, and about it, without slip (m = ratio I/R^2 about the corner):
 
     [1 + ratio (H^2 + N^2 - 1)] x'' = -[p^2 (N + s u H) + ratio r N x'^2]
 
-A step ends where a piece does. Events are isolated by `roots`, so that none is missed; parameters of whole runs are
-changed in 40 digits, angles of lists among them. Only the names of what is asked for are jaxrock's.
+A step ends where a piece does. `roots` isolates events, so that none is missed. Derivatives are differences of whole
+runs in 40 digits, also by angles of lists. Only the names of parameters and outputs are jaxrock's.
 
     python -m references.rolling_lists          # writes rolling_lists.json
     python -m references.rolling_lists check    # every fourth scene, in 60 digits, of order 44 and with another step
@@ -28,11 +28,11 @@ import numpy as np
 from references.arithmetic import Arithmetic, dot
 from references.motions import motion
 from references.roots import roots, slopes_of, value_at
-from references.taylor import ORDER, Path, Quiet, land, note_extremes, note_states, step_length, wait
+from references.taylor import ORDER, Path, Quiet, land, note_extremes, note_states, shorten, wait
 
 ANSWERS = pathlib.Path(__file__).with_suffix(".json")
 SEED, COUNT, CIRCLES = 20261128, 20, 3
-STEP, AGREE = -9, 1e-12  # relative steps of differences; how far those of one and of two steps may be apart
+STEP, AGREE = -9, 1e-12  # relative steps of differences; largest distance of those of one and of two steps
 NEAR = 1e-3  # scenes nearer to a graze than this are left out
 KINDS = ("sine", "cosine", "ricker symmetric")
 OUTPUTS = ("max_rotation", "time_of_max", "margin", "rotation", "last_impact")
@@ -90,12 +90,12 @@ class Rolling:
             self.pieces.append(Piece(start, end, radius[max(k - 1, 0)], slope, inward, outward))
 
     def piece(self, x, outward):
-        """The piece on which it rolls on from an angle."""
+        """Return the piece on which the block rolls on from an angle."""
         inside = [piece for piece in self.pieces if (piece.low <= x < piece.high if outward else piece.low < x)]
         return inside[-1] if inside else self.pieces[0]
 
     def expand(self, path, piece, unit, forcing, order):
-        """Taylor coefficients of the opening angle in units of time, and whether they converge within one."""
+        """Return Taylor coefficients of the opening angle in units of time, and whether they converge within one."""
         number, square, ratio = self.arithmetic.number, (self.p * unit) ** 2, self.ratio
         push = [path.side * u for u in forcing]
         x, v = [path.x, path.v * unit], [path.v * unit]
@@ -124,7 +124,7 @@ class Rolling:
         return x, small >= 4
 
     def strength(self, x):
-        """Restoring moment over m g R, over the moment of inertia as it is there."""
+        """Return the restoring moment over m g R, over the moment of inertia at the angle."""
         piece = self.piece(x, True)
         sine, cosine = self.arithmetic.sin_cos(x)
         height = piece.of_cosine * cosine + piece.of_sine * sine + piece.radius + piece.slope * (x - piece.low)
@@ -133,7 +133,7 @@ class Rolling:
 
 
 def longest(block, path, piece, motion):
-    """Longest step worth trying [s], and whether it is all that is left of a piece of the motion."""
+    """Return the longest step worth trying [s], and whether it reaches the end of a piece of the motion."""
     room = motion.length(path.piece) - path.local
     unit = min(
         room, block.arithmetic.number(min(5 / float(block.p), motion.reach(path.piece, path.local, block.order)))
@@ -155,13 +155,8 @@ def roll(block, path, motion):
         return
     forcing = motion.series(path.piece, path.local, unit, block.order)
     c, converged = block.expand(path, piece, unit, forcing, block.order)
-    step = 1.0 if converged else step_length(block, c)
-    if step < 1:
-        step, whole = block.arithmetic.number(step), False
-        unit, power = unit * step, 1
-        for k in range(1, len(c)):
-            power = power * step
-            c[k] = c[k] * power
+    if not converged:
+        unit, whole = shorten(block, c, unit, whole)
     path.continuous = False
     first, end, level = _event(block, piece, c)
     known = len(path.tops)
@@ -183,7 +178,7 @@ def roll(block, path, motion):
 
 
 def _event(block, piece, c):
-    """What ends a step of one unit, if anything does, when, and the opening angle there."""
+    """Return the event that ends a step of one unit, if any, its time, and the opening angle there."""
     levels = {"impact": 0 * c[0], "flat": block.half_turn, "low": piece.low, "high": piece.high}
     if not piece.low:
         del levels["low"]
@@ -197,7 +192,7 @@ def _event(block, piece, c):
 
 
 def _note_closeness(block, path, unit, c, end):
-    """How close it came to standing still in balance, where it turned back on a step of one unit up to `end`."""
+    """Note how close a turning block came to standing still in balance, on a step of one unit up to `end`."""
     slopes = slopes_of(c)
     bent = slopes_of(slopes)
     for root in roots(block.arithmetic, slopes):
@@ -244,7 +239,7 @@ class Scene:
         self.numbers = [a.number(x) for x in numbers]
 
     def run(self, numbers):
-        """The path with these numbers."""
+        """Return the path of the scene with these numbers."""
         count = len(self.known["radius"])
         block = Rolling(self.a, *numbers[:4], numbers[6 : 6 + count], numbers[6 + count :], self.order)
         moving = list(numbers[4:6])
@@ -255,7 +250,8 @@ class Scene:
         )
 
     def outputs(self, numbers):
-        """What is told of the path, in the order of `OUTPUTS`, and what must stay as it is."""
+        """Return outputs of the path, in the order of `OUTPUTS`, and discrete results that differences must not
+        change."""
         path = self.run(numbers)
         before = [time for time in path.impact_times if time < self.known["at"]]
         if path.overturned or path.peak_time is None or not before or not path.states:
@@ -265,7 +261,8 @@ class Scene:
         return told, path
 
     def gradient(self, values, path, exponent=STEP):
-        """Derivatives by all numbers, those of an output in a row, and how far the differences are apart; or None."""
+        """Return derivatives by all numbers, a row for each output, and the largest distance of the differences; or
+        None."""
         rows, worst = [], 0.0
         for j, number in enumerate(self.numbers):
             if self.names[j] == "angle" and not number:
@@ -287,7 +284,7 @@ class Scene:
 
 
 def draw(random, kind, many):
-    """Numbers of a scene; `many`: radii at so many angles, 0 for a circle."""
+    """Draw the numbers of a scene; `many`: number of angles with radii, 0 for a circle."""
     alpha, p = random.uniform(0.1, 0.35), math.exp(random.uniform(0, math.log(4)))
     intensity, ratio = math.exp(random.uniform(math.log(1.2), math.log(4))), random.uniform(0.8, 4)
     length = 2 * math.pi / (ratio * p)
@@ -306,7 +303,7 @@ def draw(random, kind, many):
 
 
 def wanted(scene, path):
-    """Whether a scene is as clear as a reference has to be: no graze, one peak."""
+    """Return whether a scene is clear enough for a reference: no graze, one peak."""
     block = scene.known["block"]
     slow = [abs(v) for v in path.impact_velocities]
     tops = sorted(path.tops)
@@ -321,7 +318,7 @@ def wanted(scene, path):
 
 
 def find(a, index):
-    """One scene with all that is stored of it."""
+    """Find one scene, and return all that is stored of it."""
     random = np.random.default_rng([SEED, index])
     while True:
         many = 0 if index < CIRCLES else (2, 3, 5, 12)[index // 3 % 4]
@@ -343,7 +340,7 @@ def find(a, index):
 
 
 def main():
-    """Write all."""
+    """Write all scenes."""
     a, scenes = Arithmetic(40), []
     for index in range(COUNT):
         with a.context():
@@ -354,7 +351,7 @@ def main():
 
 
 def check():
-    """Some of the stored scenes again: prints the worst relative differences of values and of gradients."""
+    """Check some of the stored scenes: print the worst relative differences of values and of gradients."""
     a = Arithmetic(60)
     for known in json.loads(ANSWERS.read_text())["scenes"][::4]:
         with a.context():

@@ -1,9 +1,9 @@
-"""Every skipped test names what is missing; any other skip is a failure.
+"""Every skipped test names the missing package or folder; any other skip is a failure.
 
-`tests/conftest.py` registers this plugin. A test may be skipped for want of a package of `pyproject.toml` that is not
-installed (`pytest.importorskip`, or "needs llvmlite"), or of a folder that a source distribution leaves out ("needs the
-folder notebooks"). `--no-skips` allows neither. The tests that were skipped are kept in pytest's own cache, under
-`CACHED`: an environment that has all packages runs these.
+`tests/conftest.py` registers this plugin. A test may be skipped where a package of `pyproject.toml` is not installed
+(`pytest.importorskip`, or "needs llvmlite"). It may be skipped where a source distribution leaves out a folder ("needs
+the folder notebooks"). `--no-skips` allows neither. Pytest's own cache keeps the skipped tests, under `CACHED`: an
+environment that has all packages runs these.
 """
 
 import importlib
@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 CACHED = "jaxrock/skipped"
-MODULE_OF = {"openseespy": "openseespy.opensees"}  # what a package is imported by, if not by its name
+MODULE_OF = {"openseespy": "openseespy.opensees"}  # name of the module, where it is not that of the package
 
 
 def name_of(requirement: str) -> str:
@@ -103,6 +103,6 @@ class SkippedTests:
             self.skipped.append(report.nodeid)
 
     def pytest_sessionfinish(self, session):
-        """Keep what was skipped; workers of xdist leave that to the process that started them."""
+        """Cache the skipped tests; workers of xdist leave that to the process that started them."""
         if not hasattr(session.config, "workerinput"):
             session.config.cache.set(CACHED, sorted(set(self.skipped)))

@@ -164,6 +164,21 @@ def step_length(block, coefficients):
     return min((2.0 ** min(((allowed - float(log2(abs(c)))) / k), 900.0) for k, c in last), default=math.inf)
 
 
+def shorten(block, coefficients, unit, whole):
+    """Rescale coefficients to the step within which they converge; return its length, and `whole` if it is all of one.
+
+    A series that converges throughout its step stays as it is.
+    """
+    step = step_length(block, coefficients)
+    if step >= 1:
+        return unit, whole
+    step, power = block.arithmetic.number(step), 1
+    for k in range(1, len(coefficients)):
+        power = power * step
+        coefficients[k] = coefficients[k] * power
+    return unit * step, False
+
+
 def longest(block, path, motion):
     """Longest step worth trying [s]: to the end of the piece, within reach of its series, not far beyond a hop."""
     number = block.arithmetic.number
@@ -227,13 +242,8 @@ def rock(block, path, motion):
     order = SHORT_ORDER if block.p * unit < SHORT_STEP else block.order
     forcing = motion.series(path.piece, path.local, unit, order)
     c, converged = expand(block, path, block.p * unit, path.v * unit, forcing, order)
-    step = 1.0 if converged else step_length(block, c)
-    if step < 1:
-        step, whole = block.arithmetic.number(step), False
-        unit, power = unit * step, 1
-        for k in range(1, len(c)):
-            power = power * step
-            c[k] = c[k] * power
+    if not converged:
+        unit, whole = shorten(block, c, unit, whole)
     path.continuous = False
     rough = np.array([float(a) for a in c])
     impact = next(iter(roots(block.arithmetic, c, rough)), None)

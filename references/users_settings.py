@@ -35,7 +35,7 @@ def pulse(amplitude=0.3):
 
 
 def at(value):
-    """Numbers that are placed on a device as `jax.transfer_guard` asks for it."""
+    """Return numbers placed on a device explicitly, as `jax.transfer_guard` asks for."""
     return jax.device_put(np.asarray(value, jnp.result_type(float)))
 
 
@@ -194,7 +194,7 @@ CALLS: dict[str, Callable] = {
 
 @contextlib.contextmanager
 def _settled(name: str, value) -> Iterator[None]:
-    """A setting that JAX has no context for."""
+    """Set a setting that JAX has no context for."""
     before = getattr(jax.config, name)
     jax.config.update(name, value)
     try:
@@ -225,7 +225,7 @@ SETTINGS: dict[str, Callable] = {
 
 
 def numbers(call: Callable) -> list | str:
-    """The numbers that a call finds, or what it raises."""
+    """Return the numbers of a call, or the error that it raises."""
     try:
         result = call()
     except Exception as error:
@@ -239,7 +239,7 @@ def tried(names: list[str]) -> dict[str, list | str]:
 
 
 def late(names: list[str]) -> dict[str, dict[str, list | str]]:
-    """In single precision, in double, again after caches are cleared, and in both by turns."""
+    """Return the numbers in single precision, in double, again after caches are cleared, and in both by turns."""
     told = {"single": tried(names)}
     jax.config.update("jax_enable_x64", True)
     told["double"] = tried(names)

@@ -47,7 +47,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers: more threads t
 
 
 def pytest_addoption(parser):
-    """Add what an environment that has all packages asks for."""
+    """Add the option of an environment that has all packages."""
     parser.addoption("--no-skips", action="store_true", help="a skipped test fails, whatever is missing")
 
 

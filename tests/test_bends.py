@@ -10,8 +10,10 @@ import jaxrock as rk
 
 
 def test_slopes_across_a_stop():
-    """A spring that is touched at an angle: the time of the first impact, and its slopes by stiffness and angle, beside
-    the integral of 1/speed, whose speed energy tells."""
+    """Judge the time of the first impact, and its slopes by stiffness and angle, for a spring touched at an angle.
+
+    The judge is the integral of 1/speed, with the speed by conservation of energy.
+    """
     alpha, p, stop, stiffness, start = 0.3, 2.0, 0.06, 1.5, 0.2
 
     def by_energy(stiffness, stop):

@@ -314,7 +314,7 @@ def test_no_motion_is_unexceeded_where_the_least_topples_a_rock():
     assert not np.asarray(below.complete).any() and np.isnan(below.amplitude).all()
 
 
-# Scenes of one batch: a wide block and a large one, one without ends, one that is not known, and two alike.
+# Scenes of one batch: a wide block and a large one, one without ends, an unknown one, and two alike.
 ALPHA = np.array([0.2, 0.6, np.nan, 0.05, 0.2])
 RATE = np.array([2.0, 0.5, 2.0, 8.0, 2.0])
 HELD = rk.models.Equation(lambda x, block: jnp.sin(block.alpha - x), lambda x, block: jnp.cos(block.alpha - x))
@@ -339,7 +339,7 @@ BATCHES = {
     "options", [pytest.param(x, marks=[pytest.mark.slow] * (name in SLOW), id=name) for name, x in BATCHES.items()]
 )
 def test_a_scene_does_not_depend_on_its_neighbours(options):
-    """A batch is a loop over its scenes; one that cannot be computed says so, alone."""
+    """A batch is a loop over its scenes; a scene that cannot be computed has a status of its own."""
     together = critical(ALPHA, RATE, options)
     np.testing.assert_array_equal(together.complete, [True, True, False, True, True])
     assert together.count[2] == 0
@@ -358,7 +358,7 @@ def test_a_motion_that_is_not_known_is_so_alone():
     np.testing.assert_array_equal(found.complete, [True, False])
 
 
-# Its acceleration is not a real number from 1.7 rad on, where a trial of an implicit solver may go.
+# The acceleration is not a real number beyond 1.7 rad, where a trial of an implicit solver may go.
 BOUNDED = rk.models.Equation(
     lambda x, block: jnp.sin(block.alpha - x) * jnp.sqrt(1 - x / 1.7), lambda x, block: jnp.cos(block.alpha - x)
 )
@@ -366,7 +366,7 @@ BOUNDED = rk.models.Equation(
 
 @pytest.mark.slow
 def test_a_trial_beyond_the_domain_of_an_equation_is_no_error_of_a_batch():
-    """Slopes of margins, which all searches ask for, by an implicit solver; an explicit one judges them."""
+    """An implicit solver finds slopes of margins, which all searches need; an explicit one judges them."""
     amplitudes = jnp.array([3.28540898, 6.66409842, 2.28592764, 21.76111076, 0.61, 0.1015889])
 
     def slopes(engine):
@@ -385,7 +385,7 @@ def test_a_trial_beyond_the_domain_of_an_equation_is_no_error_of_a_batch():
 
 
 def test_an_implicit_solver_sees_no_slopes_beyond_the_domain():
-    """Within it they are those of the field."""
+    """The slopes are zero beyond the domain, and those of the field within it."""
 
     class Falling(eqx.Module):
         def flow(self, t, y):

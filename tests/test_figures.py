@@ -453,8 +453,8 @@ def test_arguments_of_figures_are_checked():
             call()
 
 
-def test_a_history_over_long_quiet_shows_what_happens_in_it():
-    """Of two shocks a day apart, and of a wavelet within a long piece: peaks are drawn as high as they are."""
+def test_a_history_over_long_quiet_shows_its_events():
+    """Peaks of two shocks a day apart, and of a wavelet within a long piece, are drawn at their full height."""
     pulse = rk.SinePulse(0.4, 0.8)
     response = rk.simulate(rk.Block(0.3, 2.0), pulse + pulse.shifted(86_400.0), **QUICK)
     axes = rk.plot.history(response)

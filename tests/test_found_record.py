@@ -192,12 +192,12 @@ def test_no_change_lies_on_both_sides():
     assert least_change(np.zeros((1, 2)), np.array([-1.0])) is None
 
 
-def test_what_is_claimed_is_what_was_tried():
-    """The nearest of the starts' records; the others are told, and no word says that there is none nearer."""
+def test_texts_claim_only_the_nearest_of_the_starts():
+    """The result is the nearest of the starts' records; its text claims no more, and `changes` has the others."""
     result = found(starts=8, baseline=False)
     assert result.changes.shape == (8,) and float(result.change) == float(np.min(result.changes))
     words = rk.inverse.RecordStatus[result.status]
-    assert "came from its starts" in words and "may find a nearer one" in words and "No record" not in words
+    assert "nearest of those that the starts led to" in words and "may find a nearer one" in words and "No record" not in words
 
 
 TWO = rk.Block(np.array([ALPHA, 0.8 * ALPHA]), np.array([P, 1.5 * P]), 0.9)

@@ -63,7 +63,7 @@ def test_significant_duration_of_a_sine_pulse():
 
 
 def test_a_share_that_is_reached_before_a_pause():
-    """Two equal shocks: half of the intensity has come where the pause begins, not where it ends."""
+    """Half of the intensity of two equal shocks has come where the pause begins, not where it ends."""
     record = rk.Record([0.3, 0.0, 0.0, 0.0, 0.0, 0.3], 1.0)
     assert rk.intensity.significant_duration(record, 0.25, 0.5) == pytest.approx(0.5 ** (1 / 3), rel=1e-4)
 
@@ -105,7 +105,7 @@ FIRST_LINES = {
 
 @pytest.mark.parametrize("name", FIRST_LINES)
 def test_peak_displacement_where_a_line_begins_at_rest(name):
-    """By cubics between a hundred thousand times of each record: they are exact for lines."""
+    """Cubics between a hundred thousand times of each record are the judge: they are exact for lines."""
     samples, dt = FIRST_LINES[name]
     time = np.linspace(0.0, dt * (len(samples) - 1), 100_001)
     velocity = cumulative_trapezoid(G * np.interp(time, dt * np.arange(len(samples)), samples), time, initial=0)
@@ -117,7 +117,7 @@ def test_peak_displacement_where_a_line_begins_at_rest(name):
     assert float(rk.intensity.peak_velocity(record)) == pytest.approx(np.abs(velocity).max(), rel=1e-7)
 
 
-LONG_LINES = {  # period [s], damping: of lines of 0.2 to 40 s
+LONG_LINES = {  # period [s] and damping; lines last 0.2 to 40 s
     "undamped": (0.31, 0.0),
     "hardly damped": (0.05, 0.001),
     "usual": (0.4, 0.05),
@@ -128,7 +128,7 @@ LONG_LINES = {  # period [s], damping: of lines of 0.2 to 40 s
 
 @pytest.mark.parametrize("name", LONG_LINES)
 def test_oscillators_under_lines_of_many_periods(name):
-    """By exponentials of matrices, five hundred times a period."""
+    """Exponentials of matrices are the judge, five hundred times a period."""
     period, damping = LONG_LINES[name]
     omega, samples = 2 * np.pi / period, [0.0, 0.3, -0.1, 0.0, 0.0, 0.05, 0.0]
     for step in (0.2, 3.0, 17.0):
@@ -146,7 +146,8 @@ def test_oscillators_under_lines_of_many_periods(name):
 
 @pytest.mark.parametrize("gap", [3600.0, 86400.0])
 def test_quiet_between_shocks_costs_nothing(gap):
-    """Of what does not overlap sums add up, peaks are those of one, and the second comes when the first is over."""
+    """Measures of shocks that do not overlap are sums, maxima, or those of the first; quiet between them changes
+    none."""
     shock = rk.processing.cut(rk.example_record(), 3.0, 13.0)
     shock = rk.processing.baseline_corrected(rk.processing.tapered(shock, 1.0))
     both = shock + 0.5 * shock.shifted(gap)
@@ -200,7 +201,7 @@ def pulse_of_many_cycles(cycles):
 
 @pytest.mark.parametrize("cycles", [8.0, 300.0])
 def test_many_cycles_within_one_piece(cycles):
-    """By sums over times four hundred times a cycle, of its velocity as it is printed and the derivative of that."""
+    """Sums over times, four hundred a cycle, of the velocity by its formula and of its derivative are the judge."""
     count = 400
     time = (np.arange(int(cycles * count)) + 0.5) * 0.5 / count
     bell, wave = 4 * np.pi / cycles, 4 * np.pi
@@ -223,7 +224,7 @@ def test_many_cycles_within_one_piece(cycles):
 
 
 def test_a_wavelet_within_a_long_piece():
-    """It is as strong as one that is cut close."""
+    """A wavelet in a long piece is as strong as one in a short piece."""
     long, close = (rk.RickerPulse(0.4, 0.1, center=where) for where in (50.0, None))
     for measure in (rk.intensity.peak_acceleration, rk.intensity.peak_velocity):
         assert measure(long) == pytest.approx(float(measure(close)), rel=1e-9)
@@ -234,14 +235,14 @@ def test_a_wavelet_within_a_long_piece():
 
 
 def test_many_cycles_in_a_suite():
-    """The velocity at the middle is that of the envelope, whatever cycles others of the ensemble have."""
+    """The velocity at the middle is that of the envelope, independent of the cycles of others in the ensemble."""
     suite = rk.motions.Suite([rk.MavroeidisPapageorgiouPulse(A, 0.5, np.array([2.0, 300.0, 40.0]))])
     np.testing.assert_allclose(suite.peak_velocity, A * G * 0.5 / (2 * np.pi), rtol=1e-9)
 
 
 def test_too_many_cycles_are_refused():
     for measure in (rk.intensity.peak_velocity, rk.intensity.arias):
-        with pytest.raises(ValueError, match="`motion` must last at most .* make a `Record` of what matters"):
+        with pytest.raises(ValueError, match="`motion` must last at most .* make a `Record` of its relevant part"):
             measure(pulse_of_many_cycles(1e6))
     traced = jax.jit(lambda cycles: rk.intensity.peak_velocity(pulse_of_many_cycles(cycles)))
     np.testing.assert_allclose(traced(3.0), rk.intensity.peak_velocity(pulse_of_many_cycles(3.0)), rtol=1e-12)

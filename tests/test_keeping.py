@@ -25,7 +25,7 @@ from jaxrock.keeping import changes, facts, folder
 from jaxrock.sweeps import runner
 from jaxrock.sweeps.store import local
 
-NAME, OTHER = "jaxrock_" + 20 * "a", 40 * "b"  # as of machine code, and of a program
+NAME, OTHER = "jaxrock_" + 20 * "a", 40 * "b"  # machine code, and a program
 QUICK = {"model": rk.Linear(), "engine": rk.Series(order=4)}
 
 
@@ -393,7 +393,7 @@ def test_what_cannot_be_deleted_is_said(place, capsys):
     assert "1 compiled programs" in capsys.readouterr().out
     folder.write("machine", NAME, b"content")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folder, "remove", lambda path: None)  # as where nothing may be written
+        patch.setattr(folder, "remove", lambda path: None)  # as in a folder that cannot be written
         assert main(["cache", "--clear"]) == 2
     assert "1 of 1 files" in capsys.readouterr().err and folder.kept()
 

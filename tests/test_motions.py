@@ -578,7 +578,7 @@ def test_how_many_pieces_last(name):
 
 @pytest.mark.parametrize("way", ["factors", "signs", "shifts"])
 def test_many_factors_or_shifts_are_one(way):
-    """Three hundred of them are followed as one is."""
+    """Three hundred factors or shifts cost as much as one."""
     motion, time = rk.HalfSinePulse(0.3, 0.8), np.linspace(0.0, 4.0, 40)
     for _ in range(300):
         motion = {"factors": lambda m: 1.01 * m, "signs": lambda m: -m, "shifts": lambda m: m.shifted(0.01)}[way](
@@ -599,14 +599,14 @@ def test_factors_and_shifts_of_one_are_still_checked():
 
 
 def test_a_sum_of_several():
-    """From 0, as Python's `sum` begins; below the limit."""
+    """Python's `sum` begins with 0; the limit admits several."""
     parts, time = [rk.HalfSinePulse(0.1 * k, 0.8).shifted(0.3 * k) for k in range(1, 6)], np.linspace(0.0, 3.0, 30)
     each = [
         np.where((time >= 0.3 * k) & (time < 0.3 * k + 0.8), 0.1 * k * np.sin(np.pi * (time / 0.8 - 0.375 * k)), 0.0)
         for k in range(1, 6)
     ]
     np.testing.assert_allclose(sum(parts).acceleration(time), np.sum(each, axis=0), atol=1e-14)
-    assert sum(rk.SinePulse(0.1, 0.4).shifted(k) for k in range(33)).second.delay == 32  # as many as there may be
+    assert sum(rk.SinePulse(0.1, 0.4).shifted(k) for k in range(33)).second.delay == 32  # the largest number
 
 
 MADE_OF_MANY = {
@@ -623,7 +623,7 @@ def test_a_motion_of_too_many_is_refused_where_it_is_made(name):
         MADE_OF_MANY[name]()
 
 
-DOUBTED = {  # peak, and what is said of it
+DOUBTED = {  # peak, and the words of the warning
     "m/s2": (3.436, "peaks at 3.436 g. If its samples are in m/s2, divide them by 9.81: it then peaks at 0.35 g"),
     "cm/s2": (343.0, "peaks at 343 g. If its samples are in cm/s2, divide them by 981: it then peaks at 0.35 g"),
 }
@@ -635,7 +635,7 @@ def test_a_record_in_another_unit_is_doubted_once(unit):
     with pytest.warns(UserWarning, match=f"^Record 'mine' {told}") as found:
         record = rk.Record([0.0, -peak, 0.1], 0.01, "mine")
     assert len(found) == 1
-    # What is made of it, and what is strong by its factor, is not doubted again.
+    # Motions made of a record, and records scaled by a factor, do not warn again.
     suite = rk.motions.Suite([record, 2.0 * record])
     jax.jit(lambda number: suite[number].acceleration(0.01))(1)
     rk.processing.scaled(RECORD, acceleration=40.0)

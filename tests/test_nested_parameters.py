@@ -23,7 +23,7 @@ class Law(rk.restitution.AbstractRestitution):
 
     held: object
     speed: object
-    firm: object = eqx.field(static=True)  # what finds the number in `held`
+    firm: object = eqx.field(static=True)  # the parameter in `held`
 
     def ratio(self, corners, speed):
         return self.firm(self.held) / (1 + speed / self.speed)
@@ -56,7 +56,7 @@ def test_a_number_is_named_and_replaced_wherever_it_is(held, firm, name):
 
 
 def test_a_sensitivity_names_a_number_in_a_dictionary():
-    """By differences of outcomes."""
+    """Differences of outcomes are the judge."""
 
     def block(number):
         return rk.Block(0.2, 2.0, restitution=law({"a": {"b": (number, None)}}, lambda held: held["a"]["b"][0]))
@@ -69,7 +69,7 @@ def test_a_sensitivity_names_a_number_in_a_dictionary():
 
 @pytest.mark.slow
 def test_critical_amplitudes_of_a_law_with_a_dictionary():
-    """Their derivative by its number, by differences; a whole number is one."""
+    """Differences judge derivatives by a number of the law; a whole number is a parameter too."""
 
     def found(number):
         block = rk.Block(0.2, 2.0, restitution=law({"firm": number, "count": 1}, lambda held: held["firm"]))

@@ -47,7 +47,7 @@ def test_a_deviation_is_0_or_more(tmp_path, table, name, number, message):
 
 
 def test_a_deviation_that_belongs_to_nothing_is_a_number_too(tmp_path):
-    """That of a rotation that was not measured."""
+    """A deviation beside a rotation that was not measured must be a number too."""
     row = ONE | {"observed": "stood", "rotation_deg": "", "rotation_deg_sd": "-1"}
     with pytest.raises(ValueError, match="line 2: `rotation_deg_sd` must be 0 or more, but is -1"):
         read(tmp_path, row)

@@ -1,5 +1,5 @@
-"""Kept programs run with their user's rights: only what no other user could have written is read, and only what the
-package made is removed."""
+"""Cached programs run with their user's rights: only files that no other user could have written are read, and only the
+package's own are removed."""
 
 import os
 import stat
@@ -17,14 +17,14 @@ from jaxrock.keeping.compiled import keep_compiled
 
 NAME, OTHER = "jaxrock_" + 20 * "a", 40 * "b"
 OF_JAX = f"jit_f-{64 * 'c'}-cache"
-STRANGER = 65534  # `nobody`
+STRANGER = 65534  # the user `nobody`
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="Windows has no owners of this kind")
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """The folder of what is kept, with one program in it; and every warning is said anew."""
+    """Return a cache folder with one program in it, with all warnings still to come."""
     ownership.warn_once.cache_clear()
     (tmp_path / "of the user").mkdir()
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "of the user"))
@@ -35,7 +35,7 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture
 def give_away(monkeypatch):
-    """Let a path belong to another user: as root it is given to one, else its owner is told to be one."""
+    """Give a path to another user: root changes its owner, other users pretend so."""
 
     def given(path):
         if os.geteuid() == 0:
@@ -60,7 +60,7 @@ def mode(path):
 
 
 def refused(message):
-    """Nothing is read or written, and one warning says why."""
+    """Check that nothing is read or written, and that one warning says why."""
     with pytest.warns(RuntimeWarning, match=message) as said:
         assert folder.read("machine", NAME) is None
         folder.write("machine", OTHER, b"content")
@@ -70,7 +70,7 @@ def refused(message):
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o002, 0o022, 0o077])
-def test_what_is_made_is_for_its_user_alone(tmp_path, monkeypatch, umask):
+def test_new_folders_and_files_are_private(tmp_path, monkeypatch, umask):
     monkeypatch.setenv("JAXROCK_CACHE", str(tmp_path / "new" / "kept"))
     before = os.umask(umask)
     try:
@@ -97,7 +97,7 @@ def test_a_folder_of_another_user_is_not_used(place, give_away, which):
 
 
 def test_a_file_of_another_user_is_not_read(place, give_away):
-    """It is neither replaced nor removed, and another is kept beside it."""
+    """The file is neither replaced nor removed, and another can be cached beside it."""
     give_away(place / "machine" / NAME)
     assert folder.read("machine", NAME) is None
     folder.write("machine", NAME, b"another")
@@ -116,7 +116,7 @@ def test_a_file_that_others_could_write_is_made_anew(place, loose):
 
 
 def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
-    """Nor one that is no regular file: to open a pipe would wait."""
+    """A link is not read, nor a pipe: opening it would wait."""
     path = place / "machine" / NAME
     path.rename(tmp_path / "elsewhere")
     path.symlink_to(tmp_path / "elsewhere")
@@ -129,8 +129,8 @@ def test_a_file_that_is_a_link_is_not_read(place, tmp_path):
 
 
 @pytest.mark.parametrize("bits, good", [(0o777, False), (0o1777, True), (0o755, True), (0o1775, True)])
-def test_a_parent_in_which_others_may_write(place, bits, good):
-    """They could rename the folder, and put another in its place: not where it is sticky, as /tmp is."""
+def test_a_parent_writable_by_others(place, bits, good):
+    """Others could rename the folder, and put another in its place, except in a sticky folder such as /tmp."""
     place.parent.chmod(bits)
     assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
 
@@ -140,7 +140,7 @@ def test_a_parent_in_which_others_may_write(place, bits, good):
     [([], True, True), (["me"], True, True), (["me", "you"], True, False), ([], False, False)],
 )
 def test_a_parent_that_a_group_may_write(place, monkeypatch, members, primary, good):
-    """Good where the group is the user's own; many systems make folders so."""
+    """A parent is safe where the group is the user's own; many systems make folders so."""
     import grp
     import pwd
     from types import SimpleNamespace
@@ -160,7 +160,7 @@ def test_a_parent_of_another_user(place, give_away):
 
 
 def test_owners_that_a_container_does_not_know(place, give_away, monkeypatch):
-    """In a user namespace the folders of the machine's root seem to be `nobody`'s; the folder itself may not."""
+    """In a user namespace the parents may seem to belong to `nobody`; the folder itself may not."""
     monkeypatch.setattr(ownership, "_is_mapped", lambda: True)
     give_away(place.parent)
     assert folder.read("machine", NAME) == b"content"
@@ -171,7 +171,7 @@ def test_owners_that_a_container_does_not_know(place, give_away, monkeypatch):
 @pytest.mark.parametrize(
     "told, mapped", [("0 0 4294967295\n", False), ("0 1000 1\n1 100000 65536\n", True), (None, False)]
 )
-def test_containers_are_told_by_their_map_of_users(monkeypatch, told, mapped):
+def test_containers_are_recognised_by_their_user_map(monkeypatch, told, mapped):
     def read(path):
         if told is None:
             raise FileNotFoundError
@@ -184,7 +184,7 @@ def test_containers_are_told_by_their_map_of_users(monkeypatch, told, mapped):
 @pytest.mark.parametrize("whose", ["the user's", "another's"])
 @pytest.mark.parametrize("linked", ["the folder", "its parent"])
 def test_a_link_to_a_larger_disk(place, tmp_path, give_away, whose, linked):
-    """The user's own is followed, to a folder within what it leads to; what another user planted is not."""
+    """A link of the user's own is followed, to a folder within its target; a link of another user is not."""
     link = place if linked == "the folder" else place.parent
     link.rename(tmp_path / "kept before")
     (tmp_path / "disk").mkdir()
@@ -220,8 +220,8 @@ USERS = (
 
 @pytest.mark.parametrize("linked", [True, False])
 def test_only_what_the_package_made_is_removed(place, tmp_path, capsys, linked):
-    """Of a home with old and large files, to which the folder is a link, or that was copied into it: some have even
-    names of the package's."""
+    """A folder, which is a link to a home, also holds large old files of the user's; some have names of the
+    package's."""
     home = tmp_path / "home" if linked else place
     if linked:
         place.rename(tmp_path / "kept before")
@@ -232,7 +232,7 @@ def test_only_what_the_package_made_is_removed(place, tmp_path, capsys, linked):
         file.write_text("years of work")
         os.utime(file, (1e9, 1e9))
     with (home / "results.h5").open("ab") as file:
-        file.truncate(2 * folder.LARGEST)  # of holes
+        file.truncate(2 * folder.LARGEST)  # a sparse file
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("years of work")
     folder.write("machine", NAME, b"content")
@@ -267,7 +267,7 @@ def test_files_without_a_mark_are_known_by_their_digest(place):
 
 @pytest.fixture
 def unset(monkeypatch):
-    """No cache of JAX is set; what would be is told."""
+    """Leave JAX without a cache, and return the settings that the package makes."""
     told = {}
     monkeypatch.setattr(compiled, "setting", lambda _: None)
     monkeypatch.setattr(compiled, "compile_quickly", lambda: None)
@@ -276,7 +276,7 @@ def unset(monkeypatch):
 
 
 def test_jax_keeps_its_programs_in_a_private_folder(place, unset):
-    """Beside what another release of JAX may write there."""
+    """JAX's own folder lies beside those of other releases of JAX."""
     (place / folder.OF_JAX).mkdir()
     (place / folder.OF_JAX / "of another release").touch()
     keep_compiled()
@@ -287,7 +287,7 @@ def test_jax_keeps_its_programs_in_a_private_folder(place, unset):
     "planted", ["a file of another user", "a link", "a file of another name", "its folder is a link"]
 )
 def test_jax_runs_nothing_of_others(place, unset, tmp_path, give_away, planted):
-    """JAX reads any file in its folder, follows links, and deletes what has its names."""
+    """JAX reads any file in its folder, follows links, and deletes files that have its names."""
     there = place / folder.OF_JAX
     if planted == "its folder is a link":
         there.symlink_to(tmp_path)
@@ -303,7 +303,7 @@ def test_jax_runs_nothing_of_others(place, unset, tmp_path, give_away, planted):
 
 
 @pytest.mark.parametrize("loose, left", [(0o755, True), (0o775, False), (0o777, False)])
-def test_what_jax_kept_where_others_could_write_is_forgotten(place, unset, loose, left):
+def test_files_of_jax_that_others_could_write_are_removed(place, unset, loose, left):
     there = place / folder.OF_JAX
     there.mkdir()
     (there / OF_JAX).touch()
@@ -313,7 +313,7 @@ def test_what_jax_kept_where_others_could_write_is_forgotten(place, unset, loose
 
 
 def test_names_of_jax_are_those_that_it_gives(tmp_path):
-    """As of this release; of what it writes nothing is left."""
+    """Names follow the installed release of JAX, which leaves no other files."""
     code = """
 import jax, os, sys, jaxrock as rk
 from jaxrock.keeping import folder

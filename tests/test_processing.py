@@ -75,7 +75,7 @@ FILTERS = [(0.5, 0.52, 4), (5.0, 5.2, 4), (2.0, 2.02, 3), (3.0, 3.3, 6), (1.0, 1
 
 
 def by_the_spectrum(values, low, high, order, count=1 << 19):
-    """The squared gain of Butterworth's filter at each frequency, of so many samples that all has rung out."""
+    """Apply the squared gain of a Butterworth filter at each frequency, with padding until all has rung out."""
     tangent = np.tan(np.pi / 2 * np.linspace(0.0, 1.0, count // 2 + 1))
     low, high = (None if corner is None else np.tan(np.pi * corner * DT) for corner in (low, high))
     with np.errstate(all="ignore"):
@@ -96,7 +96,7 @@ def test_a_filter_without_delay_loses_nothing_that_rings(low, high, order):
 
 
 def test_a_narrow_filter_without_delay_by_padding():
-    """Forwards and backwards over so much rest that all has rung out."""
+    """Padding with rest until all has rung out is the judge, forwards and backwards."""
     record = rk.example_record()
     sections = scipy.signal.butter(4, (0.5, 0.52), "bandpass", fs=100, output="sos")
     rest = np.pad(record.samples, 100_000)
@@ -106,7 +106,7 @@ def test_a_narrow_filter_without_delay_by_padding():
 
 
 def test_a_filter_of_one_pass_by_its_poles():
-    """Of order 1: its differential equation under the bilinear transform, sample by sample."""
+    """The differential equation of order 1 under the bilinear transform, sample by sample, is the judge."""
     values, upper = np.random.default_rng(4).normal(0, 0.1, 300), np.tan(np.pi * 0.3 * DT)
     expected, before, state = [], 0.0, 0.0
     for value in values:
@@ -118,8 +118,8 @@ def test_a_filter_of_one_pass_by_its_poles():
 
 
 @pytest.mark.parametrize("corner, order", [(0.3, 1), (0.3, 4), (8.0, 20)])
-def test_a_low_pass_of_what_goes_on_by_repeating_it(corner, order):
-    """Mirrored or turned at both ends, 1300 s of it either way: the spectrum knows nothing of ends."""
+def test_a_low_pass_of_continued_samples_by_repetition(corner, order):
+    """Samples mirrored or turned at both ends, for 1300 s either way, are the judge: the spectrum has no ends."""
     values = np.random.default_rng(4).normal(0, 0.1, 500).cumsum() / 10
     last, place = values.size - 1, np.arange(-(1 << 17), 1 << 17)
     turns, within = np.divmod(place, 2 * last)

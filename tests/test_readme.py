@@ -34,7 +34,7 @@ def test_ci_runs_the_commands_of_the_readme(readme):
 
 @pytest.fixture
 def place(tmp_path):
-    """A folder as the first command leaves it, with this Python as the newcomer's."""
+    """Return a folder as the first command leaves it, with this Python as the newcomer's."""
     results = tmp_path / "copy" / "results"
     results.mkdir(parents=True)
     (tmp_path / "environment" / "bin").mkdir(parents=True)

@@ -150,7 +150,7 @@ def test_frames_have_room_while_a_recipe_is_traced():
     in_a_thread(count)
     in_a_thread(lambda: Recipe(traced, jax.tree.structure(number), number).program)
     bare, roomy = found
-    # Some releases of Python keep a piece that they have left (gh-142183): without room little is asked for there, too.
+    # A release of Python may keep a cycle (gh-142183), so the limit leaves room for little.
     assert roomy < 50 <= bare or roomy <= bare < 50
 
 

@@ -150,7 +150,7 @@ def test_a_pulse_is_found_again(pulse, parameters, delay, digits):
 
 @pytest.mark.parametrize("cycles", [20.0, 200.0])
 def test_the_velocity_that_is_fitted_follows_every_cycle(cycles):
-    """As it is printed, where its acceleration is integrated over as many parts as the ranges ask for."""
+    """The velocity by its formula judges integrals over as many parts as the ranges ask for."""
     record = rk.Record(np.asarray(rk.SinePulse(0.2, 0.5).acceleration(0.01 * np.arange(400))), 0.01)
     ranges = {"amplitude": (0.2, 0.4), "period": (0.1, 0.3), "oscillations": (2.0, cycles), "phase": (0.0, 1.0)}
     problem = _Problem.of(record, rk.MavroeidisPapageorgiouPulse, ranges | {"delay": (0.0, 1.0)}, "velocity")

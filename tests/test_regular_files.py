@@ -1,4 +1,4 @@
-"""Readers take regular files alone, and at once refuse what may never end; writers replace regular files alone."""
+"""Readers take regular files alone, and refuse endless ones at once; writers replace regular files alone."""
 
 import contextlib
 import os
@@ -26,14 +26,14 @@ READERS = {
 
 @contextlib.contextmanager
 def a_pipe(folder):
-    """Into which nobody writes: to open it waits."""
+    """Make a pipe without a writer: opening it waits."""
     os.mkfifo(folder / "file")
     yield folder / "file"
 
 
 @contextlib.contextmanager
 def a_pipe_of_a_shell(folder):
-    """As of `<(zcat record.gz)`: its writer is there, and says nothing yet."""
+    """Make a pipe as of `<(zcat record.gz)`: its writer exists, and has written nothing yet."""
     read, write = os.pipe()
     yield Path(f"/dev/fd/{read}")
     os.close(read)
@@ -60,7 +60,7 @@ KINDS = {a_pipe: "a pipe", a_pipe_of_a_shell: "a pipe", a_socket: "a socket", an
 
 @pytest.fixture
 def at_once():
-    """What waits is interrupted."""
+    """Interrupt a body that waits."""
 
     def waited(*_):
         raise TimeoutError
@@ -74,7 +74,7 @@ def at_once():
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 @pytest.mark.parametrize("reader", READERS)
-def test_what_is_no_regular_file_is_refused(tmp_path, at_once, reader, kind):
+def test_only_regular_files_are_read(tmp_path, at_once, reader, kind):
     with kind(tmp_path) as path, pytest.raises(ValueError, match=f"File `{path.name}`: is {KINDS[kind]}, and only"):
         READERS[reader](path)
 
@@ -132,9 +132,9 @@ def test_links_to_files_are_read(tmp_path):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_a_file_that_memory_does_not_hold_is_refused(tmp_path, reader):
-    """At once: its lines would take several times its size."""
+    """The refusal comes at once: the lines would take several times the size of the file."""
     with (tmp_path / "large.csv").open("wb") as file:
-        file.truncate(3 * 2**40)  # of holes
+        file.truncate(3 * 2**40)  # a sparse file
     with pytest.raises(ValueError, match="File `large.csv`: holds 3.07e.03 GiB, but of text at most 1 GiB is read"):
         READERS[reader](tmp_path / "large.csv")
 
@@ -160,7 +160,7 @@ def test_only_regular_files_are_replaced(tmp_path, writer, kind):
 
 @pytest.mark.parametrize("writer", WRITERS)
 def test_a_folder_is_not_replaced(tmp_path, writer):
-    """Not even an empty one, and it is said before anything is written."""
+    """Even an empty folder stays, and the error comes before anything is written."""
     (tmp_path / "results").mkdir()
     with pytest.raises(IsADirectoryError, match="results"):
         WRITERS[writer](tmp_path / "results")
@@ -169,8 +169,8 @@ def test_a_folder_is_not_replaced(tmp_path, writer):
 
 @pytest.mark.parametrize("there", [True, False])
 @pytest.mark.parametrize("writer", WRITERS)
-def test_what_a_link_leads_to_is_written(tmp_path, writer, there):
-    """As by `numpy.savetxt`: the link stays, to a file on a larger disk."""
+def test_the_target_of_a_link_is_written(tmp_path, writer, there):
+    """The link stays, as with `numpy.savetxt`: it may lead to a larger disk."""
     (tmp_path / "disk").mkdir()
     (tmp_path / "link").symlink_to("disk/file")
     if there:
@@ -180,8 +180,8 @@ def test_what_a_link_leads_to_is_written(tmp_path, writer, there):
     assert [each.name for each in (tmp_path / "disk").iterdir()] == ["file"]
 
 
-def test_what_is_new_is_not_written_through_a_link(tmp_path):
-    """Where nothing is replaced a link is something, even if it leads nowhere."""
+def test_new_files_are_not_written_through_a_link(tmp_path):
+    """A writer that replaces nothing refuses a link, even one that leads nowhere."""
     (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(FileExistsError), written_aside(tmp_path / "link") as aside:
         aside.touch()
@@ -189,7 +189,7 @@ def test_what_is_new_is_not_written_through_a_link(tmp_path):
 
 
 def test_threads_that_write_one_file_leave_one_whole(tmp_path):
-    """And nothing beside it."""
+    """One whole file is left, and nothing beside it."""
     threads = [threading.Thread(target=WRITERS["write_nrml"], args=(tmp_path / "file",)) for _ in range(8)]
     for each in threads:
         each.start()

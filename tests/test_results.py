@@ -1,4 +1,4 @@
-"""What the command line writes: over its own results, and over no other file; and streams that are closed, or full."""
+"""Results of the command line replace its own results alone, and outlast streams that are closed or full."""
 
 import errno
 import io
@@ -56,7 +56,7 @@ def out(tmp_path, monkeypatch):
 
 @pytest.fixture
 def nothing_computes(monkeypatch):
-    """What is refused is so before the long computation."""
+    """Let every long computation fail: a refusal must come before it."""
     for name in ("simulate", "rocking_spectrum", "overturning_map"):
         monkeypatch.setattr(rk, name, lambda *_, **__: pytest.fail("computes"))
     monkeypatch.setattr(rk.hazard, "simulated_fragility", lambda *_, **__: pytest.fail("computes"))
@@ -91,7 +91,7 @@ def by_a_link(path):
 
 
 def by_a_hard_link(path):
-    """As by another case, where file systems do not tell cases apart: two names of one file."""
+    """Return a second name of the same file, as on file systems that ignore case."""
     (path.parents[1] / path.name.upper()).hardlink_to(path)
     return path.parents[1] / path.name.upper()
 
@@ -112,7 +112,7 @@ def by_a_way_around(path):
     ],
 )
 def test_an_input_is_not_replaced(out, capsys, nothing_computes, command, name, called):
-    """Neither where jaxrock itself made it."""
+    """An input stays even where jaxrock itself made it."""
     with ResultFolder(out).whole(name) as aside:
         aside.write_text(EXAMPLE if command == "invert" else RECORD)
     before, given = (out / name).read_text(), str(called(out / name))
@@ -129,7 +129,7 @@ def test_patterns_name_inputs(out, capsys, nothing_computes):
 
 
 def test_one_command_after_the_other_into_one_folder(out, capsys):
-    """Its own results are replaced, as is a film of its own; other files stay, also where they are called as a film."""
+    """Results and a film of the command's own are replaced; other files stay, even one named as a film."""
     (out / "animation.mp4").write_text("a film from the field")
     (out / "notes.txt").write_text("years of work")
     with ResultFolder(out).whole("animation.gif") as aside:
@@ -144,7 +144,7 @@ def test_one_command_after_the_other_into_one_folder(out, capsys):
     assert len((out / KNOWN).read_text().splitlines()) == 8  # a title, a film, four files, two of them again
 
 
-def test_a_result_that_was_changed_since_is_not_replaced(out, capsys, nothing_computes):
+def test_a_result_that_was_changed_later_is_not_replaced(out, capsys, nothing_computes):
     with ResultFolder(out).whole("history.csv") as aside:
         aside.write_text("time_s\n1\n")
     (out / "history.csv").write_text("time_s\n1 # and a word on it\n")
@@ -153,7 +153,7 @@ def test_a_result_that_was_changed_since_is_not_replaced(out, capsys, nothing_co
 
 
 def test_force(out):
-    """Replaces what is written, and no more; a link itself, not what it leads to."""
+    """`--force` replaces results, and no more; of a link the link itself, not its target."""
     for name in ("history.csv", "animation.mp4"):
         (out / name).write_text("years of work")
     (out / "impacts.csv").symlink_to("../record.csv")
@@ -187,7 +187,7 @@ def test_a_list_of_another_is_not_written(out):
         ResultFolder(out).check([])
 
 
-def test_what_comes_while_it_computes_is_not_replaced(out):
+def test_a_file_that_appears_during_the_computation_is_not_replaced(out):
     folder = ResultFolder(out)
     folder.check(["map.csv"])
     with pytest.raises(FileExistsError, match="map.csv was not made by jaxrock"), folder.whole("map.csv") as aside:
@@ -258,7 +258,7 @@ def test_help_tells_of_it(capsys, command):
 
 
 class Unwritable(io.StringIO):
-    """A stream of which nothing comes out."""
+    """A stream that raises on every write."""
 
     def __init__(self, number=errno.EPIPE):
         super().__init__()
@@ -271,7 +271,7 @@ class Unwritable(io.StringIO):
 @pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
 @pytest.mark.parametrize("more", [(), ("--json",), ("--quiet",)])
 def test_a_stream_that_is_closed(tmp_path, monkeypatch, capfd, closed, more):
-    """As Python has it for `>&-`: none. What goes wrong is not said on the standard output instead."""
+    """Python has no stream for `>&-`; an error is not printed to standard output instead."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, closed, None)
     assert main(["cache", *more]) == 0
@@ -283,7 +283,7 @@ def test_a_stream_that_is_closed(tmp_path, monkeypatch, capfd, closed, more):
 
 
 def test_files_do_not_take_the_place_of_closed_streams(tmp_path):
-    """Libraries in C write to numbers 1 and 2, whatever file these are."""
+    """C libraries write to descriptors 1 and 2, even if those are files."""
     code = """
 import os, sys
 from jaxrock.command_line.main import main
@@ -299,7 +299,7 @@ with open("told", "w") as file:
 
 @pytest.mark.parametrize("number, status", [(errno.EPIPE, 141), (errno.ENOSPC, 2)])
 def test_results_are_written_where_words_cannot_be(out, monkeypatch, number, status):
-    """As of `jaxrock run | head -1`, or on a full disk: they took long to compute."""
+    """Results that took long to compute outlast `jaxrock run | head -1`, and a full disk."""
 
     class Once(Unwritable):
         said = 0
@@ -323,7 +323,7 @@ def test_help_that_cannot_be_printed(monkeypatch, capsys, words, number, status)
 
 
 def test_errors_that_cannot_be_printed(out, monkeypatch, capsys):
-    """The exit status tells; the log of the package, which goes there, too, stops nothing."""
+    """The exit status reports the error, and the package's log, which goes to the same stream, stops nothing."""
     monkeypatch.setattr(sys, "stderr", Unwritable(errno.ENOSPC))
     assert main(["run", "missing.AT2"]) == 2
     monkeypatch.setattr(module, "keep_compiled", lambda: __import__("logging").getLogger("jaxrock").warning("a word"))

@@ -398,7 +398,8 @@ PULSES = {"sine": rk.SinePulse, "cosine": rk.CosinePulse, "ricker symmetric": rk
 
 
 def scene_of(known):
-    """A function that makes block, motion and model of the numbers of a reference, in its order; and these numbers."""
+    """Return a function from the numbers of a reference, in its order, to block, motion and model; and these
+    numbers."""
     first = known["block"] + known["motion"]
     end = len(first) + len(known["radius"])
 
@@ -412,7 +413,8 @@ def scene_of(known):
 
 
 def agrees(known, names, found, slopes, within, slopes_within):
-    """Values, and slopes by all numbers but an angle of zero: relative to themselves, or to a value over a number."""
+    """Compare values, and slopes by all numbers but an angle of zero: relative to themselves, or to value over
+    number."""
     numbers = scene_of(known)[1]
     moving = np.flatnonzero(numbers)
     for name, value, row in zip(names, found, slopes, strict=True):
@@ -425,7 +427,7 @@ def agrees(known, names, found, slopes, within, slopes_within):
 
 @pytest.mark.parametrize("index", [8, *(pytest.param(k, marks=pytest.mark.slow) for k in range(len(KNOWN)) if k != 8)])
 def test_slopes_on_lists_beside_more_digits(index):
-    """Peak, its time and margin, by block, pulse, and every radius and angle of the edge."""
+    """Peak, its time and margin, by block, pulse, and every radius and angle of the edge, agree with 40 digits."""
     known, names = KNOWN[index], ("max_rotation", "time_of_max", "margin")
     made, numbers = scene_of(known)
 
@@ -442,7 +444,7 @@ def test_slopes_on_lists_beside_more_digits(index):
 @pytest.mark.slow
 @pytest.mark.parametrize("index", [1, 6, 17])
 def test_histories_on_lists_beside_more_digits(index):
-    """A rotation on the way, and the last impact before."""
+    """A rotation before the peak, and the last impact, agree with 40 digits."""
     known, names = KNOWN[index], ("rotation", "last_impact")
     made, numbers = scene_of(known)
 
@@ -457,7 +459,7 @@ def test_histories_on_lists_beside_more_digits(index):
 
 
 def test_slopes_do_not_depend_on_the_tolerance():
-    """A step across an angle of the list would leave them 3e-4 off; in lanes they are the same."""
+    """Steps end at angles of the list: a step across one leaves slopes 3e-4 off. Lanes give the same."""
     pulse, edge = (
         rk.MavroeidisPapageorgiouPulse(0.6, 0.9, 6.0),
         rk.blocks.Edge([0.795, 0.335, 0.732], [0, 0.051, 0.163]),
@@ -468,7 +470,8 @@ def test_slopes_do_not_depend_on_the_tolerance():
 
 
 def test_a_free_block_passes_its_balance_on_a_list():
-    """Its acceleration is zero there, and angles of the list come soon after: of 200 blocks none is lost."""
+    """The acceleration is zero at the balance, and angles of the list follow soon after: all 200 blocks are
+    computed."""
     random, angle = np.random.default_rng(1), np.linspace(0.0, 0.5, 12)
     alpha, scale, p = random.uniform(0.12, 0.3, 200), random.uniform(0.6, 1.6, 200), random.uniform(1.5, 4.0, 200)
     model = rk.models.Rolling(rk.blocks.Edge(0.3 + 0.15 * np.cos(7 * angle), angle))

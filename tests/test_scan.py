@@ -21,7 +21,7 @@ def unknowns():
 
 
 def problem(seed):
-    """Three rocks of which it is seen how far they rocked, or stand, or fell, under a motion at random."""
+    """Make three rocks that rocked so far, stand, or fell, under a random motion."""
     rng = np.random.default_rng([17, seed])
     alpha, p = rng.uniform(0.08, 0.3, 3), rng.uniform(1.5, 5.0, 3)
     amplitude, period = np.exp(rng.uniform(np.log([0.15, 0.3]), np.log([0.9, 2.0])))
@@ -44,7 +44,7 @@ def peaks(alpha, p, amplitude, period):
 
 
 def on_a_grid(observations, scatter):
-    """Log-likelihoods over both parameters, and the lists of these."""
+    """Return log-likelihoods over both parameters, and their values."""
     over = {name: np.geomspace(low * 1.001, high * 0.999, GRID) for name, (low, high) in UNKNOWNS.items()}
     region = rk.inverse.feasible_region(
         rk.inverse.Likelihood(observations, rk.SinePulse, scatter), over, progress=False
@@ -60,7 +60,7 @@ def beside_a_grid(seed):
     assert grid.max() < top + 0.05, seed
     if bool(found.status == rk.inverse.EstimateStatus.contradictory):
         return
-    within = grid > top - RATIO + 0.1  # what is hardly within may lie on either side of an end
+    within = grid > top - RATIO + 0.1  # points hardly within may lie on either side of an end
     step = 1.01 * np.log(np.array([x[1] / x[0] for x in over.values()]))
     for axis, (low, high) in enumerate(np.log(np.asarray(found.interval))):
         values = np.log(list(over.values())[axis][within.any(axis=1 - axis)])
@@ -79,7 +79,7 @@ def test_many_grids_are_nowhere_higher_and_intervals_cover_them(seed):
 
 
 def test_the_highest_summit_is_found():
-    """From 64 starts that were spread over the ranges the search ended at 3 g and 0.144 s, 2 below the highest."""
+    """A search from 64 starts spread over the ranges ends at 3 g and 0.144 s, 2 below the highest."""
     alpha = np.array([0.2972009055343436, 0.1501163844668137, 0.25348076588040636])
     p = np.array([4.544637790936756, 2.868796822887179, 3.0325865559297958])
     rotation = np.array([0.1406422817340355, 0.08883323395717965, 0.07126082833246905])
@@ -93,7 +93,7 @@ def test_the_highest_summit_is_found():
 
 
 def test_an_interval_goes_on_to_where_the_profile_ends():
-    """With a grid as judge, of rocks between which the period's interval ended at 1.29 s of 1.47 s."""
+    """A grid judges the ends; a search that stops early ends the period's interval at 1.29 s instead of 1.47 s."""
     rng = np.random.default_rng(3)
     count = int(rng.integers(3, 10))
     alpha, p = rng.uniform(0.08, 0.3, count), rng.uniform(1.5, 5, count)
@@ -114,7 +114,7 @@ def test_an_interval_goes_on_to_where_the_profile_ends():
 
 @functools.cache
 def counted(scatter, alpha_sd, p_sd, draws=20_000):
-    """Shares of drawn scenes in which rocks stand, by the verdict alone; and the rocks and motions."""
+    """Return shares of drawn scenes in which rocks stand, by the verdict alone; and the rocks and motions."""
     rng = np.random.default_rng(11)
     alpha, p = rng.uniform(0.08, 0.35, 12), rng.uniform(1.8, 5.0, 12)
     period, strength = np.exp(rng.uniform(np.log(0.3), np.log(2.5), 12)), np.exp(rng.uniform(0, 1.5, 12))
@@ -128,7 +128,7 @@ def counted(scatter, alpha_sd, p_sd, draws=20_000):
     return alpha, p, period, amplitude, np.array(shares)
 
 
-# Asked for: root mean square beside counts of few rocks, which are themselves off by 0.003.
+# Root mean square error asked for, and counts of few rocks, which are themselves off by 0.003.
 ACCURACIES = {0.02: 0.04, 0.01: 0.018, 0.005: 0.01}
 
 
@@ -149,8 +149,11 @@ def test_probabilities_are_as_accurate_as_was_asked_for(scatter, alpha_sd, p_sd)
 
 
 def test_slopes_by_the_amplitude_are_those_of_finer_quadratures():
-    """Beside central differences of a likelihood that is five times as accurate. (By the period a likelihood has steps
-    in its margins, between which it has other slopes: `test_inverse.py` compares these with its own differences.)"""
+    """Central differences of a likelihood five times as accurate are the judge.
+
+    By the period a likelihood has steps in its margins, with other slopes between: `test_inverse.py` compares these
+    with its own differences.
+    """
     alpha, p = np.array([0.12, 0.2, 0.26]), np.array([3.0, 3.6, 2.6])
     rocks = rk.inverse.Observations(alpha, p, ["toppled", "survived", "survived"], alpha_sd=0.05 * alpha)
 
@@ -173,7 +176,7 @@ def test_accuracies_that_there_are_not(accuracy):
 
 @pytest.mark.parametrize("accuracy", [0.02, 0.01, 0.005])
 def test_possible_rocks_are_normal(accuracy):
-    """Means are zero, directions hardly correlated, and what strata leave out of the variance is told."""
+    """Means are zero, directions hardly correlated, and the variance within strata is known."""
     normals, absorbed = (getattr(Quadrature.of(accuracy, False), name) for name in ("normals", "absorbed"))
     np.testing.assert_allclose(normals.mean(axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.mean(np.square(normals), axis=1) + absorbed, 1.0, rtol=1e-12)
@@ -182,7 +185,7 @@ def test_possible_rocks_are_normal(accuracy):
         assert np.abs(np.corrcoef(normals)[0, 1]) < 0.1
 
 
-def test_summits_that_compete_are_told():
+def test_competing_summits_are_reported():
     """Two ways to topple one rock and spare two: short and strong, or long and weak."""
     alpha, p = np.array([0.12, 0.25]), np.array([4.0, 1.6])
     rocks = rk.inverse.Observations(alpha, p, ["rotation"] * 2, rotation=[0.06, 0.1], rotation_sd=[0.002, 0.003])
@@ -209,7 +212,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_no_status_claims_more_than_was_tried(kind):
-    """No search proves that there is no other maximum, no nearer record and no motion that it did not meet."""
+    """No search proves that it found every maximum, the nearest record, or every motion."""
     words = " ".join(kind[getattr(kind, name)] for name in KINDS[kind])
     for claim in ("One maximum stands out", "No record near", "every motion in the range", "under no motion"):
         assert claim not in words

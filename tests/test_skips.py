@@ -29,7 +29,7 @@ REASONS = {
 
 @pytest.mark.parametrize("name", REASONS)
 def test_reasons(name, monkeypatch):
-    """With zarr and llvmlite missing, all else installed."""
+    """Zarr and llvmlite are missing, all else is installed."""
     monkeypatch.setattr(skipped_tests, "is_missing", lambda package: package in ("zarr", "llvmlite"))
     reason, wanted = REASONS[name]
     found = skipped_tests.complaint(reason)
@@ -61,7 +61,7 @@ def pytest_configure(config):
 
 @pytest.mark.parametrize("allowed", [True, False], ids=["skips allowed", "none allowed"])
 def test_a_skip_without_a_reason_is_a_failure(tmp_path, allowed):
-    """Two workers, one of which skips a whole module."""
+    """Two workers run, one of which skips a whole module."""
     (tmp_path / "conftest.py").write_text(CONFTEST.format(allowed=allowed))
     (tmp_path / "pytest.ini").write_text("[pytest]")
     (tmp_path / "test_tests.py").write_text(MODULE)
@@ -94,7 +94,7 @@ def packages_that_tests_need() -> dict[str, str]:
 
 
 def test_dev_brings_every_package_that_tests_need():
-    """And `skipped_tests` is told the modules by whose names packages are known."""
+    """`skipped_tests` also knows the modules whose names differ from those of packages."""
     needed, brought = packages_that_tests_need(), skipped_tests.packages_of("dev")
     assert len(needed) > 8 and OF_SLOW_TESTS.isdisjoint(brought)
     known = skipped_tests.optional_packages()

@@ -1,4 +1,4 @@
-"""What status texts say is so."""
+"""Advice of status texts holds: the setting that a text names decides."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ def test_no_setting_is_said_to_decide_all():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("alpha, decided", DECIDED.values(), ids=DECIDED)
-def test_what_a_setting_decides_of_a_minute_of_rocking(alpha, decided):
-    """Truncation of a low order is larger than rounding; where rounding has grown to all, no order and no tolerance
+def test_settings_that_decide_a_minute_of_rocking(alpha, decided):
+    """Truncation of a low order is larger than rounding; where rounding has grown large, no order and tolerance
     decides."""
     block = rk.Block(alpha, 3.0, 0.95)
     for engine in (rk.Series(), rk.Series(tolerance=1e-15)):

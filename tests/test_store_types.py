@@ -1,4 +1,4 @@
-"""Every type of number in every format: what is there is exact, also to xarray, and what is missing is NaN."""
+"""Every type of number in every format: stored values are exact, also to xarray, and missing ones are NaN."""
 
 import shutil
 import zipfile
@@ -17,7 +17,7 @@ xarray = pytest.importorskip("xarray")
 pytest.importorskip("zarr"), pytest.importorskip("h5netcdf")
 
 NAN = np.array([0x7FF8000000000123], np.uint64).view(float)[0]  # with a payload
-DEFAULT_FILL = 9.969209968386869e36  # of NetCDF's floating-point numbers
+DEFAULT_FILL = 9.969209968386869e36  # fill values of NetCDF's floating-point numbers
 REAL = [np.nan, np.inf, -np.inf, -0.0, DEFAULT_FILL, NAN]
 WHOLE = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
 
@@ -41,7 +41,7 @@ TABLE = {kind: of_whole(kind) for kind in WHOLE} | {
 IN_NETCDF = [name for name in TABLE if name != "float16" and not name.startswith("complex")]
 AXIS = np.array([-128, -1, 0, 1, 126, 127], np.int8)
 NUMBERS = np.arange(6)
-DONE = 4  # points of the unfinished store that are there
+DONE = 4  # computed points of the unfinished store
 
 
 def function(k):
@@ -49,12 +49,12 @@ def function(k):
 
 
 class Killed(BaseException):
-    """Nothing that the code could catch."""
+    """An exception that the code cannot catch."""
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """One file of each format with all types that it has."""
+    """Return one file of each format with all types that it has."""
     folder, patch = tmp_path_factory.mktemp("types"), pytest.MonkeyPatch()
     paths = {name: folder / name for name in ("saved.nc", "saved.zarr", "finished.zarr", "unfinished.zarr")}
     rk.studies.Grid({"k": AXIS}, {name: TABLE[name] for name in IN_NETCDF}).save(paths["saved.nc"])
@@ -75,7 +75,7 @@ def files(tmp_path_factory):
 
 
 def read_by_xarray(path: Path, name: str) -> np.ndarray:
-    """Values as users of xarray see them, by its default decoding."""
+    """Return values as users of xarray see them, by its default decoding."""
     engine = "h5netcdf" if path.suffix == ".nc" else "zarr"
     with xarray.open_dataset(path, engine=engine, chunks=None) as data:
         return data[name].values
@@ -90,21 +90,21 @@ WRITTEN += [(name, form) for form in ("saved.zarr", "finished.zarr") for name in
 
 
 @pytest.mark.parametrize("name, form", WRITTEN)
-def test_what_is_whole_is_exact(files, name, form):
+def test_finished_stores_are_exact(files, name, form):
     right = TABLE[name]
     assert bits(rk.studies.Grid.load(files[form]).values[name]) == bits(right)
     found = read_by_xarray(files[form], name)
-    if form == "finished.zarr" and right.dtype.kind in "iu":  # in a wider type, where something could be missing
+    if form == "finished.zarr" and right.dtype.kind in "iu":  # in a wider type, where values may be missing
         assert found.dtype.kind == "i" or right.dtype == np.uint64
         found = found.astype(right.dtype)
     assert bits(found) == bits(right)
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_what_is_missing_is_nan_and_what_is_there_exact(files, name):
+def test_missing_values_are_nan_and_others_exact(files, name):
     right, found = TABLE[name], read_by_xarray(files["unfinished.zarr"], name)
     assert found.dtype.kind in "fc" and np.isnan(found[DONE:]).all()
-    # Of 64 bits readers round what lies beyond 2^53, and one number is the fill value.
+    # Readers round 64-bit numbers beyond 2^53, and one number is the fill value.
     there = slice(2 if name.endswith("int64") else 0, DONE)
     np.testing.assert_array_equal(found[there], right[there])
 
@@ -120,7 +120,7 @@ def test_an_unfinished_store_goes_on_to_be_a_finished_one(files, tmp_path):
 
 
 def test_a_block_that_is_lost_is_missing_again(files, tmp_path):
-    """A finished store that is being mended says so to other readers."""
+    """A finished store under repair is marked as unfinished for other readers."""
     path = tmp_path / "a.zarr"
     shutil.copytree(files["finished.zarr"], path)
     (path / "uint8" / "c" / "2").unlink()
@@ -138,7 +138,7 @@ def test_a_block_that_is_lost_is_missing_again(files, tmp_path):
 
 @pytest.mark.parametrize("files_written", range(0, 40, 7))
 def test_a_session_may_end_while_a_store_is_marked(files, tmp_path, monkeypatch, files_written):
-    """The marks of some arrays are those of a finished store, of others not yet: nothing of it is damaged."""
+    """The marks of some arrays are still those of an unfinished store: no file counts as damaged."""
     path, count, written_aside = tmp_path / "a.zarr", [], description.written_aside
     shutil.copytree(files["unfinished.zarr"], path)
 
@@ -161,7 +161,7 @@ def test_a_session_may_end_while_a_store_is_marked(files, tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("form", ["saved.nc", "saved.zarr"])
 def test_axes_come_back(files, form):
-    """Also those that have the fill value of their type among them."""
+    """Axes may hold the fill value of their type."""
     assert bits(rk.studies.Grid.load(files[form]).axes["k"]) == bits(AXIS)
     assert bits(read_by_xarray(files[form], "k")) == bits(AXIS)
 

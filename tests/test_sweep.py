@@ -306,7 +306,7 @@ PRINTED = {
     USE + "use(2); jax.devices(); print(use(2))": "2",
     "import os, jaxrock as rk; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
     "print(rk.studies.use_cpu_devices())": "1",
-    "import os, jax; from jaxrock.__main__ import main; main(['run', '--out', '/dev/null']); "
+    "import os, jax; from jaxrock.__main__ import main; main(['run', 'missing.AT2']); "
     "print(jax.device_count() == len(os.sched_getaffinity(0)))": "True",
 }  # fmt: skip
 # JAX starts nothing when it is imported, so every copy of such a process is as a fresh one.

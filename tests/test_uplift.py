@@ -1,7 +1,7 @@
 """A flexible base that begins to turn, and its first return: the restitution acts only there.
 
-Judged by SciPy's integration of a chain of elements. Without a judge: before the first return nothing depends on the
-restitution, every impact ends a stay in which the base has turned, and mirrored scenes answer mirrored.
+SciPy's integration of a chain of elements is the judge. Some cases need none: before the first return nothing depends
+on the restitution. Every impact ends a phase in which the base has turned, and mirrored scenes answer mirrored.
 """
 
 import itertools
@@ -45,7 +45,7 @@ def test_the_restitution_waits_for_the_first_return(case):
     first = impacts[0] if impacts else duration
     before = found[0].time < first
     for name in ("rotation", "displacement", "bending"):
-        # To rounding: steps after the return are of another length.
+        # Equal to rounding: steps after the return have another length.
         one, other = (np.asarray(getattr(each, name))[before] for each in found)
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(one).max())
     assert np.abs(found[0](np.linspace(0, first, 99))[0]).max() > 1e-7
@@ -65,7 +65,7 @@ def test_mirrored_scenes_answer_mirrored():
 
 @pytest.mark.parametrize("damping", ["stiffness", "modal", "rayleigh"])
 def test_a_locked_base_unlocks_by_the_moment_of_its_state(damping):
-    """The moment that is watched for the uplift is that of springs and dampers between which the base is."""
+    """The moment that decides the uplift is that of springs and dampers next to the base."""
     block = rk.blocks.FlexibleBlock(
         **TALL, damping_ratio=0.2, masses=4, damping=damping, base="sine", rotations="finite", p_delta=True
     )
@@ -95,7 +95,7 @@ GROUPS = [(*law, KINDS[(k + other) % 3], MOTIONS[(k + other) % 4], other)
 def drawn(random, base, rotations, p_delta, damping, kind, other):
     """A random column and motion."""
     every = other == 1 and base == "plastic"
-    least = 0.7 if every else 0.3  # a column that loses most at every return comes to an end of them
+    least = 0.7 if every else 0.3  # a column that loses most at every return soon stops
     height = np.exp(random.uniform(np.log(4), np.log(40)))
     width = height / random.uniform(4, 10)
     size = random.choice([-1, 1]) * random.uniform(1.1, 3.5) * width / height
@@ -115,7 +115,7 @@ def drawn(random, base, rotations, p_delta, damping, kind, other):
 
 
 def beside_the_chain(block, motion):
-    """Largest differences, over peaks: of impact times [s], peak, rotations and tops; and counts."""
+    """Return the largest differences, over peaks: of impact times [s], peak, rotations and tops; and counts."""
     duration = float(motion.end) + 0.4
     found = rk.simulate(block, motion, duration=duration, samples=101)
     outcome = rk.outcome(block, motion, duration=duration)
@@ -141,7 +141,7 @@ def beside_the_chain(block, motion):
 @pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS, ids=["-".join(map(str, group)) for group in GROUPS])
 def test_random_columns_beside_the_chain(group):
-    """216 in all."""
+    """216 columns in all."""
     random = np.random.default_rng(GROUPS.index(group))
     for _ in range(9):
         (count, expected), late, peak, rotation, top = beside_the_chain(*drawn(random, *group))
@@ -151,7 +151,7 @@ def test_random_columns_beside_the_chain(group):
 
 @pytest.mark.slow
 def test_slopes_through_an_uplift_beside_differences_of_the_chain():
-    """Of rotation and top, while the base is up and after its first return."""
+    """Differences of the chain judge slopes of rotation and top, while the base is up and after its first return."""
     shape, _, duration = CASES["stiffness"]
     times, samples, step = np.array([0.045, 0.058]), np.array(SHAKING), 1e-4
 

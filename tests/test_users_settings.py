@@ -22,36 +22,36 @@ from jaxrock._settings import in_precision_of_session, kept_by_precision, under_
 from references.users_settings import CALLS, SETTINGS
 
 ROOT = Path(__file__).parents[1]
-OF_TESTS = ("JAXROCK_CACHE", "JAXROCK_TESTS_COMPILED", "XLA_FLAGS")  # what the tests themselves set
+OF_TESTS = ("JAXROCK_CACHE", "JAXROCK_TESTS_COMPILED", "XLA_FLAGS")  # set by the tests themselves
 OF_USERS = {
     "NaN of the user": "FloatingPointError",
     "NaN by contract, in a program of the user": "FloatingPointError",
     "infinity by contract, in a program of the user": "FloatingPointError",
 }
-# JAX itself places numbers for these, unasked: ones and unit vectors for derivatives, constants of users.
+# JAX itself places numbers for these implicitly: ones and unit vectors for derivatives, constants of users.
 PLACED_BY_JAX = {"grad", "vmap(grad)", "hessian", "jacrev of a history", "grad by samples", "scan", "suite"}
 FEW = [
     "outcome", "overturned", "outcome of no numbers", "FlexibleBlock", "pushover", "toppling_rate", "similarity",
     "fit_fragility, separable", *OF_USERS,
 ]  # fmt: skip
 LATE = ["FlexibleBlock", "toppling_rate, tabulated", "fit_pulse"]
-WITHOUT_CACHES = ["checking_leaks"]  # JAX forgets what it has traced and compiled, at every call
+WITHOUT_CACHES = ["checking_leaks"]  # JAX traces and compiles anew at every call
 STRICT = ["strict promotion of types", "transfer_guard", "debug_nans", "global debug_infs", "no promotion of ranks"]
 
 
 def told(*words):
-    """What `references.users_settings` says."""
+    """Return the output of `references.users_settings`."""
     surroundings = {name: value for name, value in os.environ.items() if name not in OF_TESTS}
     with tempfile.TemporaryDirectory() as place:
         surroundings["JAXROCK_CACHE"] = place
         program = [sys.executable, "-m", "references.users_settings", *words]
         run = subprocess.run(program, cwd=ROOT, env=surroundings, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout.splitlines()[-1])  # JAX writes of NaN that it finds before
+    return json.loads(run.stdout.splitlines()[-1])  # JAX first prints the NaN that it finds
 
 
 def differ(found, usual, rel=1e-11):
-    """Calls whose numbers differ, and what was raised."""
+    """Return calls whose numbers differ, and their errors."""
     wrong = {}
     for name, one in found.items():
         if isinstance(one, str) or isinstance(usual[name], str):
@@ -64,7 +64,7 @@ def differ(found, usual, rel=1e-11):
 
 
 def is_of_users(setting, name, raised):
-    """Whether JAX raises for what is the user's own: for a result that leaves a program of the user."""
+    """Return whether JAX rightly raises for the user's own code: for a result that leaves a program of the user."""
     if setting == "transfer_guard":
         return name in PLACED_BY_JAX and "Disallowed host-to-device transfer" in str(raised)
     kind = {"debug_nans": "NaN", "debug_infs": "infinity"}.get(setting.removeprefix("global "), "nothing")
@@ -106,12 +106,13 @@ def test_every_setting_changes_no_number_of_any_call(setting):
 
 
 def check_late(found, rel_of_single, usual):
-    """Double precision that is switched on late finds what it finds at once; single precision its digits of that."""
+    """Double precision switched on late finds the numbers of double precision; single precision agrees to its
+    digits."""
     for when in ("double", "cleared", "double again"):
         assert not differ(found[when], usual), when
     for when in ("single", "single within"):
         refused = {name for name, one in found[when].items() if str(one).startswith("ValueError: Argument")}
-        assert refused <= {"flexible with P-Delta"}  # which wants double precision, and says so
+        assert refused <= {"flexible with P-Delta"}  # that call asks for double precision
         numbers = {name: one for name, one in found[when].items() if name not in refused}
         assert not differ(numbers, usual, rel_of_single), when
 
@@ -150,7 +151,7 @@ MADE_IN_DOUBLE = {
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow if n in ("simulate", "grad") else []) for n in MADE_IN_DOUBLE]
 )
-def test_what_was_made_in_double_precision_is_single_where_that_is_asked_for(name):
+def test_double_precision_arrays_become_single_under_enable_x64_false(name):
     double = np.asarray(MADE_IN_DOUBLE[name](BLOCK, PULSE))
     with jax.enable_x64(False):
         single = MADE_IN_DOUBLE[name](BLOCK, PULSE)

@@ -132,9 +132,11 @@ class Rounded(NamedTuple):
 
 
 class EdgePieces(eqx.Module):
-    """An edge in pieces on which its radius is linear in the opening angle: where they start (None: a circle, which is
-    one), what the edge has added before, and the slope of its radius. One of many pieces is such an edge, too, whose
-    numbers are scalars."""
+    """Pieces of an edge, on each of which the radius is linear in the opening angle.
+
+    They hold the angles at which pieces start (None: a circle), the integrals up to there, and the slope of the radius.
+    A single piece taken out of many has scalar numbers.
+    """
 
     start: Real | None
     before: Rounded
@@ -162,8 +164,11 @@ class EdgePieces(eqx.Module):
         )
 
     def ahead(self, opening: Real, outward: Bool[Array, ""]) -> tuple["EdgePieces", Real]:
-        """Of many pieces the one on which a block rolls from an opening angle on, outward or inward, and the angle at
-        which it leaves it; beyond pi/2 where there is none."""
+        """Return the piece on which a block rolls on from an opening angle, outward or inward, and the angle that ends
+        it.
+
+        The angle is beyond pi/2 where no piece follows.
+        """
         piece, angle, ends = stretch_from(cast(Array, self.start), opening, outward)
         return self._piece(piece), where(ends, angle, jnp.pi)
 

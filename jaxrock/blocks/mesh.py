@@ -16,7 +16,7 @@ def surface_of(mesh: Any) -> Any:
             import trimesh
         except ImportError as error:
             raise ImportError('Reading a mesh needs trimesh: pip install "jaxrock[mesh]".') from error
-        with open_regular(path):  # said as for any file
+        with open_regular(path):  # fails with the same errors as for any other file
             pass
         try:
             return trimesh.load(path, force="mesh")

@@ -105,7 +105,7 @@ def _write(
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
     report.wrote(folder.path / "stripes.csv")
-    folder.discard("fragility.xml")  # of an earlier run, which may have had a fit
+    folder.discard("fragility.xml")  # an earlier run may have had a fit
     if fit is not None and found.measure.startswith("SV("):
         report.say(f"no fragility.xml: OpenQuake knows no {found.measure}")
     elif fit is not None:

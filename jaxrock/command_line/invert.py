@@ -194,7 +194,7 @@ def _write(
     flat = (np.ravel(x).astype(float) for x in (rows, columns, region.log_likelihood, region.allowed))
     with folder.whole(files[2]) as aside:
         np.savetxt(aside, np.column_stack(list(flat)), delimiter=",", header=header, comments="", fmt="%.8g")
-    folder.discard(_WALL)  # of an earlier run
+    folder.discard(_WALL)  # left by an earlier run
     if wall is not None:
         files.append(_WALL)
         with folder.whole(_WALL) as aside, aside.open("w", encoding="utf-8") as file:

@@ -40,8 +40,8 @@ _EXAMPLES = """\
   jaxrock cache --clear                           forget what was compiled before
 """
 _RESULTS = f"""\
-Results in --out are replaced by those of the next run; what jaxrock wrote there, and is unchanged, {KNOWN} tells.
-Other files, and inputs, are replaced with --force only."""
+The next run replaces results in --out that jaxrock wrote and that are unchanged; {KNOWN} lists them.
+It replaces other files, and inputs, with --force only."""
 _EXIT = "exit status: 0 good, 1 something was not computed, 2 bad input, 130 interrupted, 141 nobody reads it any more"
 
 
@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
             models, folder = ("housner", "linear"), Path("results")
             sub.add_argument("--model", choices=models, default="housner", help="equation of motion (default housner)")
             sub.add_argument("--out", type=Path, default=folder, help=f"folder for what is written (default {folder})")
-            words = "also replace inputs, and files in --out that jaxrock did not make, or that were changed since"
+            words = "also replace inputs, and files in --out that jaxrock did not make, or that were changed later"
             sub.add_argument("--force", action="store_true", help=words)
         command.add_options(sub)
     return parser
@@ -97,16 +97,16 @@ def main(words: list[str] | None = None) -> int:
     except BrokenPipeError:
         drop(sys.stdout)
         return 141
-    except OSError as error:  # of help, or of an example, which cannot be printed
+    except OSError as error:  # help, or an example, that cannot be printed
         complain(f"error: {error}")
         drop(sys.stdout)
         return 2
 
 
 def _open_closed_streams() -> None:
-    """Open the streams that the program was started without (`>&-`), to nowhere.
+    """Open streams that the caller has closed (`>&-`) onto the null device.
 
-    Otherwise files that it opens take their place, and libraries in C write their words into these.
+    Otherwise the next opened files get their descriptors, and C libraries print into those files.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -117,7 +117,7 @@ def _done(words: list[str] | None) -> int:
     try:
         arguments = _parser().parse_args(words)
     finally:
-        sys.stdout.flush()  # of help, after which argparse exits
+        sys.stdout.flush()  # argparse exits after it has printed help
     command = _COMMANDS[arguments.command]
     report = Report(command.name, arguments.json, arguments.quiet)
     with heard(arguments.quiet, arguments.verbose):
@@ -137,8 +137,8 @@ def _done(words: list[str] | None) -> int:
 
 
 def _prepare(command: Command, arguments: argparse.Namespace) -> None:
-    """What commands that compute need: a folder for their results, and JAX."""
-    if arguments.out.exists() and not arguments.out.is_dir():  # said before the work, not after it
+    """Prepare a command that computes: check and open its folder of results, and configure JAX."""
+    if arguments.out.exists() and not arguments.out.is_dir():  # raise before the computation, not after it
         raise NotADirectoryError(f"Argument `--out` must be a folder, but {arguments.out} is a file.")
     there = next(place for place in (arguments.out, *arguments.out.absolute().parents) if place.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):

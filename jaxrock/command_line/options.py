@@ -123,7 +123,7 @@ _POSITIONAL = {"command", *_INPUTS}
 
 
 def inputs_of(arguments: argparse.Namespace) -> list[Path]:
-    """The files that a command reads."""
+    """Return the files that a command reads."""
     words = [getattr(arguments, name, None) or [] for name in _INPUTS]
     return [Path(path).expanduser() for each in words for path in files_of([each] if isinstance(each, str) else each)]
 

@@ -59,9 +59,9 @@ class Report:
         self.say(words)
 
     def say(self, words: str) -> None:
-        """Something for people only; programs find the same in `results`.
+        """Print words for people; programs read the same from `results`.
 
-        Where it cannot be said, results are written all the same, and `finished` raises.
+        Where printing fails, results are written all the same, and `finished` raises.
         """
         if self._speaks:
             try:
@@ -90,9 +90,9 @@ class Report:
         complain(reason)
 
     def finished(self) -> int:
-        """The exit status, after all is said.
+        """Return the exit status, after printing what is left.
 
-        **Raises:** OSError where something could not be said.
+        **Raises:** OSError where something could not be printed.
         """
         if self._unsaid is not None:
             raise self._unsaid
@@ -103,7 +103,7 @@ class Report:
 
 
 def complain(words: str) -> None:
-    """Say on the standard error what goes on, or went wrong, if that can be written."""
+    """Print a message to standard error, if that can be written."""
     try:
         print(f"jaxrock: {words}", file=sys.stderr, flush=True)
     except OSError:
@@ -111,11 +111,11 @@ def complain(words: str) -> None:
 
 
 def drop(stream: TextIO) -> None:
-    """Where a stream cannot be written, forget what is left of it: Python would complain once more at its end."""
+    """Discard the buffer of a stream that cannot be written: Python would raise again at exit."""
     try:
         stream.flush()
     except OSError:
-        with contextlib.suppress(OSError):  # where it is no file there is nothing to drop
+        with contextlib.suppress(OSError):  # a stream without a descriptor has nothing to drop
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, stream.fileno())
             os.close(nowhere)
@@ -136,7 +136,7 @@ def plain(value: Any) -> Any:
 
 
 def write_csv(report: Report, folder: ResultFolder, name: str, header: str, *columns) -> None:
-    """Write columns of numbers, under a header of names with commas between them."""
+    """Write columns of numbers under a comma-separated header."""
     table = np.column_stack([np.asarray(column, dtype=float) for column in columns])
     with folder.whole(name) as aside:
         np.savetxt(aside, table, delimiter=",", header=header, comments="", fmt="%.12g")

@@ -1,8 +1,8 @@
 """The folder of results: it knows the files that the command wrote there, and replaces no others.
 
-They are told by their SHA-256 in one file beside them, to which lines are only added, before a result gets its name. So
-runs that write into one folder at once, or that are killed, know each other's results. A result that was changed since
-is not known any more.
+One file beside the results lists their SHA-256. A line is added before a result gets its name, and none is removed. So
+runs that write into one folder at once, or that are killed, know each other's results. A result that was changed later
+no longer counts as the command's own.
 """
 
 import contextlib
@@ -20,19 +20,20 @@ _TITLE = "# Files that jaxrock wrote here, by their SHA-256: these it replaces, 
 
 
 class ResultFolder:
-    """A folder, which need not be there yet.
+    """A folder of results, which may not exist yet.
 
-    - `inputs`: files that are read. `force`: whether these, and files that the command did not make, are replaced.
+    - `inputs`: files that the command reads.
+    - `force`: whether to replace inputs, and files that the command did not make.
     """
 
     def __init__(self, path: Path, inputs: Iterable[Path] = (), force: bool = False):
         self.path, self._inputs, self._force = path, list(inputs), force
 
     def check(self, names: Iterable[str]) -> None:
-        """See that files may be written.
+        """Check that files may be written.
 
-        **Raises:** FileExistsError where they would replace an input, a file that the command did not make, or one that
-        was changed since.
+        **Raises:** FileExistsError where they would replace an input, a foreign file, or a result that was changed
+        later.
         """
         found = [f"{self.path / name} {risk}" for name in names if (risk := self._risk(self.path / name))]
         if not self._is_list_own():
@@ -45,14 +46,14 @@ class ResultFolder:
 
     @contextlib.contextmanager
     def whole(self, name: str) -> Iterator[Path]:
-        """Where to write a file that is there whole or not at all; an error says which file it was."""
+        """Yield a temporary path for a file, which gets its name when the body ends; errors name the file."""
         path = self.path / name
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             aside = Path(tempfile.mkdtemp(".partial", f".{name}.", self.path))
             try:
                 yield aside / name
-                self.check([name])  # another program may have written it meanwhile
+                self.check([name])  # another program may have created the file since the first check
                 self._note(name, _digest(aside / name))
                 move_into_place(aside / name, path, replace=os.path.lexists(path))
             finally:
@@ -63,7 +64,7 @@ class ResultFolder:
             raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
 
     def discard(self, name: str) -> None:
-        """Remove the result of an earlier run, if it is there as the command wrote it."""
+        """Remove the result of an earlier run, if it is unchanged."""
         path = self.path / name
         if self._is_own(path):
             path.unlink()
@@ -79,11 +80,11 @@ class ResultFolder:
         return "is an input" if self._is_input(path) else "was not made by jaxrock, or was changed since"
 
     def _is_input(self, path: Path) -> bool:
-        """Return whether a file is one of those that are read, by whatever name or link."""
+        """Return whether a path is one of the inputs, by any name or link."""
         return any(path.exists() and each.exists() and path.samefile(each) for each in self._inputs)
 
     def _is_own(self, path: Path) -> bool:
-        """Return whether a file is as the command wrote it."""
+        """Return whether a file is unchanged since the command wrote it."""
         if not path.is_file() or path.is_symlink() or not self._is_list_own():
             return False
         return f"{_digest(path)}  {path.name}" in self._told().splitlines()
@@ -97,7 +98,7 @@ class ResultFolder:
         return known.read_text(encoding="utf-8", errors="replace") if known.is_file() else ""
 
     def _note(self, name: str, digest: str) -> None:
-        """Add a line, in one piece, if it is new."""
+        """Append a new line to the list, in one write."""
         told, line = self._told(), f"{digest}  {name}"
         if line in told.splitlines():
             return

@@ -91,9 +91,9 @@ def _impacts(of_motion: int, of_history: int, duration: float) -> list[Entry]:
 
 
 def _write(report: Report, folder: ResultFolder, response: rk.responses.Response) -> None:
-    """Files and figures of the response."""
+    """Write files and figures of the response."""
     for ending in _FILMS:
-        folder.discard(_film_of(ending))  # of an earlier run, which may have been of another block
+        folder.discard(_film_of(ending))  # an earlier run may have been of another block
     write_csv(report, folder, "history.csv", "time_s,rotation_rad,velocity_rad_per_s", response.time,
               response.rotation, response.velocity)  # fmt: skip
     write_csv(report, folder, "impacts.csv", "time_s,velocity_before_rad_per_s", response.impact_times,
@@ -112,7 +112,7 @@ def _film_of(ending: str) -> str:
 
 
 def _film(report: Report, folder: ResultFolder, name: str, response: rk.responses.Response, block: rk.Block) -> None:
-    """The film, which takes a minute; none of a block that never moves."""
+    """Write the film, which takes a minute, unless the block never moves."""
     if response.status == rk.Status.successful and float(response.max_rotation) == 0:
         return report.say("no film: the block never uplifts")
     with folder.whole(name) as aside:

@@ -25,7 +25,7 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 Real = Inexact[Array, "..."]
 Number = Inexact[Array, ""]
-_ORDER = 20  # of the quadrature between levels
+_ORDER = 20  # nodes of the quadrature between levels
 
 
 class HazardCurve(eqx.Module):

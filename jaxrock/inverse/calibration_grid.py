@@ -111,7 +111,7 @@ def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
 
 
 def _check_cells(message: str, failed: np.ndarray, grid: dict[str, np.ndarray]) -> None:
-    """Raise ValueError where a check of the block has failed, with the parameters of the first such cell."""
+    """Raise ValueError where a check of the block has failed, naming the first such cell by its parameters."""
     failed = np.broadcast_to(failed, next(iter(grid.values())).size)
     cells = np.flatnonzero(failed)
     if cells.size:
@@ -124,7 +124,7 @@ def _check_cells(message: str, failed: np.ndarray, grid: dict[str, np.ndarray]) 
 
 
 def _is_one(values: np.ndarray) -> bool:
-    """Whether all cells have the same; what is no number in all of them is the same, too."""
+    """Return whether all cells have the same value; NaN in all cells counts as the same."""
     return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
 
 

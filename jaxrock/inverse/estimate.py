@@ -1,10 +1,12 @@
 """The motion that rocks allow: parameters of a pulse, with intervals, from rocks that stand, fell, or rocked so far.
 
-The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals: it is scanned, and
-climbed from the best places of the scan. No search can tell that there is no higher one between its places. Intervals
-are those of the profile likelihood: all values of a parameter with which some values of the others explain the
-observations nearly as well as the best. Where the observations leave a side open they end at the range that was
-searched, and say so.
+The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals. A scan of it comes
+first, and climbers start from the best places of the scan. No search can prove that there is no higher maximum between
+its places.
+
+Intervals are those of the profile likelihood: all values of a parameter with which some values of the others explain
+the observations nearly as well as the best. Where the observations leave a side open, the interval ends at the range
+that was searched, and is marked open.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,10 +33,10 @@ from jaxrock.numerics.climb import Summits, climb
 from jaxrock.status import Enumeration, item
 
 Real = Inexact[Array, "..."]
-_SCANNED, _LEAST_SCANNED = 16, 256  # places of the scan for each start, and at least
+_SCANNED, _LEAST_SCANNED = 16, 256  # places of the scan for each start; least number of places
 _ROUNDS_BESIDE, _SCANNED_BESIDE, _BESIDE = 3, 128, 0.08  # rounds, points in each, and their extent in ranges
-_CLIMBING_BESIDE = 8  # of these
-_UNSURE = 0.5  # standard error of a log-likelihood from which on it is told
+_CLIMBING_BESIDE = 8  # points of these
+_UNSURE = 0.5  # standard error of a log-likelihood above which a remark reports it
 _GAIN = 1e-6  # of a round that calls for another
 _RETRIES = 7  # starts with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
@@ -70,7 +72,7 @@ class EstimateStatus(Enumeration):
     not_converged = item("The maximum was not reached. Raise `starts`; a likelihood that jumps there may have none.")
     several_maxima = item(
         "Several maxima explain the observations about equally well: others are less than 1.92 below the highest in "
-        "log-likelihood (see `competing`). Every interval covers those that were found and what lies between, and ends "
+        "log-likelihood (see `competing`). Every interval covers those that were found and the gaps between, and ends "
         "within the range that was searched."
     )
 
@@ -82,29 +84,27 @@ class Estimate(AbstractTable):
     - `interval`: (parameters, 2) 95 % intervals of the profile likelihood, in the parameters' units; other starts'
       maxima that are as good lie within.
     - `open`: (parameters, 2) whether an end is only the end of the range.
-    - `covariance`: (parameters, parameters) of logarithms of the parameters (of a parameter itself that is not searched
-      in its logarithm): the inverse of the bend of a parabola through values of the log-likelihood around its
-      maximum, as far away as it falls by about 1/2 (it has steps, so that slopes do not tell); infinite if it is flat
-      in a direction, falling by less than 0.02 within half a range. Of summits side by side it is that of the highest;
-      intervals are of all.
+    - `covariance`: (parameters, parameters) of logarithms of the parameters (of the parameter itself where the search
+      is not in its logarithm). It is the inverse Hessian of a parabola through log-likelihoods about 1/2 below the
+      maximum, because steps make slopes unusable. Infinite along a flat direction, with a fall below 0.02 within half a
+      range. It describes the highest maximum alone; intervals cover all.
     - `directions`, `deviations`: (parameters, parameters) rows of unit vectors in ranges of the parameters, and
-      (parameters,) the standard deviation along each, in ranges; those of half a range and more are not determined.
+      (parameters,) the standard deviation along each, in ranges. Directions of half a range or more are not determined.
     - `log_likelihood`: at the maximum, with the priors.
-    - `surprise`: how many standard deviations less probable the observations are than is to be expected; above 3 they
+    - `surprise`: by how many standard deviations the observations are less probable than expected; above 3 they
       contradict each other.
     - `probability`: (rocks,) that each rock does what it did (that it stands, where a rotation was measured).
-    - `probability_error`, `log_likelihood_error`: (rocks,) and (), standard errors that the quadrature over scatter and
-      rocks leaves in `probability` and `log_likelihood`, as eight quadratures at random places estimate them.
-    - `competing`, `competing_values`: (n, parameters) and (n,), other maxima that were found less than 1.92 below the
-      highest in log-likelihood, the highest first, with a fall of more than 0.5 on the straight lines between.
-    - `scatter`: under which all this holds; `consistent_scatter`: where observations contradict each other, about the
-      least with which they would not; infinite if none of those tried up to ten times as large will do.
-    - `summits`, `summit_values`: (climbs, parameters) where each climb arrived, and (climbs,) the log-likelihood there:
-      those from points beside the best of the others first, then those from the starts.
-    - `trace`: a `Trace` of the search from these starts, but for what was looked at beside their best; with
-      `plot.search`.
-    - `responses`: how many scenes were computed.
-    - `remarks`: what is to be said about it, in words.
+    - `probability_error`, `log_likelihood_error`: (rocks,) and (), standard errors of `probability` and
+      `log_likelihood` by the quadrature over scatter and rocks. Eight quadratures with random nodes estimate them.
+    - `competing`, `competing_values`: (n, parameters) and (n,), other maxima less than 1.92 below the highest in
+      log-likelihood, the highest first. On the straight line to every higher one it falls by more than 0.5.
+    - `scatter`: the scatter assumed; `consistent_scatter`: where observations contradict each other, about the least
+      scatter with which they would not. Infinite if none up to ten times as large suffices.
+    - `summits`, `summit_values`: (climbs, parameters) end points of the climbs, and (climbs,) the log-likelihood there.
+      Climbs from points beside the best come first, then those from the starts.
+    - `trace`: a `Trace` of the search from the starts, without the climbs beside the best; `plot.search` draws it.
+    - `responses`: number of scenes computed.
+    - `remarks`: warnings about the result, in words.
     - `status`: an `EstimateStatus`.
     """
 
@@ -167,19 +167,18 @@ def estimate_motion(
     **Arguments:**
 
     - `observations`: an `Observations`.
-    - `motion`: what makes the motion of its parameters by name: a pulse, such as `SinePulse`, or a function of your
-      own. Of a record scale the whole: see `Likelihood`.
+    - `motion`: the function that makes the motion from its parameters by name: a pulse, such as `SinePulse`, or your
+      own. To scale a record, scale the whole: see `Likelihood`.
     - `unknowns`: an `Unknown` for each of these parameters.
     - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive; `lapse`: probability that an
       observation says nothing; see `Likelihood`. They are not estimated.
-    - `starts`: points from which the maximum is looked for, at most; at least 1. They are the best places, with no
-      better one beside them, of a scan over the ranges of 16 times as many (at least 256) and then around its best.
-    - `optimizer`: what climbs from them: an `optax.GradientTransformation`, such as `optax.adam(0.1)`, or a minimiser
-      of optimistix, such as `optimistix.BFGS(rtol=1e-6, atol=1e-6)`, over angles: a parameter goes from one end of its
-      range to the other within pi. None: own climbers, by BFGS, in rounds that wait for nobody. Intervals are found by
-      these in any case.
-    - `accuracy`: about the root mean square error that the quadrature leaves in a probability [-], in [0.001, 0.05]:
-      see `Likelihood`, also for what it costs.
+    - `starts`: largest number of starting points, at least 1. They are the best local maxima of a scan. It visits 16
+      times as many places (at least 256) over the ranges, then more around the best.
+    - `optimizer`: an `optax.GradientTransformation`, such as `optax.adam(0.1)`, or a minimiser of optimistix, such as
+      `optimistix.BFGS(rtol=1e-6, atol=1e-6)`. It works on angles: a parameter passes its range within pi. None: the
+      package's batched BFGS, which finds the intervals in any case.
+    - `accuracy`: approximate root mean square error of a probability by the quadrature [-], in [0.001, 0.05].
+      `Likelihood` states its cost.
     - `model`, `engine`: as in `outcome`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
@@ -262,7 +261,7 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
         if np.isfinite(consistent):
             remarks += (f"With a scatter of {consistent:.2g} the observations would not contradict each other.",)
         else:
-            remarks += ("With no scatter that was tried, up to ten times as large, would the observations agree.",)
+            remarks += ("With no scatter that was tried, up to ten times as large, do the observations agree.",)
     arrays = {
         "values": parameters[best], "interval": interval, "open": profiled.open, "covariance": covariance,
         "directions": shape.directions, "deviations": shape.deviations, "log_likelihood": summits.values[best],
@@ -320,7 +319,7 @@ def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
 
 
 def _remarks(problem: Problem, shape: Shape, profiled: Profile, others: Competing, error: float) -> tuple[str, ...]:
-    """Open intervals, flat directions, other maxima and errors of the quadrature in words."""
+    """Return remarks on open intervals, flat directions, other maxima and errors of the quadrature."""
     remarks = []
     for place, value in zip(problem.parameters(others.places), others.values):
         named = ", ".join(f"{name} {x:.3g}" for name, x in zip(problem.names, place))
@@ -329,7 +328,7 @@ def _remarks(problem: Problem, shape: Shape, profiled: Profile, others: Competin
         )
     if error > _UNSURE:
         said = f"The quadrature leaves a standard error of {error:.2g} in the log-likelihood at its maximum"
-        remarks.append(f"{said}: a smaller `accuracy` tells more.")
+        remarks.append(f"{said}: a smaller `accuracy` reduces it.")
     for name, (below, above) in zip(problem.names, profiled.open):
         if below and above:
             remarks.append(f"The observations do not determine {name}.")

@@ -1,8 +1,8 @@
 """Critical excitation: the least-changed record that topples blocks, spares them, or brings them to a margin.
 
-There are as many unknowns as samples, and margins are neither convex nor continuous in them: what is found is the
-least change of those to which several starts lead, each about a local minimum. Each start is a direction of change:
-louder or softer, where an optimiser of optax goes, and against the slopes of the margins under records nearby.
+There are as many unknowns as samples, and margins are neither convex nor continuous in them. The result is the smallest
+of the changes to which several starts lead, each about a local minimum. Each start is a direction of change: louder or
+softer, the path of an optimiser of optax, and against the slopes of the margins under nearby records.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ Target = str | ArrayLike | Sequence[str | float]
 _ROUNDS = 6  # of the search, each of which keeps the peaks of the spectrum that have grown in the one before
 _APPROACH = 40  # steps of the optimiser
 _NEARBY = 0.15  # root mean square of what is added to a record to start nearby, over the record's
-_UNRELATED, _TURNED = 6, 0.7  # first starts; root mean square of what is added to the best direction after them
+_UNRELATED, _TURNED = 6, 0.7  # first starts; root mean square of the perturbation of the best direction in later starts
 _SIDES = {"topple": 1.0, "spare": -1.0}  # the margin is to be on or below that, or above
 _USELESS = 1e6  # [1/g] slope of a margin, from which on a record in the sixth digit decides
 
@@ -44,13 +44,13 @@ class RecordStatus(Enumeration):
     """What became of a search for a record; `RecordStatus[found.status]` is the message."""
 
     successful = item(
-        "The margins are as wanted. Of the records to which the search came from its starts this is the nearest (see "
-        "`changes`); a search from others may find a nearer one."
+        "The margins are as wanted. This record is the nearest of those that the starts led to (see `changes`); other "
+        "starts may find a nearer one."
     )
     unchanged = item("The margins are as wanted under the record as it is.")
     useless_slopes = item(
-        "The margins are as wanted, but they change by more than 1e6 for a change of 1 g: rocking has gone on for so "
-        "long that slopes lead nowhere, and digits of the record decide that nobody measures. Nearer ones are likely."
+        "The margins are as wanted, but they change by more than 1e6 for a change of 1 g. After such long rocking "
+        "slopes lead nowhere, and digits of the record below any measurement decide. Nearer records are likely."
     )
     spectrum_changed = item(
         "The margins are as wanted, but the response spectrum at the periods that are to be kept changes by more than "
@@ -67,17 +67,15 @@ class FoundRecord(AbstractTable):
 
     - `record`: the `Record`; `start`: the one that was changed.
     - `change`: root mean square of the change [g]; infinite if nothing was found, and the record is the start.
-    - `scaling`: root mean square of the change that it takes to scale the start until margins are as wanted [g], of
-      factors that are looked at in steps of half a per cent; infinite if none of them does it.
+    - `scaling`: root mean square of the change that scaling the start alone needs to reach the margins [g]. Factors are
+      tried in steps of half a per cent; infinite if none suffices.
     - `margin`: (blocks,) margins under the record.
-    - `slope`: by how much the margin that changes most does so for a change of root mean square 1 g [1/g], where the
-      search turned last. (At the verge itself a block in balance may wait for what is left of the record, and slopes
-      grow as exp(p t).)
-    - `changes`: (starts,) root mean squares of the changes to which each start came [g], of which `change` is the
-      least; infinite where it did not come to anything. Those that differ are other places where the search ends.
-    - `path`: (steps,) root mean squares on the way from the start that came farthest [g].
-    - `spectrum`: by which share the response spectrum changes at most at the periods that are kept; not a number where
-      none is.
+    - `slope`: largest change of a margin for a change of root mean square 1 g [1/g], at the last linearisation of the
+      search. (At the verge itself a block may stay in balance, where slopes grow as exp(p t).)
+    - `changes`: (starts,) root mean squares of the changes that each start found [g], of which `change` is the least;
+      infinite where a start failed. Different values are different local minima.
+    - `path`: (steps,) root mean squares along the search from the best start [g].
+    - `spectrum`: largest relative change of the response spectrum at the kept periods; NaN where there are none.
     - `status`: a `RecordStatus`.
     """
 
@@ -137,22 +135,21 @@ def find_record(
 
     - `block`: a `Block` or `AsymmetricBlock`, of scalars or of (blocks,) arrays: all of these at once.
     - `start`: the `Record` to change.
-    - `target`: "topple", "spare", or a margin to be come to, which a block that is above comes to from above; one for
-      all blocks, or a list.
-    - `optimizer`: what looks for a first change, by slopes of margins: an `optax.GradientTransformation`, for changes
-      in root mean squares of the record; None: momentum with clipped slopes. `penalty`: weight of the squared change
-      beside the margins there, 0 or more.
+    - `target`: "topple", "spare", or a margin, which a block above it approaches from above; one for all blocks, or a
+      list.
+    - `optimizer`: an `optax.GradientTransformation` that finds a first change by slopes of margins, in root mean
+      squares of the record. None: momentum with clipped slopes. `penalty`: weight of the squared change beside the
+      margins there, 0 or more.
     - `band`: frequencies between which the record may change [Hz]; None: at all.
     - `baseline`: whether velocity and displacement of the ground at the end of the record stay as they are.
-    - `spectrum`: (periods,) of oscillators of 5 % damping whose peaks the change leaves as they are, within 5 % [s],
-      10 steps of the record or more; None: whatever becomes of them.
-    - `starts`: directions from which the nearest record is looked for, at least 1: louder or softer, by the optimiser,
-      by slopes here, three by slopes under records nearby, and then by turns near the best so far and under records
-      nearby, by `seed`. `steps`: for each, at most.
+    - `spectrum`: (periods,) of oscillators of 5 % damping whose peaks stay within 5 % [s], 10 steps of the record or
+      more; None: no such limit.
+    - `starts`: number of directions in which the search starts, at least 1. First louder or softer, the optimiser,
+      slopes here, and three slopes under nearby records. Later ones alternate between the neighbourhood of the best and
+      nearby records, drawn by `seed`. `steps`: for each, at most.
     - `model`, `engine`, `progress`: as in `estimate_motion`.
 
-    **Returns:** a `FoundRecord`: the nearest of those that were found, which no search of this kind proves to be the
-    nearest of all.
+    **Returns:** a `FoundRecord`: the nearest record found; no search of this kind proves it the nearest of all.
 
     **Raises:** ValueError for arguments outside their ranges, and for a record that does not shake.
 
@@ -255,8 +252,10 @@ class _Directions(NamedTuple):
     random: np.random.Generator
 
     def __call__(self, number: int, nearest: Found | None) -> np.ndarray:
-        """First louder (or softer), then by the optimiser, then by the slopes here and under records nearby; later
-        every other one near the best direction so far, where a nearer record is likelier than elsewhere."""
+        """Return the directions in order: louder (or softer), the optimiser, slopes here, slopes under nearby records.
+
+        Later ones alternate with perturbations of the best direction, where a nearer record is likelier than elsewhere.
+        """
         if number == 0:
             louder, softer = (
                 self.search.in_direction(self.search.allowed(x), fine=True) for x in (self.samples, -self.samples)

@@ -1,22 +1,21 @@
-"""How probable observations of rocks are under a motion.
+"""The probability of observations of rocks under a motion.
 
-What is certain about a rock is the sign of the margin of a known block under a known motion. Neither is known: the
-motion at each rock differs from that of the site by a lognormal factor of its own (`scatter`, its standard deviation in
-ln amplitude: what the ground, its surface and the model of a rigid block in a plane leave open), and alpha, p and
-restitution are uncertain. The probability that a rock stands is the share of these possible scenes with a positive
-margin:
+A known block under a known motion stands or falls by the sign of its margin. Neither is known. The motion at each rock
+differs from that of the site by a lognormal factor. `scatter` is its standard deviation in ln amplitude: variation of
+the ground, and errors of the model of a rigid block in a plane. The parameters alpha, p and restitution are uncertain
+too. The probability that a rock stands is the share of these possible scenes with a positive margin:
 
     P(stands) = E[margin > 0],  over  ln amplitude + scatter e0,  ln alpha + (alpha_sd/alpha) e1,  ln p + (p_sd/p) e2,
-                                restitution + restitution_sd e3,  all e independent and normal.
+    restitution + restitution_sd e3,  all e independent and normal.
 
-A probit of the margin over its slope (the delta method) would give that where the margin is straight; but overturning
-sets are unions of intervals, narrower than the scatter or wider, and a probit with one slope would be certain where the
-slope vanishes, in the middle of one. So the margin is computed at many amplitudes (see `scatter`). No derivatives are
-needed for the likelihood, and only first ones for its slope. How far probabilities are off is chosen by `accuracy` and
-told by `survival_error`; beside counted verdicts it stands in `benchmarks/inverse.md`.
+A probit of the margin over its slope (the delta method) would give that where the margin is straight. But overturning
+sets are unions of intervals, narrower than the scatter or wider. A probit with one slope would be certain where the
+slope vanishes, in the middle of an interval. So the margin is computed at many amplitudes (see `scatter`).
 
-Of an asymmetric rock of which it is not known which way round it stood in the shaking, the probability is the mean over
-both ways.
+The likelihood needs no derivatives, and its slope only first ones. `accuracy` chooses the error of probabilities, and
+`survival_error` estimates it; `benchmarks/inverse.md` compares it with counted verdicts.
+
+The orientation of an asymmetric rock in the shaking may be unknown. Its probability is then the mean over both.
 """
 
 import inspect
@@ -56,7 +55,7 @@ _FLAT = -np.log(np.pi / 2)  # log-density of a rotation of which nothing is know
 
 
 def quadrature_accuracy(name: str, value: Any) -> float:
-    """An error of a probability that the quadrature may have."""
+    """Check the error that the quadrature may leave in a probability."""
     known = float(scalar(name, positive(name, value)))
     if not MOST_ACCURATE <= known <= LEAST_ACCURATE:
         raise ValueError(f"Argument `{name}` must be in [{MOST_ACCURATE:g}, {LEAST_ACCURATE:g}], but is {known:g}.")
@@ -69,20 +68,20 @@ class Likelihood(eqx.Module):
     **Arguments:**
 
     - `observations`: an `Observations`.
-    - `motion`: what makes the motion of its parameters by name, such as `SinePulse`; any function will do. It is taken
-      as it is when the likelihood is asked (within a function of yours under `jax.jit`, as when that was traced). Of a
-      record scale the whole, `amplitude * rk.Record(samples, dt * stretch)`: the likelihood of one with other samples,
-      `rk.Record(amplitude * samples, dt)`, is differentiated by each of them, which takes many times as long.
-    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive: what the motion at one rock may
-      differ from that of the site, and the model be wrong by. 0.3 is a third up or down.
+    - `motion`: any function that makes the motion from its parameters by name, such as `SinePulse`. Each call reads its
+      current state (under your `jax.jit`, that of the trace). To scale a record, scale the whole of it:
+      `amplitude * rk.Record(samples, dt * stretch)`. With `rk.Record(amplitude * samples, dt)` the likelihood is
+      differentiated by every sample, which takes many times as long.
+    - `scatter`: standard deviation of ln amplitude from rock to rock [-], positive. It covers local differences of the
+      motion and errors of the model; 0.3 is a third up or down.
     - `model`, `engine`: as in `outcome`.
-    - `lapse`: probability that what was seen of a rock says nothing, in [0, 1): somebody moved it, it was misjudged, or
-      it stands in a gap between two ways of overturning that is too narrow to be resolved. One rock can then speak
-      against a motion no more strongly than 2/lapse to 1.
-    - `accuracy`: about the root mean square error that the quadrature over scatter and rocks may leave in a probability
-      [-], in [0.001, 0.05]. Scenes for each rock: 54 at 0.02, 272 at 0.01, 1,452 at 0.005 and 66,332 at
-      0.001; 42, 82, 162 and 802 where rocks are known well beside the motion at them. Single probabilities
-      may be off by four times as much: `survival_error` estimates what is left of each.
+    - `lapse`: probability that an observation is uninformative, in [0, 1). A rock may have been moved or misjudged, or
+      stand in an unresolved gap between two ways of overturning. One rock then contradicts a motion by odds of at most
+      2/lapse to 1.
+    - `accuracy`: approximate root mean square error of a probability by the quadrature over scatter and rocks [-], in
+      [0.001, 0.05]. Scenes for each rock: 54 at 0.02, 272 at 0.01, 1,452 at 0.005 and 66,332 at 0.001. They are 42, 82,
+      162 and 802 where the scatter of the motion dominates. Single probabilities may be off by four times as much:
+      `survival_error` estimates the error of each.
 
     **Raises:** ValueError for a value outside its range.
     """
@@ -118,7 +117,7 @@ class Likelihood(eqx.Module):
 
     @property
     def scenes(self) -> int:
-        """How many scenes are computed for one motion."""
+        """Number of scenes computed for one motion."""
         return self.observations.ways.size * self.quadrature.scenes
 
     def current(self, names: Sequence[str]) -> "Likelihood":
@@ -179,13 +178,16 @@ class Likelihood(eqx.Module):
         return self._compiled(Likelihood._survival, values)
 
     def survival_error(self, values: Mapping[str, ArrayLike]) -> Real:
-        """Estimated standard error of `survival`, (..., rocks), which its quadrature leaves: from eight others with as
-        many nodes at random places (Cranley & Patterson 1976). It costs as much as eight times `survival`."""
+        """Estimate the standard error of `survival` by its quadrature, (..., rocks).
+
+        Eight quadratures with as many nodes at random places give it (Cranley & Patterson 1976), at eight times the
+        cost of `survival`.
+        """
         found = [np.asarray(each.survival(values)) for each in self.drawn()]
         return placed(np.std(found, axis=0, ddof=1))
 
     def drawn(self) -> list["Likelihood"]:
-        """Likelihoods by other quadratures of as many nodes, at random places: they scatter by their errors."""
+        """Return likelihoods by other quadratures with as many nodes at random places; they scatter by their errors."""
         draws = (self.quadrature.drawn(seed) for seed in range(_DRAWS))
         return [eqx.tree_at(lambda it: it.quadrature, self, each) for each in draws]
 
@@ -266,7 +268,7 @@ class Likelihood(eqx.Module):
         else:
             real, lost, known = jax.vmap(scene.results)(fixed, level, ways, blocks)[1]
         verge = lanes(levels.alpha * seen.weaker_alpha / seen.alpha)
-        # Which way round a rock stands and which of the possible ones it is are one axis: all are equally likely.
+        # The orientation of a rock and the possible rocks share one axis: all are equally likely.
         merged = (*shape[:-3], -1, shape[-1])
         where, margin, rotation, lost, known, verge = (
             x.reshape(merged) for x in (lanes(where), *real.T, lost, known, verge)

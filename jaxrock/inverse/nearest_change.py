@@ -152,8 +152,10 @@ class Search(NamedTuple):
         return found._replace(length=float(above))
 
     def nearer(self, found: Found, steps: int, progress: Callable[[], None] = lambda: None) -> Found:
-        """A shorter change that does what is wanted as well: it is turned, at most `steps` times, until none of the
-        directions that are tried makes it shorter by a thousandth."""
+        """Return a shorter change that reaches the same target.
+
+        It is turned, at most `steps` times, until no direction that is tried shortens it by a thousandth.
+        """
         lengths, slope = [found.length], np.nan
         for _ in range(steps):
             excess, slopes = self.slopes(found.change)

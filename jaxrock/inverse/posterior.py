@@ -139,20 +139,22 @@ def sample_motion(
 ) -> Posterior:
     """Sample the parameters of a motion given rocks that stand, fell, or rocked so far.
 
-    Priors are those of the `Unknown`s, uniform over their ranges (in the logarithm if `log`) where they have none: the
-    posterior is proper even where the observations tell nothing, and then as wide as the ranges.
+    Priors are those of the `Unknown`s; without one, uniform over the range (in the logarithm if `log`). So the
+    posterior is always proper, and as wide as the ranges where observations carry no information.
 
     **Arguments:**
 
     - `observations`, `motion`, `unknowns`, `scatter`, `lapse`, `accuracy`, `model`, `engine`: as in `estimate_motion`.
-    - `estimate`: what `estimate_motion` found: where to look first. None makes one.
-    - `effective_size`: of every parameter at which it ends, once the chains agree (R-hat below 1.01); at least 1.
-    - `steps`: of each of eight chains, at most; at least 1. Those before chains began anew are counted, but not used.
-    - `seed`: of the random numbers.
-    - `sampler`: what makes another sampler of a `LogDensity`, such as
+    - `estimate`: the result of `estimate_motion`, where chains begin. None: it is computed.
+    - `effective_size`: effective sample size of every parameter at which it ends, once the chains agree (R-hat below
+      1.01); at least 1.
+    - `steps`: largest number of steps of each of eight chains, at least 1. Steps before a restart of the chains count,
+      but are not used.
+    - `seed`: seed of the random numbers.
+    - `sampler`: a function that makes another sampler from a `LogDensity`, such as
       `lambda density: numpyro.infer.NUTS(potential_fn=lambda point: -density(point))` or
       `lambda density: blackjax.nuts(density, 0.5, jnp.ones(2))`. Its eight chains begin at maxima of the estimate; the
-      first 500 steps of each are not kept. None: own chains (`jaxrock.numerics.proposals`).
+      first 500 steps of each are not kept. None: chains of the package (`jaxrock.numerics.proposals`).
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `Posterior`.

@@ -13,13 +13,13 @@ _ROOT = np.sqrt(2 * _RATIO)
 _PARABOLAS, _SETTLED = 4, 0.3  # fits of a parabola at most; change of the lengths of its axes that calls for none more
 _TELLING = 0.16  # bend over a range, squared, with which it falls by 0.02 over half of it: less may be steps
 _NOTHING = 50.0  # a fall after which the likelihood is none
-_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of a range, outside of an end, where the region may go on
-_OUTWARD = 4  # times that it is looked for there
+_BEYOND = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # share of a range beyond an end, where the region may go on
+_OUTWARD = 4  # number of such searches
 _BRACKETS, _NARROW, _NEAR = 10, 2e-3, 0.01  # rounds at most; width of a bracket, in ranges, and root that will do
 _MULTIPLES = 1.5, 3.0, np.inf  # standard deviations from the maximum at which profiles begin
-_SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the scan of the other parameters before
-_BESIDE = 0.2  # extent of another as many around the nearest place, in ranges: ridges are narrow
-_HOPE = 1.5  # of a scan below the region, within which climbers may yet come to it
+_SEEDS, _SCANNED = 2, 32  # climbers for each value; places of the preceding scan over the other parameters
+_BESIDE = 0.2  # extent of a second scan around the nearest place, in ranges: ridges are narrow
+_HOPE = 1.5  # depth below the region from which climbers may still reach it
 _AWAY = 0.02  # of a range, from its ends, where climbers begin: at an end none would move
 
 
@@ -117,11 +117,12 @@ class _Row(NamedTuple):
 
 
 def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
-    """Ends of the intervals in which the profile of the log-likelihood is less than 1.92 below its maximum.
+    """Return the ends of intervals in which the profile of the log-likelihood is less than 1.92 below its maximum.
 
-    For every parameter and side: some values outward to the end of the range, the others climbing at each; then where
-    the likelihood ratio crosses, by secants in the outermost bracket until that is narrow. Climbers begin at the best
-    places nearby, also of a scan over the other parameters: from place to place they would stay on a lower summit.
+    For every parameter and side, the profile is sampled at some values up to the end of the range, the others climbing
+    at each. Secants in the outermost bracket then find where the likelihood ratio crosses. Climbers begin at the best
+    places nearby, also of a scan over the other parameters. Passed from value to value alone, they would stay on a
+    lower summit.
     """
     low, high = evaluate.ends
     size = high - low
@@ -133,7 +134,7 @@ def profile(evaluate: Evaluator, summits: Summits, shape: Shape) -> Profile:
         inside = [np.clip(v, low[j], high[j]) for v, (j, _) in zip(values, sides.rows)]
         sides.follow(dict(zip(sides.rows, inside)))
     sides.recall()
-    # Beyond a valley the region may go on: near its end, as a likelihood has steps, and farther away.
+    # Beyond a valley the region may go on: near its end, because a likelihood has steps, and farther away.
     for _ in range(_OUTWARD):
         sides.narrow()
         before = {side: sides.outermost(side) for side in sides.rows}
@@ -168,8 +169,10 @@ class _Sides:
         self.highest = (-np.inf, None)
 
     def follow(self, wanted: dict[tuple[int, int], float]) -> None:
-        """Climb with one parameter held at a value, for each of some sides, from two places: the highest of a scan, and
-        the nearest on the profile or the best of all nearby."""
+        """Climb with one parameter held at a value, for each given side, from two places.
+
+        These are the highest of a scan, and the nearest on the profile or the best of all nearby.
+        """
         if not wanted:
             return
         begin, free = [], []
@@ -190,8 +193,10 @@ class _Sides:
         self.highest = max(self.highest, (values[top], reached.points[top]), key=lambda pair: pair[0])
 
     def _scanned(self, wanted: dict[tuple[int, int], float]) -> tuple[list[np.ndarray], np.ndarray]:
-        """For each side places with its parameter held, at which climbers begin, and the highest of a scan of these and
-        of some spread over the other parameters, and around the nearest."""
+        """Return for each side starting places with its parameter held, and the highest place of a scan.
+
+        The scan covers these places, some spread over the other parameters, and some around the nearest.
+        """
         low, high = self.evaluate.ends
         tried = []
         for (j, s), value in wanted.items():
@@ -206,12 +211,12 @@ class _Sides:
         return [places[[k, int(k == 0)]] for places, k in zip(tried, first)], values.max(axis=1)
 
     def hopeful(self, wanted: dict[tuple[int, int], float]) -> dict[tuple[int, int], float]:
-        """Those at which a scan comes near to the region."""
+        """Select the sides at which a scan comes near to the region."""
         highest = self._scanned(wanted)[1]
         return {side: x for (side, x), top in zip(wanted.items(), highest) if top > self.best - _RATIO - _HOPE}
 
     def narrow(self) -> None:
-        """Follow secants until all ends are known well enough."""
+        """Follow secants until all brackets are narrow enough."""
         for _ in range(_BRACKETS):
             brackets = {side: self.bracket(side) for side in self.rows}
             wide = {side: pair for side, pair in brackets.items() if pair is not None and self.is_wide(side, pair)}
@@ -221,16 +226,16 @@ class _Sides:
             self.recall()
 
     def outermost(self, side: tuple[int, int]) -> float:
-        """The value farthest out within 95 %."""
+        """Return the outermost value within 95 %."""
         return max((row for row in self.rows[side] if row.root < _ROOT), key=lambda row: side[1] * row.value).value
 
     def outside(self, value: float, j: int, s: int, share: float) -> float:
-        """A value farther out by a share of the range, or at its end."""
+        """Return a value farther out by a share of the range, or its end."""
         low, high = self.evaluate.ends
         return float(np.clip(value + s * share * (high - low)[j], low[j], high[j]))
 
     def is_wide(self, side: tuple[int, int], pair: tuple[_Row, _Row]) -> bool:
-        """Whether the end is not known well enough from its bracket."""
+        """Return whether the bracket is too wide to give the end."""
         low, high = self.evaluate.ends
         inner, outer = pair
         narrow = abs(outer.value - inner.value) < _NARROW * (high - low)[side[0]]

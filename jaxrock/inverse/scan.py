@@ -1,7 +1,7 @@
-"""A scan of a likelihood: where climbers begin, and which of the summits that they found compete.
+"""A scan of a likelihood: starting points of climbers, and the choice of competing summits among their results.
 
-Values by few scenes, without slopes, at many places together are cheap. A first scan is spread over the ranges; a few
-more, each half as wide as the one before, lie around the best places so far.
+Values at many places together, by few scenes and without slopes, are cheap. A first scan covers the ranges. A few more,
+each half as wide as the one before, lie around the best places so far.
 """
 
 from typing import NamedTuple
@@ -15,17 +15,17 @@ from jaxrock.numerics.climb import Summits
 Places = Float[np.ndarray, "n parameters"]
 _CENTRES, _AROUND = 16, 16  # best places of a scan, and places of the next one around each
 _NARROWER = (1.0, 0.5, 0.25)  # standard deviations around these, in distances of places of the first scan
-_BESIDE = 0.1  # of the ranges, within which a place has a higher one beside it
-_COMPARED = 2000  # best places that are looked at for that
+_BESIDE = 0.1  # share of the ranges within which a higher place excludes a lower one
+_COMPARED = 2000  # best places compared for that
 _FEWEST = 12  # places at which climbers begin
-COMPETING = 1.9207  # below the maximum, within which summits compete: the log-likelihood ratio of 95 %
-_VALLEY = 0.5  # fall on the straight line between two summits that makes them two
+COMPETING = 1.9207  # log-likelihood below the maximum within which summits compete: the ratio of 95 %
+_VALLEY = 0.5  # fall on the straight line between two summits that separates them
 _BETWEEN = 12  # places on that line
-_ALIKE, _MOST = 0.02, 12  # of the ranges, within which summits are one; at most so many are compared
+_ALIKE, _MOST = 0.02, 12  # share of the ranges within which summits are one; largest number compared
 
 
 def scan(evaluate: Evaluator, count: int) -> None:
-    """Look at so many places spread over the ranges, and at some around the best of them."""
+    """Scan a number of places spread over the ranges, and some around the best of them."""
     evaluate.scan(spread(count, evaluate))
     low, high = evaluate.ends
     rng, distance = np.random.default_rng(0), count ** (-1 / low.size)
@@ -38,7 +38,7 @@ def scan(evaluate: Evaluator, count: int) -> None:
 
 
 def starts(evaluate: Evaluator, count: int) -> Places:
-    """The best places of the scan that have no higher one beside them, as points; a few others where these are few."""
+    """Return the best places of the scan that have no higher one near, as points, filled up where these are few."""
     places, _ = best_scanned(evaluate)
     beside = _has_higher_beside(places, evaluate, _BESIDE)
     wanted = np.concatenate([places[~beside][:count], places[beside][: max(_FEWEST - np.sum(~beside), 0)]])
@@ -46,14 +46,14 @@ def starts(evaluate: Evaluator, count: int) -> Places:
 
 
 def best_scanned(evaluate: Evaluator) -> tuple[Places, Float[np.ndarray, " n"]]:
-    """The best places of the scan and their values, the highest first."""
+    """Return the best places of the scan and their values, the highest first."""
     places, values = evaluate.scanned
     order = np.argsort(-values, kind="stable")[:_COMPARED]
     return places[order], values[order]
 
 
 def _has_higher_beside(places: Places, evaluate: Evaluator, distance: float) -> Bool[np.ndarray, " n"]:
-    """Whether one of the places before it, which are higher, is so near in every range."""
+    """Return whether one of the higher places before it is near in every range."""
     low, high = evaluate.ends
     share = (places - low) / (high - low)
     near = np.max(np.abs(share[:, None] - share[None]), axis=2) < distance
@@ -61,30 +61,31 @@ def _has_higher_beside(places: Places, evaluate: Evaluator, distance: float) -> 
 
 
 def spread(count: int, evaluate: Evaluator) -> Places:
-    """Places spread evenly over the ranges: multiples of irrational numbers, modulo one.
+    """Spread places evenly over the ranges: multiples of irrational numbers, modulo one.
 
-    From starts by Halton's sequence (of SciPy) five of eight fits ended on a lower summit, and one on a higher.
+    Started from Halton's sequence (of SciPy), five of eight fits end on a lower summit, and one on a higher.
     """
     low, high = evaluate.ends
     return low + (high - low) * (0.01 + 0.98 * evenly(count, low.size))
 
 
 def evenly(count: int, dimensions: int) -> Places:
-    """Multiples of irrational numbers, modulo one, in a box of size 1."""
+    """Return multiples of irrational numbers, modulo one, in a box of size 1."""
     root = np.roots([1, *[0] * (dimensions - 1), -1, -1])
     ratio = np.max(root.real[np.abs(root.imag) < 1e-9])  # x^(n+1) = x + 1, the golden ratio for n = 1
     return (0.5 + np.outer(np.arange(count), ratio ** -np.arange(1.0, dimensions + 1))) % 1
 
 
 class Competing(NamedTuple):
-    """Other summits about as high as the highest: places (n, parameters) and values (n,), the highest first."""
+    """Competing summits about as high as the highest: places (n, parameters) and values (n,), the highest first."""
 
     places: Places
     values: Float[np.ndarray, " n"]
 
 
 def competing(evaluate: Evaluator, summits: Summits) -> Competing:
-    """Summits less than 1.92 below the highest, with a fall of over 1/2 on the straight lines to all higher ones."""
+    """Return summits less than 1.92 below the highest, with a fall of over 1/2 on the straight lines to all higher
+    ones."""
     order = np.argsort(-summits.values)
     order = order[summits.values[order] > summits.values.max() - COMPETING]
     places, values = evaluate.places(summits.points[order]), summits.values[order]

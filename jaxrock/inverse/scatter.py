@@ -1,24 +1,23 @@
-"""What may have become of rocks under a motion that is not the same at each of them, and how probable that is.
+"""The quadrature over motions at each rock and over possible rocks, for the probabilities of outcomes.
 
 The motion at each rock differs from that of the site by a lognormal factor, and alpha, p and restitution are uncertain.
-Margins and rotations are computed at nodes along the logarithm of the factor, for a few possible rocks, and are
-straight between nodes:
+Margins and rotations are computed at nodes along the logarithm of the factor, for a few possible rocks. Between nodes
+they are interpolated linearly:
 
     P(stands) = mean over possible rocks of sum_k w_k Phi(y_k/s_k),
 
-over the quarter points of the intervals between nodes, with y a function of the margin that is nearly straight in ln
-amplitude, w_k the normal probability of the quarter's surroundings, and s_k half of what y changes by from node to
-node: a probit that smears each interval so far that the sum is smooth.
+The sum is over the quarter points of the intervals between nodes. Here y is a function of the margin that is nearly
+straight in ln amplitude, and w_k the normal probability around the quarter point. The smear s_k is half of the change
+of y from node to node; a probit of that width makes the sum smooth.
 
-Nodes are fixed levels of the strength of the motion: a motion that grows moves the weights along, and not the nodes.
-So the probability is as smooth in the amplitude as the normal distribution is, however rough the margin: overturning
-sets are unions of intervals, some of them narrower than what is between two nodes, and nodes that move with the
-amplitude would flicker through these. What is narrower than the distance of nodes is either met by a node or not, and
-counts for an interval or for nothing.
+Nodes are fixed levels of the strength of the motion: a growing motion moves the weights, and not the nodes. So the
+probability is as smooth in the amplitude as the normal distribution, however rough the margin. Overturning sets are
+unions of intervals, some narrower than the distance of nodes. Nodes that moved with the amplitude would flicker through
+these. A fixed node either meets such a narrow set, which then counts as a whole interval, or misses it.
 
 Possible rocks are a Latin hypercube (McKay, Beckman & Conover 1979), whose first direction is that in which a rock
-becomes easier to topple. A slenderer rock acts like a stronger motion, so what its strata leave out of the variance is
-added to that of the amplitude: the total is right for any number of rocks.
+becomes easier to topple. A slenderer rock acts like a stronger motion. So the variance within its strata is added to
+that of the amplitude: the total is right for any number of rocks.
 """
 
 import functools
@@ -36,29 +35,30 @@ from jaxrock.inverse.observations import Observations
 
 Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
-MOST_ACCURATE, LEAST_ACCURATE = 1e-3, 0.05  # errors of a probability that can be asked for
+MOST_ACCURATE, LEAST_ACCURATE = 1e-3, 0.05  # range of errors of a probability
 _APART, _APART_EXACT = 25.0, 10.0  # distance of nodes, in standard deviations for each unit of the error
 _LEAST_APART, _MOST_APART = 0.01, 0.8
 _ROCKS, _ROCKS_POWER = 0.045, 1.4  # possible rocks: (0.045/error)^1.4
-_WELL_KNOWN = 10.0  # scatter by rocks over that of the motion, for each unit of the error, below which one will do
-_REACH = 4.0  # standard deviations to each side, within which nodes are
+_WELL_KNOWN = 10.0  # scatter by rocks over that by motion, per unit of the error, below which one rock suffices
+_REACH = 4.0  # standard deviations to each side that nodes cover
 _SMEAR = 0.5  # of the difference between nodes
 _LEAST_WIDTH = 1e-3
-_SLOPE_OVER = 1.2  # standard deviations at each end from which y goes on
+_SLOPE_OVER = 1.2  # standard deviations at each end from which y is extrapolated
 _LEAST_SLOPE = 0.05  # of y by a standard deviation, beyond the last nodes
 _END_WIDTH = 0.1  # of y there, so that the probability is smooth
 _BY_P = 0.5  # a higher p acts like so much of the amplitude: between none for long pulses and all for short ones
 _GOLDEN = (np.sqrt(5) - 1) / 2
-_DESIGNS = 200  # Latin hypercubes that are drawn, of which the least correlated is taken
+_DESIGNS = 200  # number of Latin hypercubes drawn; the least correlated is used
 
 
 class Quadrature(eqx.Module):
-    """Where margins are computed: nodes of the strength, and possible rocks.
+    """Nodes and weights of the quadrature: strengths of the motion, and possible rocks.
 
-    - `apart`: distance of nodes, in standard deviations; `each_side`: how many on each side of the motion itself.
-    - `absorbed`: share of the rocks' variance that counts as one of the amplitude.
-    - `phases`: (possible,) by which share of the distance the nodes of each possible rock are shifted.
-    - `normals`: (3, possible) standard normal: how easily it topples, what else alpha and p differ by, restitution.
+    - `apart`: distance of nodes, in standard deviations; `each_side`: number of nodes on each side of the motion
+      itself.
+    - `absorbed`: share of the rocks' variance that counts as variance of the amplitude.
+    - `phases`: (possible,) shift of the nodes of each possible rock, as a share of the distance.
+    - `normals`: (3, possible) standard normal: ease of toppling, remaining differences of alpha and p, restitution.
     """
 
     apart: float = eqx.field(static=True)
@@ -69,8 +69,10 @@ class Quadrature(eqx.Module):
 
     @classmethod
     def of(cls, accuracy: float, exact: bool) -> "Quadrature":
-        """That of an error of about `accuracy` in a probability; `exact`: rocks are known so well that it is enough to
-        add what they differ by to the scatter of the amplitude."""
+        """Return the quadrature for an error of about `accuracy` in a probability.
+
+        `exact`: rocks are known so well that their variance is only added to that of the amplitude.
+        """
         apart = float(np.clip((_APART_EXACT if exact else _APART) * accuracy, _LEAST_APART, _MOST_APART))
         rocks = 1 if exact else max(round((_ROCKS / accuracy) ** _ROCKS_POWER), 1)
         normals = _latin_hypercube(rocks)
@@ -80,16 +82,16 @@ class Quadrature(eqx.Module):
 
     @classmethod
     def coarse(cls) -> "Quadrature":
-        """That of the fewest nodes: it is enough to see where a likelihood is large."""
+        """Return the quadrature of fewest nodes, enough to find where a likelihood is large."""
         return cls.of(_MOST_APART / _APART_EXACT, True)
 
     @property
     def scenes(self) -> int:
-        """How many are computed for each rock, one way round."""
+        """Number of scenes for each rock and orientation."""
         return (2 * self.each_side + 2) * self.phases.size
 
     def drawn(self, seed: int) -> "Quadrature":
-        """Another of as many nodes: its phases, and the places in the inner halves of strata, are random."""
+        """Return a quadrature of as many nodes, with random phases and random places in the inner halves of strata."""
         rng, count = np.random.default_rng(seed), self.phases.size
         phases = (np.asarray(self.phases) + rng.uniform()) % 1
         normals = np.asarray(self.normals)
@@ -101,7 +103,7 @@ class Quadrature(eqx.Module):
 
 @functools.cache
 def _latin_hypercube(count: int) -> np.ndarray:
-    """Means of the standard normal over as many strata in each of three directions, (3, count), hardly correlated."""
+    """Return nearly uncorrelated means of the standard normal over equal strata in three directions, (3, count)."""
     ends = _quantile(np.arange(1, count) / count)
     density = np.concatenate([[0.0], np.exp(-(ends**2) / 2) / np.sqrt(2 * np.pi), [0.0]])
     means, rng = -count * np.diff(density), np.random.default_rng(0)
@@ -117,7 +119,7 @@ def _quantile(share: np.ndarray) -> np.ndarray:
 
 
 class Levels(NamedTuple):
-    """Nodes, (nodes, ..., possible, rocks): how strong the motion is, and which rocks stand there."""
+    """Nodes, (nodes, ..., possible, rocks): strengths of the motion, and the rocks at each."""
 
     strength: Real  # logarithm
     alpha: Real
@@ -128,13 +130,15 @@ class Levels(NamedTuple):
 def levels_around(
     observations: Observations, quadrature: Quadrature, scatter: ArrayLike, strength: Real
 ) -> tuple[Levels, Real]:
-    """Nodes around motions whose logarithm of the strength is known, (...), and how far they are from it, (nodes, ...,
-    possible, rocks), in standard deviations."""
+    """Return nodes around motions of known logarithmic strength, (...), and their distance from it.
+
+    Distances, (nodes, ..., possible, rocks), are in standard deviations.
+    """
     seen = observations
     by_alpha, by_p = _as_amplitudes(seen)
     by_rock = by_alpha**2 + by_p**2
     variance = scatter**2 + quadrature.absorbed * by_rock
-    # Straight y through quarter points, with the smear, has a variance that is larger by this factor.
+    # Linear y through quarter points, with the smear, has a variance larger by this factor.
     spread = 1 + quadrature.apart**2 * (_SMEAR**2 - 1 / 48)
     # A change of the scatter moves weights, and not the nodes: what the intervals between them add stays, too.
     deviation = jnp.sqrt(variance - jax.lax.stop_gradient((1 - 1 / spread) * variance))
@@ -156,14 +160,14 @@ def levels_around(
 
 
 def _as_amplitudes(seen: Observations) -> tuple[Real, Real]:
-    """Standard deviations of ln amplitude, (rocks,), that have about the effect of those of alpha and of p."""
+    """Return standard deviations of ln amplitude, (rocks,), with about the effect of those of alpha and of p."""
     weaker = seen.weaker_alpha
-    by_alpha = seen.alpha_sd / seen.alpha * weaker / (jnp.sin(weaker) * jnp.cos(weaker))  # of ln tan(alpha)
+    by_alpha = seen.alpha_sd / seen.alpha * weaker / (jnp.sin(weaker) * jnp.cos(weaker))  # that of ln tan(alpha)
     return by_alpha, _BY_P * seen.p_sd / seen.p
 
 
 def are_known_well(observations: Observations, scatter: Real, accuracy: float) -> bool:
-    """Whether rocks are known so well beside the motion at them that one possible rock stands for all."""
+    """Return whether the scatter of the motion dominates, so that one possible rock stands for all."""
     seen = observations
     known = seen.alpha, seen.alpha_sd, seen.p, seen.p_sd, seen.restitution_sd, scatter
     if is_traced(known):
@@ -185,9 +189,9 @@ def rocks_at(observations: Observations, offsets: tuple[Real, Real, Real] | Real
 
 
 class Possible(NamedTuple):
-    """What becomes of rocks in possible scenes, (scenes, ..., ways, rocks): the quarter points of intervals.
+    """Outcomes of rocks in possible scenes, (scenes, ..., ways, rocks), at the quarter points of intervals.
 
-    Ways are all that is equally likely of a rock: which way round it stands, and which of the possible ones it is.
+    The axis of ways holds all that is equally likely of a rock: its orientation, and the possible rocks.
     """
 
     weight: Real  # probability of the surroundings of each
@@ -200,11 +204,13 @@ class Possible(NamedTuple):
 
     @classmethod
     def of(cls, where, margin, rotation, known, lost, verge, apart: float) -> "Possible":
-        """From the results at nodes, (nodes, ..., ways, rocks), which are so many standard deviations away and
-        `apart`; `verge` is the rotation from which a rock at rest overturns.
+        """Interpolate from results at nodes, (nodes, ..., ways, rocks).
 
-        On the way to overturning the rotation grows without bounds with the amplitude; what is left of the energy to
-        overturn, about (1 - rotation/verge)^2, does not, and passes zero with y, of which it is twice as much there.
+        Nodes lie at the given distances in standard deviations, `apart` from each other; `verge` is the rotation from
+        which a rock at rest overturns.
+
+        On the way to overturning the rotation grows without bounds with the amplitude. The energy left to overturn,
+        about (1 - rotation/verge)^2, does not; it passes zero with y, and is about twice y there.
         """
         left = 1 - rotation / verge
         left = jnp.where(lost, 2 * _straightened(jnp.minimum(margin, 0.0)), left * jnp.abs(left))

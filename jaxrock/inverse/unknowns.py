@@ -20,7 +20,7 @@ from jaxrock.inverse.scatter import Quadrature
 Real = Inexact[Array, "..."]
 Flags = Bool[Array, "..."]
 _LANES = 4  # points in one call of the compiled program with slopes
-_SCANNED = 64  # and of that without
+_SCANNED = 64  # points in one call of the program without slopes
 _FARTHEST = 5.0  # standard deviations from a range that a prior may be: beyond, one of them is a slip
 
 
@@ -167,8 +167,10 @@ def _log_density(problem: Problem, places: Real, wanted: Flags) -> Real:
 
 
 def densities(problem: Problem, places: np.ndarray, progress: Callable[[int], None] = lambda more: None) -> np.ndarray:
-    """Log-densities (n,) of a `current` problem at any number of places, (n, parameters), without slopes; minus
-    infinity where there is none."""
+    """Return log-densities (n,) of a `current` problem at any places, (n, parameters), without slopes.
+
+    They are minus infinity outside of the domain.
+    """
     (found,) = in_batches(lambda *part: [_log_density(problem, *part)], places, _SCANNED, progress)
     return np.where(np.isnan(found), -np.inf, found)
 
@@ -199,14 +201,14 @@ class Evaluator:
         return values, slopes
 
     def scan(self, places: np.ndarray) -> np.ndarray:
-        """Values at places by few scenes and without slopes: about those of the likelihood, for much less."""
+        """Return approximate log-likelihoods at places, by few scenes and without slopes."""
         values = densities(self._coarse, places, self.progress)
         self.scanned = np.concatenate([self.scanned[0], places]), np.concatenate([self.scanned[1], values])
         return values
 
     @property
     def scenes(self) -> int:
-        """How many were computed so far."""
+        """Number of scenes computed so far."""
         few, many = (problem.likelihood.scenes for problem in (self._coarse, self.problem))
         return few * len(self.scanned[1]) + many * self.count
 
@@ -226,8 +228,10 @@ class Evaluator:
         return tuple(x[0] for x in in_batches(lambda *part: _batch(self.problem, *part)[2], place[None], _LANES))
 
     def errors(self, place: np.ndarray) -> tuple[np.ndarray, float]:
-        """Estimated standard errors that the quadrature leaves at a place: of the probabilities that rocks stand,
-        (rocks,), and of the log-likelihood."""
+        """Estimate the standard errors of the quadrature at a place.
+
+        **Returns:** errors of the probabilities that rocks stand, (rocks,), and of the log-likelihood.
+        """
 
         def found(problem):
             value, _, facts = _batch(problem, np.tile(place, (_LANES, 1)), np.arange(_LANES) < 1)

@@ -15,15 +15,17 @@ _LAST = (0, 10)  # of the jaxlibs that know it; in 0.11.2 and 0.12 an option tha
 
 
 def keep_compiled() -> None:
-    """Let JAX compile in less time, and keep on disk what it compiles, for other sessions.
+    """Let JAX compile in less time, and cache on disk what it compiles, for other sessions.
 
-    Call it before the first computation; it keeps nothing where JAX does that already, where the folder cannot be
-    written, and where the environment says `JAXROCK_CACHE=off`. Machine code and programs of the package's own are kept
-    without it. It sets options of JAX (`jax_compilation_cache_dir` and its limits) and one of XLA (in `XLA_FLAGS`, if
-    that says nothing of it), for all that this process compiles; last digits of what XLA computes may change by it.
+    Call it before the first computation. It does nothing where JAX has a cache already, where the folder cannot be
+    written, and under `JAXROCK_CACHE=off`. The package's own machine code and programs are cached without it.
 
-    What is kept runs as a part of later programs. So the folder must belong to the user, or to root, and only its owner
-    may write in it, and in no parent others may; where that does not hold nothing is kept, and a warning says why.
+    It sets options of JAX (`jax_compilation_cache_dir` and its limits) and one of XLA (in `XLA_FLAGS`, unless that
+    already sets it). They hold for all that this process compiles. The last digits of XLA's results may change.
+
+    Cached code runs as a part of later programs. So the folder must belong to the user, or to root, and only its owner
+    may write in it. Others must not be able to write in its parents. Otherwise nothing is cached, and a warning says
+    why.
     """
     compile_quickly()
     if setting("jax_compilation_cache_dir"):
@@ -38,10 +40,10 @@ def keep_compiled() -> None:
 
 
 def _place_of_jax() -> Path | None:
-    """The folder that JAX may look after; None where JAX would run there what another user wrote.
+    """Return the cache folder of JAX; None where JAX would run files of other users there.
 
-    JAX reads all files in it, of any owner, and deletes those that have its names. What lay there while others could
-    write in it goes.
+    JAX reads all files in it, of any owner, and deletes those that have its names. So files that lay there while others
+    could write in it are removed first.
     """
     place = folder()
     if place is None:

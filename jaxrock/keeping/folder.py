@@ -1,9 +1,9 @@
-"""The folder of what is kept: any number of processes may read and write it, and what is damaged is made again.
+"""The cache folder: any number of processes may read and write it, and damaged files are made again.
 
-A file begins with a mark and a digest of its name and the rest, is written aside, and renamed: a reader finds all of it
-or nothing. Only what is private (`ownership`) is read, as it is run. When the folder has grown too large, what has not
-been used for longest goes first. Only files that the package made are replaced or removed: regular ones of the user's,
-with their names and their mark.
+A file begins with a mark and a digest of its name and contents. It is written under a temporary name, and renamed: a
+reader finds all of it or nothing. Its contents are run, so only private files (`ownership`) are read. When the folder
+is too large, the least recently used files are removed first. Only files that the package made are replaced or removed:
+regular ones of the user's, with the package's names and mark.
 """
 
 import contextlib
@@ -20,9 +20,9 @@ from jaxrock._aside import written_aside
 from jaxrock.keeping.ownership import is_own_file, is_private_file, private
 
 LARGEST = 2**30  # bytes
-KINDS = ("machine", "lowered")  # of what the package keeps, each in a folder of its own
+KINDS = ("machine", "lowered")  # kinds of files of the package, each in a folder of its own
 OF_JAX = "xla"  # the folder that JAX looks after (see `compiled`)
-_OWN = "jaxrock-compiled"  # within a folder that the user names, where other things may lie
+_OWN = "jaxrock-compiled"  # within a folder that the user names, which may hold other files
 _OFF = ("off", "no", "none", "false", "0")
 _MARK = b"jaxrock kept\n"
 _DIGEST = hashlib.sha256().digest_size
@@ -36,9 +36,9 @@ _ANEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
 def folder() -> Path | None:
-    """Where things are kept: in the user's cache folder, or in the one of JAXROCK_CACHE; None if that says `off`.
+    """Return the cache folder: in the user's cache folder, or in that of JAXROCK_CACHE; None if that says `off`.
 
-    A link leads to a larger disk, where other things may lie: there it is a folder within what the link leads to.
+    A link may lead to a larger disk with other files: the cache is then a folder within the target.
     """
     said = os.environ.get("JAXROCK_CACHE", "").strip()
     if said.lower() in _OFF:
@@ -48,11 +48,11 @@ def folder() -> Path | None:
 
 
 def folder_of(kind: str, make: bool = False) -> Path | None:
-    """The folder of one kind of what is kept; None where it is not there, or not private.
+    """Return the folder of one kind of cached files; None where it is missing, or not private.
 
     **Arguments:**
 
-    - `make`: whether it is made where it is missing.
+    - `make`: whether to make a missing folder.
     """
     place = folder()
     return place / kind if place is not None and private(place, place / kind, make=make) else None
@@ -64,7 +64,8 @@ def name_of(*parts: object) -> str:
 
 
 def read(kind: str, name: str) -> bytes | None:
-    """What is kept under a name; None if it is not there, damaged, or if others could have written it."""
+    """Return the contents cached under a name; None if they are missing or damaged, or if others could have written
+    them."""
     place = folder_of(kind)
     if place is None:
         return None
@@ -109,7 +110,7 @@ def _digest(kind: str, name: str, content: bytes) -> bytes:
 
 
 def _verified(kind: str, name: str, content: bytes) -> bytes | None:
-    """What a file holds, with or without a mark; None if it is damaged, or was not made by the package."""
+    """Return the contents of a file, with or without a mark; None if it is damaged, or was not made by the package."""
     content = content.removeprefix(_MARK)
     return content[_DIGEST:] if content[:_DIGEST] == _digest(kind, name, content[_DIGEST:]) else None
 
@@ -117,7 +118,7 @@ def _verified(kind: str, name: str, content: bytes) -> bytes | None:
 def _is_made(path: Path) -> bool:
     """Return whether the package made a file: by its owner and its mark, or by its digest.
 
-    One that is empty, or begins with zeros, is left of a loss of power, and holds nothing.
+    A file that is empty, or begins with zeros, is left by a power loss, and holds nothing.
     """
     try:
         with open(os.open(path, _PLAINLY), "rb") as file:
@@ -132,9 +133,9 @@ def _is_made(path: Path) -> bool:
 
 
 def remove(path: Path) -> None:
-    """Remove a file that is kept, if the package made it, or JAX for it."""
+    """Remove a cached file, if the package made it, or JAX did."""
     if path.parent.name not in KINDS or _is_made(path):
-        with contextlib.suppress(OSError):  # another process may have been faster
+        with contextlib.suppress(OSError):  # another process may have removed it
             path.unlink()
 
 
@@ -155,12 +156,12 @@ def prune(largest: int) -> None:
 
 
 def _of_package(kind: str) -> list[tuple[Path, os.stat_result]]:
-    """Regular files of the user's, with the package's names, in the folder of a kind."""
+    """Return the user's regular files with the package's names in the folder of a kind."""
     place, found = folder_of(kind), []
     if place is None:
         return found
     for entry in os.scandir(place):
-        with contextlib.suppress(OSError):  # another process may have been faster
+        with contextlib.suppress(OSError):  # another process may have removed it
             named = _NAME.fullmatch(entry.name) or _UNFINISHED.fullmatch(entry.name)
             if named and is_own_file(about := entry.stat(follow_symlinks=False)):
                 found.append((place / entry.name, about))
@@ -168,16 +169,16 @@ def _of_package(kind: str) -> list[tuple[Path, os.stat_result]]:
 
 
 def of_jax() -> tuple[list[Path], list[Path]]:
-    """Files in the folder that JAX looks after: those that it made for the user, and those that it must not meet.
+    """Return the files in JAX's folder: those that JAX made for the user, and those that it must not read.
 
-    These are links, files of other users, and files of other names that it would delete as its own.
+    The latter are links, files of other users, and files with other names that JAX would delete as its own.
     """
     made, others, place = [], [], folder_of(OF_JAX)
     if place is None:
         return made, others
     for at, folders, files in os.walk(place):
         for path in [Path(at) / name for name in (*files, *folders)]:
-            with contextlib.suppress(FileNotFoundError):  # another process may have been faster
+            with contextlib.suppress(FileNotFoundError):  # another process may have removed it
                 about = path.lstat()
                 if is_own_file(about) and _NAME_OF_JAX.fullmatch(path.relative_to(place).as_posix()):
                     made.append(path)
@@ -187,18 +188,18 @@ def of_jax() -> tuple[list[Path], list[Path]]:
 
 
 def kept() -> list[Path]:
-    """All files of the folder that the package made, or JAX for it."""
+    """Return all files of the folder that the package or JAX made."""
     own = [path for kind in KINDS for path, _ in _of_package(kind) if _is_made(path)]
     return own + of_jax()[0]
 
 
 def clear() -> None:
-    """Delete what is kept, and the folders that are empty then."""
+    """Delete the cached files, and the folders that are then empty."""
     for path in kept():
         remove(path)
     for kind in (*KINDS, OF_JAX):
         place = folder_of(kind)
         for each in [*(place.glob("xla_gpu_*") if place is not None else ()), place]:
-            with contextlib.suppress(OSError):  # something else lies there
+            with contextlib.suppress(OSError):  # the folder holds other files
                 if each is not None:
                     each.rmdir()

@@ -1,7 +1,7 @@
-"""Folders and files that only their user can change: what is kept there runs as a part of the user's programs.
+"""Folders and files that only their user can change: cached code runs as a part of the user's programs.
 
-A folder is private where it belongs to the user (or to root) and only its owner may write in it, and where the same
-holds on the way to it: a parent in which others may write lets them put another folder in its place.
+A folder is private where it belongs to the user (or to root) and only its owner may write in it. The same must hold for
+its parents: a writable parent lets other users put another folder in its place.
 """
 
 import functools
@@ -15,25 +15,25 @@ from jaxrock._precision import frames_of_the_package
 
 _OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _PRIVATE = 0o700
-_HAS_OWNERS = hasattr(os, "geteuid")  # Windows keeps others out of a user's folders by lists of access
-_ALL_USERS = 2**32 - 1  # in the map of a process that lives in no user namespace of its own
-_UNMAPPED = 65534  # the owner of what belongs to a user whom a container does not know
+_HAS_OWNERS = hasattr(os, "geteuid")  # Windows protects a user's folders by access lists
+_ALL_USERS = 2**32 - 1  # identity map of a process outside of any user namespace
+_UNMAPPED = 65534  # owner of files of users that a container does not know
 
 
 def private(*folders: Path, make: bool = False) -> bool:
-    """Return whether folders are there and private; those that are the user's own are closed to others first.
+    """Return whether folders exist and are private; folders of the user's own are first closed to others.
 
     **Arguments:**
 
-    - `folders`: each in the one before it, and none a link; links on the way to the first must belong to the user or
-      to root.
-    - `make`: whether they are made where they are missing, with their parents.
+    - `folders`: each in the one before it, and no links. Links on the way to the first must belong to the user or to
+      root.
+    - `make`: whether to make missing folders, with their parents.
 
-    Where they are there and not private, a warning says once why, and what to do.
+    Where they exist and are not private, a warning says once why, and names the remedy.
     """
     try:
         there = next(each for each in folders[0].absolute().parents if each.exists())
-        found = _parent_at_risk(there)  # before anything is made in what another user planted
+        found = _parent_at_risk(there)  # checked before anything is made below a folder that another user planted
         if found is None and make:
             _make(folders[-1])
         if found is None and not folders[-1].exists():
@@ -47,7 +47,7 @@ def private(*folders: Path, make: bool = False) -> bool:
 
 
 def is_private_file(about: os.stat_result) -> bool:
-    """Return whether a file, as its open descriptor tells of it, is a regular one that only its user could write."""
+    """Return whether an open file's status shows a regular file that only its user could write."""
     return stat.S_ISREG(about.st_mode) and _is_trusted(about.st_uid) and not (_HAS_OWNERS and about.st_mode & _OTHERS)
 
 
@@ -58,17 +58,17 @@ def is_own_file(about: os.stat_result) -> bool:
 
 @functools.cache
 def warn_once(risk: str) -> None:
-    """Warn that nothing is kept, and say what to do; once in a process for each reason."""
+    """Warn that nothing is cached, with the remedy; once in a process for each reason."""
     warnings.warn(
         f"Compiled programs are not kept between sessions: {risk}. They would run with your rights. Let JAXROCK_CACHE "
-        "name a folder of yours in which others cannot write, or say JAXROCK_CACHE=off.",
+        "name a folder of yours in which others cannot write, or set JAXROCK_CACHE=off.",
         RuntimeWarning,
         stacklevel=frames_of_the_package() + 1,
     )
 
 
 def is_open(folder: Path) -> bool:
-    """Return whether others than the owner of a folder may write in it; False where there is none."""
+    """Return whether users other than the owner may write in a folder; False where it is missing."""
     try:
         return _HAS_OWNERS and bool(folder.lstat().st_mode & _OTHERS)
     except OSError:
@@ -76,14 +76,14 @@ def is_open(folder: Path) -> bool:
 
 
 def _make(folder: Path) -> None:
-    """Make a folder and its parents, each for its user alone: what umask allows others is no matter."""
+    """Make a folder and its parents, each for its user alone, independent of umask."""
     for each in [*reversed(folder.absolute().parents), folder]:
         if not each.exists():
             each.mkdir(_PRIVATE, exist_ok=True)
 
 
 def _risk(folder: Path) -> str | None:
-    """Return why others may change what lies in a folder, else None; the user's own is closed to others first."""
+    """Return why others may change the contents of a folder, else None; the user's own is first closed to others."""
     if folder.is_symlink():
         return f"{folder} is a link"
     if not _HAS_OWNERS:
@@ -103,7 +103,7 @@ def _risk(folder: Path) -> str | None:
 
 
 def _parent_at_risk(folder: Path) -> str | None:
-    """Return why others may put something else in the place of what lies in a folder; None if they cannot."""
+    """Return why others may replace an entry of a folder, else None."""
     for part in _way_to(folder) if _HAS_OWNERS else ():
         about = part.lstat()
         if not (_is_trusted(about.st_uid) or about.st_uid == _UNMAPPED and _is_mapped()):
@@ -114,7 +114,7 @@ def _parent_at_risk(folder: Path) -> str | None:
 
 
 def _way_to(folder: Path) -> Iterator[Path]:
-    """Every folder and link that leads to a folder, from the root."""
+    """Return every folder and link on the path to a folder, from the root."""
     for part in [*reversed(folder.absolute().parents), folder.absolute()]:
         yield part
         if part.is_symlink():
@@ -122,21 +122,21 @@ def _way_to(folder: Path) -> Iterator[Path]:
 
 
 def _lets_others_rename(about: os.stat_result) -> bool:
-    """Return whether others may rename what lies in a folder: not where it is sticky, as /tmp is."""
+    """Return whether others may rename entries of a folder; a sticky folder, such as /tmp, forbids it."""
     if about.st_mode & stat.S_ISVTX:
         return False
     return bool(about.st_mode & stat.S_IWOTH or about.st_mode & stat.S_IWGRP and not _is_group_of_one(about.st_gid))
 
 
 def _is_group_of_one(group: int) -> bool:
-    """Return whether a group is the user's own, of which no other is a member."""
+    """Return whether a group is the user's own, without other members."""
     import grp
     import pwd
 
     try:
         user = pwd.getpwuid(os.geteuid())
         return group == user.pw_gid and set(grp.getgrgid(group).gr_mem) <= {user.pw_name}
-    except KeyError:  # a container that knows no names
+    except KeyError:  # a container may know no names
         return False
 
 

@@ -114,12 +114,15 @@ class AbstractMoments(eqx.Module):
 
     @property
     def bends(self) -> int:
-        """At how many opening angles at most a derivative of these moments jumps."""
+        """Return the largest number of opening angles at which a derivative of these moments jumps."""
         return 0
 
     def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["AbstractMoments", Scalar]:
-        """Of moments that bend: those that act from an opening angle on, outward or inward, as if they went on without
-        a bend, and the angle at which they bend next; beyond pi/2 where they do not."""
+        """Return smooth moments that act from an opening angle on, outward or inward, and the next angle at which they
+        bend.
+
+        The moments go on beyond that angle as if they did not bend. The angle is beyond pi/2 where there is none.
+        """
         raise NotImplementedError
 
     def rolled(self, angle: Angle) -> Rolled | None:

@@ -106,11 +106,11 @@ class RollingMoments(AbstractMoments):
 
     @property
     def bends(self) -> int:
-        """As for any moments: the angles of a list."""
+        """Return the number of angles of a list, at which the moments bend."""
         return 0 if self.pieces.start is None else self.pieces.start.size
 
     def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["RollingMoments", Scalar]:
-        """As for any moments."""
+        """Return the moments of the piece that acts from an opening angle on, and the angle that ends it."""
         piece, angle = self.pieces.ahead(opening, outward)
         return replace(self, pieces=piece), angle
 

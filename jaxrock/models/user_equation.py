@@ -34,23 +34,22 @@ class Equation(AbstractEquation):
     - `arm`: overturning arm over R; positive at x = 0. None: 1.
     - `dissipation`: moment over m g R against the motion, zero at rest. None: none.
     - `acceleration`: instead of the three, the whole right-hand side: acceleration(x, v, s u, block), linear in s u.
-    - `falls_flat`: whether a rotation of pi/2 means that the block lies on its side.
-    - `bends`: (k,) opening angles [rad], above 0 and growing, at which a derivative of the functions jumps (where a
-      stop is touched, say): steps end there. None: nowhere.
+    - `falls_flat`: whether a block at a rotation of pi/2 lies on its side.
+    - `bends`: (k,) opening angles [rad], above 0 and growing, at which a derivative of the functions jumps, such as
+      contact with a stop: steps end there. None: nowhere.
 
     A vertical acceleration v [g] multiplies the restoring moment by 1 + v.
 
-    The functions must be smooth but for these angles (dry friction is nearly k tanh(v/w), with a small w), work on JAX
-    arrays, and be defined somewhat beyond 0 and pi/2. They must not jump. Where they bend at an angle that `bends` does
-    not tell, values keep the tolerance, but slopes are off by 1e-5 to 1e-3, with no sign of it.
+    The functions must be continuous, smooth between these angles, work on JAX arrays, and be defined somewhat beyond 0
+    and pi/2. Dry friction is nearly k tanh(v/w), with a small w. At a bend that `bends` does not list, values keep the
+    tolerance, but slopes are off by 1e-5 to 1e-3, without a warning.
 
-    Functions that are Equinox modules may carry parameters to differentiate. They may read what changes: every call of
-    the package sees them as they are then (within a function of yours under `jax.jit`, as when that was traced). A
-    block that has stopped below its unstable equilibrium after the motion counts as safe: what dissipates does not
-    lift.
+    Functions that are Equinox modules may carry parameters to differentiate. They may read variables that change: every
+    call of the package sees current values (under your `jax.jit`, those of the trace). A block that has stopped below
+    its unstable equilibrium after the motion counts as safe: dissipation does not lift it.
 
-    **Raises:** ValueError where neither or both ways are used; where it is used for a block that does not stand by it,
-    or if its dissipation jumps at rest or its acceleration is not linear in the push.
+    **Raises:** ValueError where neither or both ways are used. A call raises it for a block that does not stand by the
+    equation, for dissipation that jumps at rest, and for an acceleration that is not linear in the push.
     """
 
     _acceleration: Callable
@@ -158,7 +157,7 @@ class FunctionMoments(AbstractMoments):
     block: Block | Side
     factor: Scalar | float | None  # of all accelerations (see `times`)
     bends_at: Inexact[Array, " bends"] | None
-    stretch: tuple[Scalar, Scalar] | None  # beyond it the function goes on as a straight line; None: nowhere
+    stretch: tuple[Scalar, Scalar] | None  # continues as a straight line beyond it; None: nowhere
     restoring_at_rest: Scalar
     arm_at_rest: Scalar
     saddle: Scalar  # first zero of the restoring moment, at most pi/2
@@ -203,14 +202,14 @@ class FunctionMoments(AbstractMoments):
 
     @property
     def bends(self) -> int:
-        """As for any moments."""
+        """Return the number of angles given in `bends`."""
         return 0 if self.bends_at is None else self.bends_at.size
 
     def ahead(self, opening: Scalar, outward: Bool[Array, ""]) -> tuple["FunctionMoments", Scalar]:
-        """As for any moments."""
+        """Return the equation that acts from an opening angle on, and the angle at which it bends next."""
         starts = jnp.concatenate([jnp.zeros(1, opening.dtype), cast(Array, self.bends_at)])
         number, angle, ends = stretch_from(starts, opening, outward)
-        inside = 4 * float(jnp.finfo(opening.dtype).eps)  # where it bends a function is of one side or the other
+        inside = 4 * float(jnp.finfo(opening.dtype).eps)  # at a bend rounding decides the side of the function
         low, high = pick(starts, number), pick(jnp.append(starts, 4.0), number + 1)
         stretch = where(number == 0, -1.0, low * (1 + inside)), high * (1 - inside)
         moments = eqx.tree_at(lambda m: m.stretch, self, stretch, is_leaf=lambda x: x is None)
@@ -251,7 +250,7 @@ class FunctionMoments(AbstractMoments):
 
 
 def _straight_beyond(low: Scalar, high: Scalar, function: Callable, x: Scalar) -> Scalar:
-    """A function of a number, whose tangents go on where it is not asked."""
+    """Return a function of a number whose tangents continue beyond the interval where it is evaluated."""
     inside = where(x < low, low, where(x > high, high, x))
     value, slope = jax.jvp(function, (inside,), (jnp.ones_like(inside),))
     return value + slope * (x - inside)

@@ -1,6 +1,6 @@
-"""Butterworth filters of samples, and what lies beyond both ends of them: rest, or the samples mirrored for ever.
+"""Butterworth filters of samples that continue beyond both ends: with rest, or mirrored for ever.
 
-NumPy and SciPy: `processing` uses them. No filter is followed beyond the ends, however long it rings there.
+NumPy and SciPy: `processing` uses them. No filter runs beyond the ends, however long it rings there.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ def smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, be
 
 
 def _smoothed_period(whole: np.ndarray, dt: float, corner: float, order: int) -> np.ndarray:
-    """Pass a period of values, an even number of them, through the filter: its gain is known at each frequency."""
+    """Pass a period of values, an even number of them, through the filter by its gain at each frequency."""
     ratio = np.tan(np.pi * np.arange(whole.size // 2 + 1) / whole.size) / np.tan(np.pi * corner * dt)
     with np.errstate(over="ignore"):
         gain = 1 / (1 + ratio ** (2 * order))
@@ -42,7 +42,7 @@ def of_displacement(values: np.ndarray, smooth: Callable) -> np.ndarray:
 
 
 def of_velocity(values: np.ndarray, smooth: Callable) -> np.ndarray:
-    """Smooth values that are turned about both ends: a straight line, which passes, and what is odd beside it."""
+    """Smooth values that are turned about both ends: a straight line, which passes, plus an odd remainder."""
     line = np.linspace(values[0], values[-1], values.size)
     beside = values - line
     return line + smooth(np.concatenate([beside, -beside[-2:0:-1]]))[: values.size]
@@ -51,10 +51,10 @@ def of_velocity(values: np.ndarray, smooth: Callable) -> np.ndarray:
 def butterworth(
     values: np.ndarray, dt: float, low: float | None, high: float | None, order: int, zero_phase: bool
 ) -> np.ndarray:
-    """Pass values between rest before and after through a Butterworth filter, as far as they go.
+    """Pass values, with rest before and after, through a Butterworth filter.
 
-    Without delay the response has a part after its cause, and the mirror image of that before it. Either is a sum over
-    poles that begins at rest, so that nothing has to be followed back from beyond an end.
+    Without delay the response has a causal part, and the mirror image of that before its cause. Either is a sum over
+    poles that begins at rest, so that no filter runs beyond an end.
     """
     if not zero_phase:
         edges = [edge for edge in (low, high) if edge is not None]
@@ -67,16 +67,16 @@ def butterworth(
 
 
 def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, order: int) -> np.ndarray:
-    """The part of a response without delay that comes after its cause.
+    """Return the causal part of a response without delay.
 
-    With S = s/w of a low-pass and (s^2 + l h)/(s (h - l)) of a band, l, h and w its corners under the bilinear
-    transform, the squared gain 1/(1 + (S/i)^2N) has at each of its poles the residue -p/2N: those with a real part
-    below zero are this half, the others its mirror image in time.
+    With S = s/w of a low-pass and (s^2 + l h)/(s (h - l)) of a band, l, h and w are corners under the bilinear
+    transform. The squared gain 1/(1 + (S/i)^2N) has at each of its poles the residue -p/2N. The poles with a negative
+    real part are this half, the others its mirror image in time.
     """
     upper = np.tan(np.pi * high * dt)
     lower = 0.0 if low is None else np.tan(np.pi * low * dt)
     total = np.zeros(values.size)
-    for k in range((order + 1) // 2):  # of each pair of conjugate poles one
+    for k in range((order + 1) // 2):  # one of each pair of conjugate poles
         pole = 1j * np.exp(1j * np.pi * (2 * k + 1) / (2 * order))
         size = -pole * (upper - lower) / (2 * order)
         if low is None:
@@ -84,7 +84,7 @@ def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, 
         else:
             middle = pole * (upper - lower) / 2
             root = np.sqrt(middle**2 - lower * upper)
-            far = max(middle + root, middle - root, key=abs)  # the near one, as their difference, would lose its digits
+            far = max(middle + root, middle - root, key=abs)  # the near pole, a difference, would lose its digits
             part = _one_pole(_one_pole(values, 1, -1, lower * upper / far), size, 1, far)
         total += (1 if 2 * k + 1 == order else 2) * part.real
     return total

@@ -1,8 +1,7 @@
 """Squared Fourier amplitudes of straight lines over a band of frequencies, in NumPy.
 
-Shocks far from one another are transformed each by itself, so that the quiet between them costs nothing. What they add
-to each other's amplitudes changes from frequency to frequency as fast as they are far apart: that factor is integrated
-in closed form.
+Shocks far from one another are transformed separately, so that the quiet between them costs nothing. Their cross terms
+oscillate over frequency the faster, the farther apart they are: that factor is integrated in closed form.
 """
 
 from typing import NamedTuple
@@ -12,17 +11,17 @@ import numpy as np
 from jaxrock.motions.oscillator import integrals_of_exponential
 from jaxrock.motions.straight import Straight
 
-_QUIET = 20.0  # between two shocks [s], at least
-_SHOCKS = 64  # at most; with more, longer pauses part them
-_APART = 5e-3  # amplitudes, at most [Hz]
-_SHORT = 2.5e-4  # steps of time, at most [s], but those of lines of one length
-_MOST = 1 << 24  # steps
-_FINE = 8  # amplitudes for each that a shock of some length determines
-_MANY = 1 << 20  # samples, of which there are fewer
+_QUIET = 20.0  # least pause between two shocks [s]
+_SHOCKS = 64  # largest number; with more, longer pauses part them
+_APART = 5e-3  # largest distance of amplitudes [Hz]
+_SHORT = 2.5e-4  # largest step of time [s], except for lines of one length
+_MOST = 1 << 24  # largest number of steps
+_FINE = 8  # amplitudes per independent amplitude of a shock's length
+_MANY = 1 << 20  # largest number of samples
 
 
 class _Shock(NamedTuple):
-    """Straight lines between quiet: from when on [s], and how long they last [s]."""
+    """Straight lines between pauses, their begin and length [s]."""
 
     lines: Straight
     begin: float
@@ -54,7 +53,7 @@ def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[floa
 
 
 def _shocks(lines: Straight) -> list[_Shock]:
-    """What is parted by quiet."""
+    """Split lines into shocks, at pauses."""
     lines = Straight(*(part[lines.length > 0] for part in lines))
     moving, times = (lines.begin != 0) | (lines.end != 0), lines.times
     places = np.flatnonzero(moving)
@@ -68,7 +67,7 @@ def _shocks(lines: Straight) -> list[_Shock]:
 
 
 def _step(shock: _Shock) -> float:
-    """Of what length steps of time are [s]: that of the lines, if they are alike and go on where others end."""
+    """Return the step of time [s]: that of the lines, if they are of one length and continuous."""
     length = shock.lines.length
     joined = np.allclose(shock.lines.begin[1:], shock.lines.end[:-1], rtol=1e-9, atol=0)
     if length.size > 1 and joined and np.ptp(length) <= 1e-6 * length.max():
@@ -77,22 +76,22 @@ def _step(shock: _Shock) -> float:
 
 
 def _amplitudes(shock: _Shock, grid: np.ndarray) -> np.ndarray:
-    """Fourier transform at some frequencies [Hz], of time from the middle of the shock on."""
+    """Return the Fourier transform at some frequencies [Hz], with time from the middle of the shock."""
     lines, step, times = shock.lines, _step(shock), shock.lines.times
     time = step * np.arange(int(np.floor(times[-1] / step * (1 + 1e-9))) + 1)
     knots = np.stack([times[:-1], times[1:] - 1e-9 * step], axis=1).ravel()
     values = np.stack([lines.begin, lines.end], axis=1).ravel()
-    # At a jump the mean of both sides, so that it comes neither too early nor too late.
+    # At a jump the mean of both sides, so that the sample is centred in time.
     samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
     from scipy.signal import zoom_fft
 
     sums = zoom_fft(samples, [grid[0], grid[-1]], grid.size, fs=1 / step, endpoint=True)
-    # Of straight lines between the samples: that of samples, which comes again beyond half of their rate, but weaker.
+    # Transform of straight lines between samples: that of the samples, periodic in their rate, times a squared sinc.
     return step * sums * np.sinc(grid * step) ** 2 * np.exp(1j * np.pi * grid * shock.length)
 
 
 def _between(values: np.ndarray, grid: np.ndarray, later: float) -> np.ndarray:
-    """Real parts of integrals of values, straight between frequencies, times e^(-2 pi i later frequency)."""
+    """Return real parts of integrals of values, straight between frequencies, times e^(-2 pi i later frequency)."""
     apart = np.diff(grid)
     turn = -2j * np.pi * later
     whole, falling = integrals_of_exponential(turn * apart, apart)

@@ -1,9 +1,9 @@
-"""Intensity measures of ground motions: peaks, what is summed over time, response spectra, rocking's own.
+"""Intensity measures of ground motions: peaks, integrals over time, response spectra, and measures of rocking.
 
 `peak_acceleration`, `peak_velocity` and their ratios to a block's are functions of JAX. The others are of known
 motions, in NumPy and SciPy: exact for records (straight lines between samples), to about 1e-7 for pulses. A pulse of
-thousands of cycles is followed as finely as one; of more than 5,000 (20 for functions of JAX under tracing) it is
-refused. Quiet within a motion costs nothing. g is 9.81 m/s^2.
+thousands of cycles is sampled as finely as one cycle. A pulse of more than 5,000 cycles is refused, of more than 20 in
+functions of JAX under tracing. Quiet within a motion costs nothing. g is 9.81 m/s^2.
 """
 
 import warnings
@@ -89,17 +89,17 @@ def peak_displacement(motion: AbstractMotion) -> float:
 
     **Arguments:**
 
-    - `motion`: one known motion; a record should have been corrected so that its displacement is meant.
+    - `motion`: one known motion; a record needs a correction of its baseline.
 
     **Returns:** the largest |displacement|, also between samples. It warns of a record of 100 samples or more whose
-    ground ends further away than half of that: its baseline drifts. (Where a fault has moved the ground it may be so.)
+    ground ends farther away than half of that: its baseline drifts. (A fault may have moved the ground.)
 
     **Raises:** ValueError for a motion of too many cycles within its pieces.
     """
     lines = straight(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
     largest = np.abs(places).max(initial=0.0)
-    # Where the velocity v + a t + j t^2/2 passes zero within a line, also one that begins without any.
+    # Times at which the velocity v + a t + j t^2/2 passes zero within a line, also in one that begins at rest.
     slope = (lines.end - lines.begin) / lines.length
     root = np.sqrt(np.maximum(lines.begin**2 - 2 * slope * velocity, 0.0))
     lead = lines.begin + np.copysign(root, lines.begin)
@@ -185,7 +185,8 @@ def _squares(lines: Straight) -> np.ndarray:
 
 
 def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
-    """When the integral of the squared acceleration first comes to a value: halved down to rounding within a line."""
+    """Return the time at which the integral of the squared acceleration first reaches a value, by bisection within a
+    line."""
     row = min(max(int(np.searchsorted(sums, wanted)) - 1, 0), lines.length.size - 1)
     a, b, length = (float(part[row]) for part in lines)
     low, high = 0.0, 1.0

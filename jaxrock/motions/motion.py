@@ -1,8 +1,7 @@
-"""Ground motions: what every motion must tell the engines, and motions made of motions.
+"""Ground motions: the interface between every motion and the engines, and motions made of motions.
 
-A motion is smooth on pieces. It gives the times that separate them (`knots`), for each piece a time scale and a bound
-of its acceleration, and its Taylor series at any point of a piece. Accelerations are in units of g; positive
-acceleration drives negative rotation.
+A motion is smooth on pieces. It gives the times that separate them (`knots`), a time scale and a bound of every piece,
+and its Taylor series at any point of a piece. Accelerations are in g; a positive one drives negative rotation.
 """
 
 import abc
@@ -307,7 +306,7 @@ class _Together(AbstractMotion):
 
     @property
     def lateness(self) -> Scalar | None:
-        # Where one is shifted, its times are rounded as those of the whole are.
+        # A part that is shifted rounds its times as the whole sum does.
         parts, knots = jax.tree.leaves(self._both, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
         if not any(isinstance(part, Shifted) for part in parts):
             return None

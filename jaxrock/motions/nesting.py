@@ -1,16 +1,16 @@
-"""How many motions one motion is made of: each is a part of the program that follows the whole."""
+"""The limit on the number of motions that make up one motion: each is a part of the program for the whole."""
 
 from typing import Any
 
 import equinox as eqx
 
-MOST = 100  # of which a sum of 33 delayed pulses is made: its program compiles in 40 s, twice as many take minutes
+MOST = 100  # a sum of 33 delayed pulses has as many: its program compiles in 40 s, twice as many take minutes
 
 
 def check_nesting(motion: eqx.Module) -> None:
-    """Raise ValueError for a motion that is made of too many: their program would take minutes to compile.
+    """Raise ValueError for a motion made of too many parts, whose program would take minutes to compile.
 
-    Called wherever a motion is made, so that it never has to look deeper than that.
+    Every constructor of a motion calls it, so that the count never recurses deeper than the limit.
     """
     count = _count(motion)
     if count > MOST:

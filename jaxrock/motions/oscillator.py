@@ -1,15 +1,15 @@
 """Linear oscillators under straight lines of acceleration: exact from end to end of each, in NumPy.
 
-A line of many periods costs what two cost: see `_peaks_of_long_lines`.
+A line of many periods costs as much as one of two: see `_peaks_of_long_lines`.
 """
 
 import numpy as np
 
 from jaxrock.motions.straight import Straight
 
-_PARTS = 80  # of a period, for peaks
-_AT_A_TIME = 1 << 16  # lines, or parts of them, whose states are held in memory
-_GONE = 40.0  # exponents by which an oscillation has decayed to rounding
+_PARTS = 80  # share of a period, for peaks
+_AT_A_TIME = 1 << 16  # lines, or parts of lines, whose states are in memory together
+_GONE = 40.0  # exponents after which an oscillation is below rounding
 
 
 def peaks_of_oscillator(lines: Straight, period: float, damping: float) -> tuple[float, float]:
@@ -30,8 +30,8 @@ def peaks_of_oscillator(lines: Straight, period: float, damping: float) -> tuple
 
 
 def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: float) -> np.ndarray:
-    """Peaks within some lines, with the states at their ends."""
-    window = 2 * np.pi / s.imag  # a period of the damped oscillation, or less if that is soon over
+    """Return peaks within some lines, and the states at their ends."""
+    window = 2 * np.pi / s.imag  # a period of the damped oscillation, or its decay if shorter
     window = min(window, max(_GONE / -s.real, period)) if s.real else window
     parts = np.maximum(1, np.ceil(_PARTS * lines.length / period)).astype(int)
     long = lines.length > 2 * window
@@ -47,11 +47,11 @@ def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: flo
 
 
 def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window: float) -> np.ndarray:
-    """Peaks within lines of many periods: they lie in the first or in the last of these.
+    """Return peaks within lines of many periods: they lie in the first or in the last period.
 
-    The oscillator moves along a straight line, and rings about it. At one phase, from period to period, where it is
-    ahead of the line its distance is a straight line and a decaying exponential, which is convex: largest at an end.
-    Where it is behind, it is further half a period before or after.
+    The oscillator moves along a straight line, and rings about it. At one phase, from period to period, its distance is
+    a straight line and a decaying exponential. Where it is ahead of the line that is convex, and largest at an end.
+    Where it is behind, it is farther away half a period before or after.
     """
     a, b, length = lines
     slope, first = (b - a) / length, np.full_like(length, window)
@@ -62,7 +62,7 @@ def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window
 
 
 def _peaks_of_parts(lines: Straight, states: np.ndarray, parts: np.ndarray, s: complex) -> np.ndarray:
-    """Peaks within lines that are cut into so many parts, with the states at the beginnings of lines."""
+    """Return peaks within lines cut into equal parts, from the states at the beginnings of lines."""
     peaks, total = np.zeros(2), np.cumsum(parts)
     for group in np.split(np.arange(parts.size), np.flatnonzero(np.diff(total // _AT_A_TIME)) + 1):
         row = np.repeat(group, parts[group])
@@ -77,7 +77,7 @@ def _peaks_of_parts(lines: Straight, states: np.ndarray, parts: np.ndarray, s: c
 
 
 def _peaks_between(lines: Straight, before: np.ndarray, after: np.ndarray, s: complex) -> np.ndarray:
-    """Peaks within lines much shorter than a period, from the states at their ends."""
+    """Return peaks within lines much shorter than a period, from the states at their ends."""
     (place, next_place), (speed, next_speed), (slope, next_slope) = (
         (-(s**k * before).imag / s.imag, -(s**k * after).imag / s.imag) for k in range(3)
     )
@@ -91,19 +91,19 @@ def _peaks_between(lines: Straight, before: np.ndarray, after: np.ndarray, s: co
 
 
 def _rows(lines: Straight, rows: np.ndarray) -> Straight:
-    """Some of the lines."""
+    """Select some of the lines."""
     return Straight(*(part[rows] for part in lines))
 
 
 def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
-    """z at the ends of all lines, from its first value on."""
+    """Return z at the ends of all lines, from its first value."""
     from scipy.signal import lfilter
 
     x = s * lines.length
     first, second = integrals_of_exponential(x, lines.length)
     gain, factor = lines.begin * (first - second) + lines.end * second, np.exp(x)
     edges = np.flatnonzero(np.concatenate([[True], np.abs(np.diff(lines.length)) > 0, [True]]))
-    if edges.size > x.size // 16:  # few lines of one length: a filter of each would cost more than a loop
+    if edges.size > x.size // 16:  # few lines of one length: a filter for each length would cost more than a loop
         states = [state]
         for each, more in zip(factor.tolist(), gain.tolist()):
             states.append(each * states[-1] + more)
@@ -117,14 +117,14 @@ def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
 
 
 def _after(a: np.ndarray, slope: np.ndarray, state: np.ndarray, time: np.ndarray, s: complex) -> np.ndarray:
-    """z some time after the beginning of a line."""
+    """Return z some time after the beginning of a line."""
     x = s * time
     first, second = integrals_of_exponential(x, time)
     return np.exp(x) * state + a * first + slope * time * second
 
 
 def integrals_of_exponential(x: np.ndarray, time: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals from 0 to some time of e^(x t/time), and of that times 1 - t/time."""
+    """Return integrals from 0 to some time of e^(x t/time), and of that times 1 - t/time."""
     small = np.abs(x) < 1e-2
     far = np.where(small, 1.0, x)
     first = np.expm1(far) / far
@@ -141,13 +141,13 @@ def _series(x: np.ndarray, first: int) -> np.ndarray:
 
 
 def _top(y0: np.ndarray, y1: np.ndarray, m0: np.ndarray, m1: np.ndarray, h: np.ndarray) -> float:
-    """The largest size of what has these values and slopes at the ends of lines, of lengths h: of cubics."""
+    """Return the largest magnitude of cubics with the given values and slopes at the ends of lines of lengths h."""
     sizes = np.maximum(np.abs(y0), np.abs(y1))
     largest = sizes.max(initial=0.0)
-    # No cubic of Hermite lies further beyond its ends.
+    # No Hermite cubic lies farther beyond its ends.
     rows = np.flatnonzero(sizes + 4 / 27 * h * (np.abs(m0) + np.abs(m1)) > largest)
     y0, y1, m0, m1 = (part[rows] for part in (y0, y1, h * m0, h * m1))
-    # Its slope over a share of the line is a t^2 + b t + m0.
+    # The slope over a share of the line is a t^2 + b t + m0.
     a, b = 6 * (y0 - y1) + 3 * (m0 + m1), 6 * (y1 - y0) - 4 * m0 - 2 * m1
     lead = -(b + np.copysign(np.sqrt(np.maximum(b * b - 4 * a * m0, 0.0)), b)) / 2
     with np.errstate(all="ignore"):

@@ -19,9 +19,9 @@ _NODES, _WEIGHTS = gauss_legendre(6)
 _FEW = 32  # pieces
 _PARTS = 256  # of every piece, where there are few
 _PER_SCALE = 8  # parts of the time in which an acceleration changes, where there are many
-_LEAST = 2  # parts of that time, with which they are still exact to 1e-9
-_MOST = 1 << 20  # parts, of what is known
-_AT_A_TIME = 8192  # of these
+_LEAST = 2  # parts of that time, still exact to 1e-9
+_MOST = 1 << 20  # largest number of parts of a known motion
+_AT_A_TIME = 8192  # parts at a time
 _NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
 
 
@@ -31,16 +31,18 @@ def peaks_of_motion(motion: AbstractMotion) -> tuple[Scalar, Scalar]:
 
 
 def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Scalar]:
-    """The same, and the velocity at the end [m/s]: by a few programs for records of any lengths.
+    """Return peaks of acceleration [g] and velocity [m/s], and the last velocity [m/s].
 
-    **Raises:** ValueError for a motion of too many cycles within its pieces, which are fewer where it is traced.
+    A few programs serve records of any length.
+
+    **Raises:** ValueError for a motion of too many cycles within its pieces; the limit is lower under tracing.
     """
     motion = with_room(motion)
     return _fine_enough(motion, _peaks_of)
 
 
 def peaks_of_many(motions: AbstractMotion, choose: Callable, count: int) -> tuple[Array, Array]:
-    """`peaks_of_motion` of each that `choose(motions, index)` gives: in one program."""
+    """Return `peaks_of_motion` of every `choose(motions, index)`, by one program."""
 
     def peaks(motions, room):
         return jax.vmap(lambda index: _peaks_of(choose(motions, index), room))(jnp.arange(count))
@@ -49,7 +51,7 @@ def peaks_of_many(motions: AbstractMotion, choose: Callable, count: int) -> tupl
 
 
 def _fine_enough(motion: Any, peaks: Callable) -> tuple:
-    """Return what `peaks(motion, room)` finds with the usual parts of every piece, or with more where these are few."""
+    """Return the results of `peaks(motion, room)` with the usual parts of every piece, or with more where needed."""
     *found, wanted = peaks(motion, None)
     if wanted is None:
         return tuple(found)
@@ -57,7 +59,7 @@ def _fine_enough(motion: Any, peaks: Callable) -> tuple:
         message = "Argument `motion` must have at most 20 cycles within a piece where it is traced"
         return watched(tuple(found), message, jnp.any(wanted > 0))
     most = float(np.max(np.asarray(wanted)))
-    if not most > 0:  # NaN of a motion that is
+    if not most > 0:  # NaN where the motion is
         return tuple(found)
     if most > _MOST:
         raise too_long(_MOST // _LEAST, most / _LEAST)
@@ -65,20 +67,20 @@ def _fine_enough(motion: Any, peaks: Callable) -> tuple:
 
 
 def too_long(most: float, lasts: float) -> ValueError:
-    """Of motions with more cycles than are followed."""
+    """Make the error for motions with more cycles than the limit."""
     return ValueError(
         f"Argument `motion` must last at most {most:g} times the time in which its acceleration changes, but lasts "
-        f"{lasts:.3g} times that: make a `Record` of what matters of it."
+        f"{lasts:.3g} times that: make a `Record` of its relevant part."
     )
 
 
 @quickly(static_argnums=1)
 def _peaks_of(motion: AbstractMotion, room: int | None):
-    """Peaks of acceleration [g] and velocity [m/s], the last velocity, and how many parts are wanted: 0 if there are
-    enough, None if there always are.
+    """Return peaks of acceleration [g] and velocity [m/s], the last velocity, and the number of parts wanted.
 
-    Every piece is cut into parts. Velocity is integrated over each by Gauss and Legendre, and to where the acceleration
-    passes zero in it; from the larger of its ends the acceleration is followed to the top beside it.
+    That number is 0 if there are enough parts, None if there always are. Every piece is cut into parts. Gauss-Legendre
+    quadrature integrates the acceleration over each part, and up to its zero in it. Newton's method finds the top of
+    the acceleration beside the larger end of each part.
     """
     kind = motion.knots.dtype
     nodes, weights = (jnp.asarray(values, kind) / 2 for values in (_NODES, _WEIGHTS))
@@ -126,7 +128,7 @@ def _peaks_of(motion: AbstractMotion, room: int | None):
 
 
 def _wanted(motion: AbstractMotion) -> Array | None:
-    """How many parts are wanted at least, of all pieces together, if `_parts` are too few; or else 0."""
+    """Return the least number of parts of all pieces together, if `_parts` are too few; else 0."""
     lengths, scales = jax.lax.stop_gradient((motion.lengths, motion.scales))
     if scales is None:
         return None
@@ -151,7 +153,7 @@ def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
 
 
 def _parts_by_scale(motion: AbstractMotion, room: int) -> tuple[Array, Array, Array]:
-    """As `_parts`, one of every piece and so many more, as their curves ask for."""
+    """Return `_parts` by time scale: one for every piece, the others in proportion to its changes."""
     lengths, scales = motion.lengths, jnp.inf if motion.scales is None else motion.scales
     wanted = _PER_SCALE * lengths / scales
     counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)

@@ -251,7 +251,7 @@ def filtered(
     - `order`: of the filter.
     - `zero_phase`: whether it runs forwards and backwards (which doubles its order); the ground rests before and after.
 
-    **Returns:** a `Record` of as many samples: what rings on before its beginning and after its end is left out.
+    **Returns:** a `Record` of as many samples; ringing before its beginning and after its end is cut off.
 
     **Raises:** ValueError for corners that are not in order, or not from a millionth to half of the sampling rate, or
     within a millionth of one another.

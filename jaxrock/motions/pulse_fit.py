@@ -28,9 +28,9 @@ from jaxrock.numerics.gauss_legendre import gauss_legendre
 from jaxrock.numerics.lookup import count_up_to
 from jaxrock.status import Enumeration, item
 
-_ORDER = 6  # of the quadrature over parts of pieces
-_PARTS = 64  # of every smooth piece of a pulse, at least
-_PER_SCALE = 0.5  # of the time in which its acceleration changes: exact to 1e-9
+_ORDER = 6  # nodes of the quadrature over parts of pieces
+_PARTS = 64  # least number of parts of every smooth piece of a pulse
+_PER_SCALE = 0.5  # parts of the time in which its acceleration changes: exact to 1e-9
 _MOST = 1 << 14
 _LENGTHS = 14  # periods or durations that are tried
 _USUAL = {"oscillations": (1.01, 8.0), "shape": (-30.0, 30.0), "phase": (-np.pi, np.pi)}
@@ -223,9 +223,9 @@ class _Problem(NamedTuple):
 
 
 def _parts_of(kind: _Kind, ends: np.ndarray) -> int:
-    """How many parts a piece is cut into, so that pulses at all ends of the ranges change little within each.
+    """Return the number of parts of each piece, so that pulses at all ends of the ranges change little within each.
 
-    **Raises:** ValueError for ranges of pulses with more cycles than are followed.
+    **Raises:** ValueError for ranges of pulses with too many cycles.
     """
     changes = float(np.nanmax(np.asarray(_changes(kind, np.array(list(itertools.product(*ends)))))))
     if _PER_SCALE * changes > _MOST:
@@ -238,7 +238,7 @@ def _parts_of(kind: _Kind, ends: np.ndarray) -> int:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _changes(kind: _Kind, places):
-    """How many times the time in which its acceleration changes a piece of a pulse lasts, at some places."""
+    """Return the lengths of pieces of a pulse over the time in which its acceleration changes, at some places."""
 
     def at(place):
         values = kind.values(place)
@@ -293,7 +293,8 @@ def _with_slopes(kind: _Kind, place, times):
 
 
 def _velocity(pulse: AbstractMotion, times: Float[Array, " n"], count: int) -> Float[Array, " n"]:
-    """Integral of the acceleration [g s], by Gauss and Legendre over parts of pieces: smooth where a pulse jumps."""
+    """Integrate the acceleration, by Gauss-Legendre quadrature over parts of pieces [g s]; smooth where a pulse
+    jumps."""
     knots, lengths = pulse.knots, pulse.lengths
     nodes, weights = (jnp.asarray(values) for values in gauss_legendre(_ORDER))
     piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)

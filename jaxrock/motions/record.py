@@ -20,8 +20,8 @@ from jaxrock.motions.pieces import Lasting
 from jaxrock.numerics.choice import where
 
 _SHORT = 64  # samples of a record that is a program of its own
-STRONGEST = 3.0  # [g]; few records ever went beyond
-_is_in_g = contextvars.ContextVar("is_in_g", default=False)  # whether samples are known to be, and not doubted
+STRONGEST = 3.0  # [g]; few records exceed it
+_is_in_g = contextvars.ContextVar("is_in_g", default=False)  # whether samples are known to be in g
 
 
 class Straight(AbstractMotion):
@@ -76,8 +76,8 @@ class Record(Straight):
 
     **Arguments:**
 
-    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1 (of one, it lasts no time and moves
-      nothing). Or (..., n) of many records of one length, for use under `jax.vmap`.
+    - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1 (a single sample lasts no time and
+      moves nothing). Or (..., n) of many records of one length, for use under `jax.vmap`.
     - `dt`: time between samples [s], positive.
     - `name`: where it comes from; shown in tables and figures. Compiled functions do not see it: one serves all names,
       and a record that it returns has the name that the first one had.
@@ -85,7 +85,7 @@ class Record(Straight):
 
     **Raises:** ValueError for samples that are not finite numbers, a column (n, 1) in place of them, or dt <= 0.
 
-    It warns of known samples beyond 3 g, which are likely in another unit. `factor * record` may be as strong as it is.
+    It warns of known samples beyond 3 g, which are likely in another unit. `factor * record` never warns.
 
     Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
     """
@@ -150,7 +150,7 @@ class Record(Straight):
 
 
 def record_in_g(acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None) -> Record:
-    """A `Record` of samples that are computed from accelerations in g: their unit is not doubted."""
+    """Make a `Record` of samples computed from accelerations in g, without a warning about their unit."""
     before = _is_in_g.set(True)
     try:
         return Record(acceleration, dt, name, origin)

@@ -15,7 +15,7 @@ from jaxrock.motions.record import Record
 
 _LINES = 16384  # of smooth pieces, at least
 _PER_SCALE = 256  # of the time in which an acceleration changes
-_FEWEST = 32  # of it, with which they are 1e-7 off
+_FEWEST = 32  # lines of that time, with an error of 1e-7
 _MOST = 1 << 20
 
 
@@ -72,16 +72,17 @@ def straight(motion: AbstractMotion) -> Straight:
     step = (lengths / np.maximum(counts, 1))[piece]
     places = (number * step, (number + 0.5) * step, np.minimum((number + 1) * step, lengths[piece]))
     begin, middle, end = (GRAVITY * _values(motion, piece, local) for local in places)
-    # Lines from end to end of a curve lie on its inner side: these have its integral, by Simpson's rule.
+    # Chords of a curve lie on its inner side: these lines have its integral, by Simpson's rule.
     bend = 2 / 3 * (middle - (begin + end) / 2)
     return Straight(begin + bend, end + bend, step)
 
 
 def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
-    """How many lines each piece is made of: one, if it is one; none without a length (the room of longer records); else
-    as many as its curves ask for.
+    """Return the number of lines of each piece: one for a straight piece, none without a length, else by its curvature.
 
-    **Raises:** ValueError for curves of too many.
+    Pieces without a length make room for longer records.
+
+    **Raises:** ValueError for curves of too many lines.
     """
     lasting = lengths > 0
     if scales is None:

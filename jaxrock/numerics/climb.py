@@ -19,7 +19,7 @@ _SHORTEST_STEP = 1e-9  # below which there is a jump
 # Rounds after which climbers so far below the best are given up: a compromise. Later, a fit takes up to twice as many
 # points, and finds a higher summit now and then; more starts do, too.
 _HOPELESS = ((2, 10.0), (5, 4.0), (8, 1.5), (12, 0.5), (20, 0.1), (30, 0.02), (40, 0.005))
-_PATIENCE, _LEAST_GAIN = 12, 2e-6  # rounds in which a climber must gain so much: at a kink none ends otherwise
+_PATIENCE, _LEAST_GAIN = 12, 2e-6  # rounds in which a climber must gain so much; at a kink none would end otherwise
 _SAME = 0.01  # distance from a higher climber, in the units of the points, at which one is given up
 _NOWHERE = -1e300  # the value where there is none
 

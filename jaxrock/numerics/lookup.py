@@ -38,11 +38,11 @@ def count_up_to(values: Shaped[Array, " n"], x: Shaped[ArrayLike, ""]) -> Int[Ar
 def stretch_from(
     starts: Shaped[Array, " n"], x: Shaped[Array, ""], upward: Bool[Array, ""]
 ) -> tuple[Int[Array, ""], Shaped[Array, ""], Bool[Array, ""]]:
-    """The stretch between sorted numbers that is gone through from x on, upward or downward, and where it ends.
+    """Return the interval between sorted numbers that holds x when moving upward or downward, and where it ends.
 
-    **Arguments:** `starts`: of the stretches, 0 or more, the first 0.
+    **Arguments:** `starts`: starts of the intervals, 0 or more, the first 0.
 
-    **Returns:** its number; its end, beyond x by more than rounding; whether there is one above 0.
+    **Returns:** its index; its end, beyond x by more than rounding; whether there is an end above 0.
     """
     rounding = 64 * float(jnp.finfo(x.dtype).eps)
     stretch = jnp.maximum(count_up_to(starts, x * where(upward, 1 + rounding, 1 - rounding)) - 1, 0)

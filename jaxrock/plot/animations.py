@@ -188,9 +188,8 @@ def save_animation(
 ) -> None:
     """Write a film as its file's name says: GIF, HTML that plays by itself, or MP4.
 
-    It lasts as long as its pictures per second say. Those of a GIF last whole hundredths of a second in turn, and two
-    at least, as viewers slow others down: of more than 50 per second some are left out. Those of HTML last whole
-    thousandths.
+    Its duration follows from the pictures per second. Pictures of a GIF last whole hundredths of a second, and at least
+    two, as viewers slow others down. Above 50 per second some are left out. Pictures of HTML last whole thousandths.
 
     **Arguments:**
 
@@ -221,7 +220,7 @@ def save_animation(
             aside.write_text(text, encoding="utf-8")
     elif kind == ".mp4":
         with matplotlib.rc_context({"animation.ffmpeg_path": _ffmpeg()}):
-            more = [*matplotlib.rcParams["animation.ffmpeg_args"], "-f", "mp4"]  # whatever its name ends with
+            more = [*matplotlib.rcParams["animation.ffmpeg_args"], "-f", "mp4"]  # independent of the ending of its name
             if not FFMpegWriter.isAvailable():
                 raise ValueError(
                     "Argument `path` must end with .gif or .html, as .mp4 needs the program ffmpeg, which is not "

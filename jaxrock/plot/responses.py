@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 _POINTS = 20_001  # of a curve
-_LONG = 200.0  # [s], in which they lie a hundredth of a second apart
+_LONG = 200.0  # [s], with points a hundredth of a second apart
 
 
 def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
@@ -30,8 +30,10 @@ def acceleration_of(motion: AbstractMotion, time: np.ndarray) -> np.ndarray:
 
 
 def moments_seen(motion: AbstractMotion, begin: float, end: float, count: int) -> np.ndarray:
-    """Times at which a motion is drawn [s]: so many at equal steps, as many where it is curved, and all of its knots
-    between, where it has its corners and, with the moment before them, its jumps."""
+    """Return times at which a motion is drawn [s]: equal steps, as many in curved pieces, and all knots between.
+
+    Each knot comes with the moment before it, which draws jumps.
+    """
     knots = np.asarray(motion.knots)
     # Those that lie outside stay, at the ends: one number of times, one program, for all lengths of padded records.
     within = np.clip(np.concatenate([knots, np.nextafter(knots, -np.inf), _curved(motion, knots, count)]), begin, end)
@@ -39,7 +41,7 @@ def moments_seen(motion: AbstractMotion, begin: float, end: float, count: int) -
 
 
 def _curved(motion: AbstractMotion, knots: np.ndarray, count: int) -> np.ndarray:
-    """So many times within pieces that are no straight lines, the closer the faster the acceleration changes there."""
+    """Return times within curved pieces, denser where the acceleration changes faster."""
     if motion.scales is None:
         return knots[:0]
     lengths, scales = np.asarray(motion.lengths), np.asarray(motion.scales)
@@ -52,8 +54,10 @@ def _curved(motion: AbstractMotion, knots: np.ndarray, count: int) -> np.ndarray
 
 
 def _times_of(response: Response | FlexibleResponse, motion: AbstractMotion) -> np.ndarray:
-    """Times at which a response is drawn [s]: at equal steps, or, of one so long that these would pass over what it
-    does, half of them between knots and impacts, as many between any two."""
+    """Return times at which a response is drawn [s]: equal steps, which would pass over events of a long response.
+
+    A long one has half of its times between knots and impacts, equally many between any two.
+    """
     duration = float(response.duration)
     if duration <= _LONG:
         return np.linspace(0, duration, _POINTS)

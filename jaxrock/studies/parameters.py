@@ -25,15 +25,15 @@ AnyBlock = Block | AsymmetricBlock | FlexibleBlock
 
 
 def named(block: AnyBlock, motion: AbstractMotion) -> dict[str, Real]:
-    """Parameters and their values.
+    """Return parameters and their values, by name.
 
-    Those that the block declares (`alpha`, `p`; of an asymmetric one `alpha1`, `alpha2`, `p1`, `inertia_ratio`,
-    `radius_ratio`), its restitution (`restitution`; `restitution1` and `restitution2` of two sides; of a law with
-    parameters of its own these, as `restitution.gentle`), and those of the motion as it names them; `amplitude` [g]
-    also of a motion that does not (a record): its peak, which scales all of it.
+    The block declares `alpha` and `p`; an asymmetric one `alpha1`, `alpha2`, `p1`, `inertia_ratio` and `radius_ratio`.
+    Its law adds `restitution`, or `restitution1` and `restitution2` of two sides, or parameters of its own, such as
+    `restitution.gentle`. The motion adds parameters by its own names. A motion without `amplitude` [g] (a record) gets
+    one: its peak, which scales all of it.
 
-    **Raises:** ValueError for a motion (of the user's own) that has a parameter of the block's name, and for two
-    parameters of one name, as of `{"a.b": 1.0, "a": {"b": 2.0}}`.
+    **Raises:** ValueError for a user's motion that has a parameter of the block's name, and for two parameters of one
+    name, as of `{"a.b": 1.0, "a": {"b": 2.0}}`.
     """
     for owner, leaves in {"block": _of_own(block), "motion": _numbers(motion)}.items():
         for name, count in Counter(leaf.name for leaf in leaves).items():
@@ -123,12 +123,12 @@ def _rebuilt_motion(motion: AbstractMotion, values: dict[str, Real], amplitude: 
     changed = with_values(motion, {name: values[name] for name in names})
     if "amplitude" not in names:
         peak = jax.lax.stop_gradient(peak_of(motion) if amplitude is None else amplitude)
-        changed = scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # ground at rest stays so
+        changed = scaled(changed, values["amplitude"] / jnp.where(peak == 0, 1.0, peak))  # rest scales to rest
     return changed
 
 
 def scaled(motion: AbstractMotion, factor: Real) -> AbstractMotion:
-    """A motion times a factor, which is not checked: it may be NaN, and so is the outcome of the scene then."""
+    """Return a motion times a factor, unchecked: a NaN factor makes the outcome of the scene NaN."""
     return eqx.tree_at(lambda changed: changed.factor, Scaled(motion, jnp.ones_like(factor)), factor)
 
 

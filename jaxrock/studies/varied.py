@@ -84,7 +84,7 @@ class Amplitude(AbstractVaried):
     """A larger motion."""
 
     def scene(self, z, block, motion):
-        """What is asked for at a factor, which is NaN where nothing is known of the scene: so is its outcome then."""
+        """Return the scene at a factor; a NaN factor marks an unknown scene, whose outcome is NaN too."""
         return block, scaled(motion, jnp.exp(z))
 
     def unit(self, block, motion):

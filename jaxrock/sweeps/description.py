@@ -63,8 +63,10 @@ class Description:
         metadata: dict,
         marks: dict[str, dict[str, dict]],
     ) -> "Description":
-        """From names of axes, results with their types, and what Zarr says of every array; `marks`: attributes of
-        arrays in an unfinished store and in a finished one."""
+        """Make a description from names of axes, results with their types, and Zarr's metadata of every array.
+
+        `marks`: attributes of arrays in an unfinished store and in a finished one.
+        """
         about = {"axes": axes, "results": results, "block": block, "made_by": made_by, "marks": marks}
         return cls._of(about, metadata)
 
@@ -91,12 +93,15 @@ class Description:
 
     @functools.cached_property
     def checksum(self) -> str:
-        """Checksum of the description while the store is unfinished, which tells it from others, finished too."""
+        """Checksum of the unfinished store's description, which identifies the store in either state."""
         return self.marked(_UNFINISHED).root["attributes"][_CHECKSUM]
 
     def marked(self, state: str) -> "Description":
-        """Return the description of the store in a state: "unfinished", where arrays tell what stands for missing
-        values, or "finished", where none is missing. A store without marks has one description."""
+        """Return the description of the store in a state: "unfinished" or "finished".
+
+        An unfinished store marks the fill value of missing values; a finished one has none. A store without marks has
+        one description.
+        """
         about, metadata = self.about, dict(self.metadata)
         if not about.get("marks"):
             return self
@@ -110,12 +115,12 @@ class Description:
         return {name: self.root for name in TWINS} | {f"{name}/zarr.json": said for name, said in self.metadata.items()}
 
     def damaged(self, path: Path) -> list[Path]:
-        """List the files that do not say what they should, in either state: a session may end between two of them."""
+        """List the files that differ from the description in both states: a session may end between two of them."""
         states = [self.marked(state).files() for state in (_UNFINISHED, _FINISHED)]
         return [path / name for name in states[0] if _read(path / name) not in [files[name] for files in states]]
 
     def write(self, path: Path) -> None:
-        """Write the files that do not say what they should in this state."""
+        """Write the files that differ from the description in this state."""
         for name, said in self.files().items():
             file = path / name
             if _read(file) == said:

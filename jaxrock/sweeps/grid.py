@@ -96,8 +96,8 @@ class Grid(eqx.Module):
           number as it is, in its own type.
 
         **Raises:** ValueError for another ending, for object stores (`s3://...`), and for results with names that files
-        cannot have; FileExistsError; OSError where it cannot be written, on a full disk, say: then nothing is left of
-        it; ImportError without xarray, h5netcdf or zarr.
+        cannot have; FileExistsError; OSError where it cannot be written, such as on a full disk, without leaving a part
+        of it; ImportError without xarray, h5netcdf or zarr.
         """
         write = {".nc": self._to_netcdf, ".zarr": self._to_zarr}
         path = local("path", path)
@@ -173,7 +173,7 @@ def known_again(example: Callable[[], Any]) -> None:
 
 
 def _in_order(values: np.ndarray) -> np.ndarray:
-    """Values in this machine's order of bytes, as a store has them."""
+    """Return values in this machine's byte order, as stores have them."""
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 

@@ -90,7 +90,7 @@ class Runner:
         if self._mesh.size == 1:
             return np.asarray(dealt)
         begin = device * self._layout[1]
-        if dealt.size == 0:  # JAX deals no empty array out
+        if dealt.size == 0:  # JAX cannot shard an empty array
             return np.asarray(dealt)[begin : begin + self._layout[1]]
         (shard,) = (x for x in dealt.addressable_shards if (x.index[0].start or 0) == begin)
         return np.asarray(shard.data)

@@ -101,7 +101,7 @@ class Store:
         return damaged + [self.path / name for name in lost]
 
     def mark(self, state: str) -> None:
-        """Tell other readers that the store is "unfinished", so values may be missing, or "finished"."""
+        """Mark the store as "unfinished" for other readers, with values that may be missing, or as "finished"."""
         self._description = self._description.marked(state)
         self._description.write(self.path)
 
@@ -276,8 +276,11 @@ def create(
     *,
     whole: bool = False,
 ) -> Store:
-    """Make a store of which no block is done. `leaves`: results by name, as of one point; `words`: what the numbers of
-    axes stand for; `whole`: all blocks are written before anybody reads it."""
+    """Make a store in which no block is done.
+
+    `leaves`: results by name, as of one point; `words`: labels of the numbers of axes; `whole`: all blocks are written
+    before the store is read.
+    """
     zarr = needed("zarr")
     for name, values in (axes | leaves).items():
         if np.dtype(values.dtype).kind not in ("iuf" if name in axes else "biufc"):

@@ -217,8 +217,10 @@ def _axis(name: str, values: ArrayLike | Sequence) -> np.ndarray:
 
 
 def _check_size(name: str, given: np.ndarray, found: np.ndarray) -> None:
-    """Refuse numbers that are infinite or zero in the precision of the session, and were not; processors take what is
-    below the least normal number as zero."""
+    """Refuse numbers that become infinite or zero in the precision of the session.
+
+    Processors take subnormal numbers as zero.
+    """
     known = np.finfo(found.dtype)
     bad = (np.isinf(found) & ~np.isinf(given)) | ((np.abs(found) < known.tiny) & (given != 0))
     if bad.any():
@@ -310,7 +312,7 @@ def compute(
             else:
                 for leaf, part in zip(results, leaves):
                     leaf[place] = part
-    with all_or_none():  # all processes have written theirs
+    with all_or_none():  # wait until all processes have written their blocks
         if store and own == 0:
             _mark(store, "finished")
     if count > 1 and not store:
@@ -336,7 +338,7 @@ def _mark(store: Store, state: str) -> None:
 
 
 def _kept(store: Store, write: Callable, *given) -> None:
-    """Write to a store, or say that what is finished stays."""
+    """Write to a store; an error says that finished blocks are kept."""
     try:
         uninterrupted(write, *given)
     except OSError as error:

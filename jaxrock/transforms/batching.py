@@ -13,12 +13,12 @@ Which way `Lanes.__call__` takes:
                                   chunks of _NATIVE_LANES where       anew; careful what it postpones
                                   scenes have lists of their own
 
-On accelerators XLA's chunks have _WIDE lanes. Of a number of scenes that an exported program leaves open
-(`jax.export.symbolic_shape`) all are careful, in chunks of _LANES on CPUs, and at once elsewhere. *Careful* is the
-function as it was given, *quick* a part of its `Passes`. Machine code (`Lanes.in_machine_code`) is for the CPU of this
-process, where llvmlite is: not for what users export, nor for functions that do not ask for it (`in_lanes`: flexible
-columns and whole histories do not), nor for programs of operations that `native` does not know. Whether a program is
-traced at all, or was kept, is told by `lowering`.
+On accelerators XLA's chunks have _WIDE lanes. Exported batches of symbolic size (`jax.export.symbolic_shape`) are all
+careful, in chunks of _LANES on CPUs, and at once elsewhere. *Careful* is the function as given, *quick* a part of its
+`Passes`. Machine code (`Lanes.in_machine_code`) needs llvmlite, and runs on the CPU of this process. Exported programs
+have none, nor have functions that do not ask for it (`in_lanes`: flexible columns and whole histories do not), nor
+programs with operations that `native` does not know. `lowering` decides whether to trace a program or to reuse a kept
+one.
 """
 
 import functools
@@ -236,7 +236,7 @@ class Lanes:
 
     def _chunked(self, function: Callable, leaves, most: int = _LANES):
         """`function` of leaves with a leading axis, in chunks; the last is filled up with its last scene."""
-        size = self.size  # there is one: a single scene is not cut
+        size = self.size  # a single scene is not chunked
         lanes = self._width(most, size)
         chunks = -(-size // lanes)
 

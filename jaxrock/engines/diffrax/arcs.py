@@ -1,12 +1,16 @@
 """The diffrax engine: one `diffrax.diffeqsolve` for each smooth arc of a rocking block.
 
-An arc runs from one event to the next: impact, turning point, velocity extremum, saddle crossing, certain loss,
-an angle at which the moments bend, a knot of the motion. All are roots of one function, the smallest of a few guards
-that are positive at first. A guard that starts at zero (the opening angle after an impact, the velocity after a turning
-point) is divided by the power of time with which it leaves zero, so that a hop of any size is seen and its start is not
-an event. The signs of velocity and acceleration are guards too, so that a dip through the ground inside one step cannot
-hide: it needs a turning point. Knots and bends end arcs, so that the right-hand side of every solve is smooth: a step
-across a jump of its derivative keeps values within the tolerance, but not slopes.
+An arc runs from one event to the next: impact, turning point, velocity extremum, saddle crossing, certain loss, an
+angle at which the moments bend, a knot of the motion. All events are roots of one function, the smallest of a few
+guards that are positive at first.
+
+A guard may start at zero, as the opening angle after an impact and the velocity after a turning point do. It is divided
+by the power of time with which it leaves zero: a hop of any size is seen, and its start is no event. The signs of
+velocity and acceleration are guards too. A dip through the ground inside one step cannot hide, because it needs a
+turning point.
+
+Knots and bends end arcs, so that the right-hand side of every solve is smooth. A step across a jump of its derivative
+keeps values within the tolerance, but not slopes.
 """
 
 from collections.abc import Callable
@@ -146,7 +150,8 @@ class Diffrax(AbstractEngine):
     def budget(self, scene: Scene, history: bool) -> int:
         """Largest number of solves."""
         usual = POLICY.solves + 4 * scene.most_pieces
-        # From impact to impact it is four arcs or so, and passes twice where the moments bend; a history keeps all.
+        # Between impacts there are about four arcs, plus two passes of each bend; a history stores every arc, so its
+        # bound is lower.
         return self.max_solves or usual + scene.moments.bends * (64 if history else usual // 2)
 
     def loop(self, unfinished: Callable, step: Callable, carry: PyTree, budget: int) -> PyTree:

@@ -85,11 +85,11 @@ class Forcing(eqx.Module):
 
 
 def is_hop(stepper: AbstractStepper, state: State, arc: "Arc") -> Flag:
-    """Whether a block that leaves the ground comes back at once, without a peak or a speed that matters.
+    """Return whether a block that leaves the ground comes back at once, without a peak or a speed that matters.
 
-    From the ground at speed v under a deceleration a it flies for 2 v/a. Where the deceleration changes by less
-    than a/2 within twice that time, it stays between a/2 and 3 a/2: the hop is not higher than v^2/a and not
-    faster than 2 v.
+    From the ground at speed v under a deceleration a it flies for 2 v/a. Let the deceleration change by less than a/2
+    within twice that time: it stays between a/2 and 3 a/2. Then the hop is not higher than v^2/a and not faster than 2
+    v.
     """
     moments, v, forcing, acceleration = stepper.scene.moments, state.velocity, arc.forcing, arc.start_acceleration
     back = jnp.where(acceleration < 0, -acceleration, 1.0)
@@ -120,7 +120,7 @@ class Arc(eqx.Module):
     helpful: tuple[Scalar, Scalar | None]  # forcing and weight still to come that help it most
     hop: Flag  # too small for its turning point to matter, and certain to come back
     flat: Flag  # whether a rotation of pi/2 ends it
-    bend: Scalar | None  # opening angle at which its moments would bend; None: they are smooth everywhere
+    bend: Scalar | None  # next opening angle at which the moments bend; None: they are smooth everywhere
 
     @classmethod
     def of(cls, scene: Scene, start: State | Node, forcing: Forcing, history: bool) -> "Arc":
@@ -170,14 +170,15 @@ class Arc(eqx.Module):
         return self.leaving & (self.start_acceleration == 0) & ((self.start_jerk <= 0) | nothing)
 
     def guards(self, time: Scalar, y: Pair) -> Inexact[Array, "guards"]:
-        """One for every event, in the order of `Events`, one for certain loss, and one where its moments bend: the
-        first at zero ends the arc. All start above zero."""
+        """Return one guard for every event, in the order of `Events`, then certain loss, then the bend of the moments.
+        All start above zero; the first at zero ends the arc."""
         jets = [self.opening, self.velocity, self.start_acceleration, self.start_jerk]  # derivatives at the start
         # The acceleration has to be past zero by more than rounding, so that no extremum is met twice.
         rises = jnp.where(self.start_acceleration == 0, self.start_jerk >= 0, self.start_acceleration > 0)
         most = self.noise / (_NOISE * jnp.finfo(self.noise.dtype).eps)
         directed = jnp.where(rises, 1.0, -1.0) * self.acceleration(time, y) + self.noise
-        # From the saddle on it is first so little beyond that rounding decides; an end of a piece may be near there.
+        # Just beyond the saddle rounding decides the sign of the gap, also where a piece of the moments ends near
+        # there.
         beyond = True if self.bend is None else (self.gap(self.opening) != 0) | (self.gap(y[0]) != 0)
         guards = Events(
             impact=_guard(time, y[0], [jets[0], jets[1], jets[2] / 2, jets[3] / 6], True),
@@ -202,8 +203,8 @@ class Arc(eqx.Module):
 
 
 def _smooth(moments: AbstractMoments, start: State | Node, forcing: Forcing) -> tuple[AbstractMoments, Scalar | None]:
-    """The moments of an arc, which are smooth, and where they would bend. A turning point ends an arc: it goes outward
-    all the way, or inward."""
+    """Return the smooth moments that act on an arc, and the angle at which they bend. A turning point ends an arc, so
+    its rotation is monotone."""
     if not moments.bends:
         return moments, None
     acceleration, weight = forcing(jnp.zeros_like(start.opening))
@@ -230,10 +231,10 @@ def field(t, y, args: Arc):
 
 
 def field_of_trials(t, y, args: Arc):
-    """The right-hand side for an implicit solver, without derivatives where it is not finite.
+    """Return the right-hand side for an implicit solver, with zero derivatives where it is not finite.
 
-    A trial of its root finder may leave the domain of a user's equation. The step is rejected then, but JAX
-    differentiates it, and lineax raises for a linear equation that is not finite, in all scenes of a batch.
+    A trial of the root finder may leave the domain of a user's equation. The solver rejects that step, but JAX
+    differentiates it. Lineax then raises for a linear system that is not finite, in all scenes of a batch.
     """
     found = args.flow(t, y)
     return still_where(~jnp.isfinite(found).all(), found)

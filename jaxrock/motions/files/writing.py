@@ -56,8 +56,7 @@ def write_csv(record: Record, path: str | os.PathLike, unit: Annotated[str, word
       title of its column, where `read_record` finds it.
 
     **Raises:** OSError if the file cannot be written; ValueError for arguments of other kinds, for a record of one
-    sample, which has no second time to tell the step by, and for a name that would be read as a header ("NPTS= 5, DT=
-    .1").
+    sample, which has no step between times, and for a name that reads as a header ("NPTS= 5, DT= .1").
     """
     check_single(record=record)
     samples, step = np.asarray(record.samples, float) * PER_G[unit], as_meant(record.dt)
