@@ -103,6 +103,7 @@ class SkippedTests:
             self.skipped.append(report.nodeid)
 
     def pytest_sessionfinish(self, session):
-        """Cache the skipped tests; workers of xdist leave that to the process that started them."""
-        if not hasattr(session.config, "workerinput"):
-            session.config.cache.set(CACHED, sorted(set(self.skipped)))
+        """Keep what was skipped, if pytest has a cache; workers of xdist leave it to the process that started them."""
+        cache = getattr(session.config, "cache", None)
+        if cache is not None and not hasattr(session.config, "workerinput"):
+            cache.set(CACHED, sorted(set(self.skipped)))
