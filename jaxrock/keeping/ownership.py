@@ -129,15 +129,20 @@ def _lets_others_rename(about: os.stat_result) -> bool:
 
 
 def _is_group_of_one(group: int) -> bool:
-    """Return whether a group is the user's own, of which no other is a member."""
+    """Return whether a group is the user's own, to which no other belongs."""
     import grp
     import pwd
 
     try:
-        user = pwd.getpwuid(os.geteuid())
-        return group == user.pw_gid and set(grp.getgrgid(group).gr_mem) <= {user.pw_name}
+        user, own = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
     except KeyError:  # a container that knows no names
         return False
+    if group != user.pw_gid or not set(own.gr_mem) <= {user.pw_name}:
+        return False
+    # A group that does not bear the user's name may be the first one of all users, who are no members by name then.
+    return own.gr_name == user.pw_name or [each.pw_name for each in pwd.getpwall() if each.pw_gid == group] == [
+        user.pw_name
+    ]
 
 
 def _is_trusted(owner: int) -> bool:
