@@ -165,6 +165,13 @@ def test_a_parent_that_a_group_may_write(place, monkeypatch, members, name, user
     assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
 
 
+def test_nothing_is_kept_in_what_is_no_folder(monkeypatch):
+    """There is nothing to warn of, although all users may write in it."""
+    monkeypatch.setenv("JAXROCK_CACHE", os.devnull)
+    folder.write("machine", NAME, b"content")
+    assert folder.read("machine", NAME) is None
+
+
 def test_a_parent_of_another_user(place, give_away):
     give_away(place.parent)
     assert refused("of the user, on the way to them, belongs to another user")
