@@ -7,6 +7,8 @@ from typing import Any
 
 import jax
 
+_NOT_OF_USERS = (__name__.split(".")[0], "equinox", "jax", "functools", "contextlib")
+
 
 def setting(name: str) -> Any:
     """A setting of JAX, which declares none of them to type checkers."""
@@ -29,8 +31,8 @@ def _say() -> None:
 
 
 def frames_of_the_package() -> int:
-    """Count the frames of the package above the caller; the next frame is the user's."""
+    """Count the frames between the caller and the user's line: the package's, and those of libraries that call it."""
     frame, count = sys._getframe(1), 0
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _NOT_OF_USERS:
         frame, count = frame.f_back, count + 1
     return count

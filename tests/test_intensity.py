@@ -336,6 +336,24 @@ def test_mean_period_of_few_samples_a_second():
     assert rk.intensity.mean_period(record) == pytest.approx(rk.intensity.mean_period(finer), rel=1e-5)
 
 
+@pytest.mark.parametrize("samples", [[1.0, -0.5, 0.8], [0.3, 0.3, 0.3, 0.3], [-0.2, 0.9, 0.1, -0.7, 1.0]])
+@pytest.mark.parametrize("step", [0.03, 0.4, 1.5])
+def test_mean_period_of_a_record_that_begins_and_ends_with_a_jump(samples, step):
+    """Its transform in closed form, by parts: jumps at the ends, and a corner at every sample."""
+    times, slopes = step * np.arange(len(samples)), np.diff(samples) / step
+    corners = np.diff(np.concatenate([[0.0], slopes, [0.0]]))
+
+    def power(f):
+        turn = 2j * np.pi * f
+        turned = np.exp(-turn * times)
+        jumps = samples[0] - samples[-1] * turned[-1]
+        return abs(jumps / turn + corners @ turned / turn**2) ** 2
+
+    below = quad(power, 0.25, 20, limit=2000)[0]
+    above = quad(lambda f: power(f) / f, 0.25, 20, limit=2000)[0]
+    assert rk.intensity.mean_period(rk.Record(samples, step)) == pytest.approx(above / below, rel=1e-5)
+
+
 def test_mean_period_of_a_long_sine():
     record = rk.Record(np.sin(2 * np.pi * np.arange(40_000) * 0.005 / 0.5), 0.005)
     assert rk.intensity.mean_period(record) == pytest.approx(0.5, rel=3e-3)

@@ -136,22 +136,42 @@ def test_a_parent_writable_by_others(place, bits, good):
 
 
 @pytest.mark.parametrize(
-    "members, primary, good",
-    [([], True, True), (["me"], True, True), (["me", "you"], True, False), ([], False, False)],
+    "members, name, users, good",
+    [
+        ([], "me", {}, True),
+        (["me"], "me", {}, True),
+        (["me", "you"], "me", {}, False),
+        ([], "me", {"me": 1}, False),
+        ([], "users", {"me": 0}, True),
+        ([], "users", {"me": 0, "you": 0}, False),
+        ([], "users", {}, False),
+    ],
+    ids=["by name", "a member", "two members", "not the first", "alone in it", "the first of two", "not listed"],
 )
-def test_a_parent_that_a_group_may_write(place, monkeypatch, members, primary, good):
-    """A parent is safe where the group is the user's own; many systems make folders so."""
+def test_a_parent_that_a_group_may_write(place, monkeypatch, members, name, users, good):
+    """A parent is safe where no other user belongs to the group; many systems make folders so.
+
+    `users` gives the first group of every user that the system knows; those are no members by name.
+    """
     import grp
     import pwd
     from types import SimpleNamespace
 
     group = place.parent.stat().st_gid
-    monkeypatch.setattr(
-        pwd, "getpwuid", lambda _: SimpleNamespace(pw_name="me", pw_gid=group if primary else group + 1)
-    )
-    monkeypatch.setattr(grp, "getgrgid", lambda _: SimpleNamespace(gr_mem=members))
+    known = [SimpleNamespace(pw_name=user, pw_gid=group + off) for user, off in users.items()]
+    me = next((user for user in known if user.pw_name == "me"), SimpleNamespace(pw_name="me", pw_gid=group))
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: me)
+    monkeypatch.setattr(pwd, "getpwall", lambda: known)
+    monkeypatch.setattr(grp, "getgrgid", lambda _: SimpleNamespace(gr_mem=members, gr_name=name))
     place.parent.chmod(0o775)
     assert folder.read("machine", NAME) == b"content" if good else refused("others may write in .*of the user")
+
+
+def test_nothing_is_kept_in_what_is_no_folder(monkeypatch):
+    """There is nothing to warn of, although all users may write in it."""
+    monkeypatch.setenv("JAXROCK_CACHE", os.devnull)
+    folder.write("machine", NAME, b"content")
+    assert folder.read("machine", NAME) is None
 
 
 def test_a_parent_of_another_user(place, give_away):

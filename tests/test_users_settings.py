@@ -241,3 +241,27 @@ def test_a_batch_of_symbolic_size_is_exported(name):
         assert found.shape == (count,)
         np.testing.assert_allclose(found[:3], one_by_one, rtol=1e-12)
         np.testing.assert_allclose(found, function(amplitude), rtol=1e-11)
+
+
+DOUBTFUL = """import jax; jax.config.update("jax_enable_x64", True); import jaxrock as rk
+steady = rk.Record([0.1] * 200, 0.01)
+rk.Record([0.0, 5.0, 0.0], 0.01)
+rk.intensity.peak_velocity(steady)
+rk.intensity.peak_displacement(steady)
+rk.hazard.suite_outcomes(rk.Block(0.2, 2.0), [steady, steady], 1.0, progress=False)
+"""
+
+
+def test_a_warning_names_the_line_of_the_user(tmp_path):
+    """Not one of the package, nor of the libraries by which it is called."""
+    file = tmp_path / "script.py"
+    file.write_text(DOUBTFUL)
+    done = subprocess.run(
+        [sys.executable, str(file)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    told = [line.split(":")[:2] for line in done.stderr.splitlines() if "UserWarning" in line]
+    assert done.returncode == 0 and told == [[str(file), str(line)] for line in (3, 4, 5, 6)]

@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 
+from jaxrock._precision import frames_of_the_package
 from jaxrock.blocks.edge import Edge, fitted_edge
 
 _SMOOTH = 0.2  # of the longest arm of the weight, by which a smooth edge may differ from the faces of a mesh
@@ -52,7 +53,7 @@ def rounded_edge(points: np.ndarray, corner: np.ndarray, height: float, knots: i
         warnings.warn(
             f"The base is made of faces: on a smooth edge the arm of the weight is up to {off:.3g} m off, of "
             f"{own.max():.3g} m. See also what bounds it, by `base` of `AsymmetricBlock.from_mesh`.",
-            stacklevel=4,
+            stacklevel=frames_of_the_package() + 1,
         )
     return found
 

@@ -11,6 +11,7 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxrock._arguments import arguments, at_least, word_of
 from jaxrock._checks import Values, direction, finite, positive, scalar
+from jaxrock._precision import frames_of_the_package
 from jaxrock.blocks.base import arms_of, rolled, rounded_edge
 from jaxrock.blocks.edge import Edge
 from jaxrock.blocks.mesh import surface_of
@@ -213,7 +214,7 @@ def section_of(mesh: Any, azimuth: ArrayLike, base: str, plane: str, unit: str, 
             f"The base is rounded: the rock rolls on before it is in balance, at {ends[0]:.3g} rad if it rocked about "
             f"the ground it stands on, at {ends[1]:.3g} rad if about where it rolls to. See both, with `base`; or let "
             "it roll, by the model `jaxrock.models.Rolling(*rock.edges(azimuth))`.",
-            stacklevel=4,
+            stacklevel=frames_of_the_package() + 1,
         )
     return found
 

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int8
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import Values, checked, positive, shown
 from jaxrock._parameters import leaves_of
+from jaxrock._precision import frames_of_the_package
 from jaxrock._settings import called_by_users
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -186,7 +187,10 @@ def suite_outcomes(
     suite = motions if isinstance(motions, Suite) else Suite(motions)
     twice = repeated(suite)
     if twice:
-        warnings.warn(f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.", stacklevel=3)
+        warnings.warn(
+            f"Motions {twice[0]!r} and {twice[1]!r} are the same: what they do counts twice.",
+            stacklevel=frames_of_the_package() + 1,
+        )
     strongest = float(np.max(suite.peak_acceleration))
     checked("scale", scales, "keep all motions at 1e9 g or below", lambda x: x * strongest <= 1e9)
     blocks, ways = stacked(block), FACINGS[facing]

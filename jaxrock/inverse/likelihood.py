@@ -177,6 +177,7 @@ class Likelihood(eqx.Module):
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
 
+    @called_by_users
     def survival_error(self, values: Mapping[str, ArrayLike]) -> Real:
         """Estimate the standard error of `survival` by its quadrature, (..., rocks).
 
@@ -186,6 +187,7 @@ class Likelihood(eqx.Module):
         found = [np.asarray(each.survival(values)) for each in self.drawn()]
         return placed(np.std(found, axis=0, ddof=1))
 
+    @called_by_users
     def drawn(self) -> list["Likelihood"]:
         """Return likelihoods by other quadratures with as many nodes at random places; they scatter by their errors."""
         draws = (self.quadrature.drawn(seed) for seed in range(_DRAWS))

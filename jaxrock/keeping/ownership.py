@@ -33,6 +33,8 @@ def private(*folders: Path, make: bool = False) -> bool:
     """
     try:
         there = next(each for each in folders[0].absolute().parents if each.exists())
+        if not there.is_dir():  # JAXROCK_CACHE=/dev/null means that nothing is to be kept
+            return False
         found = _parent_at_risk(there)  # checked before anything is made below a folder that another user planted
         if found is None and make:
             _make(folders[-1])
@@ -134,10 +136,15 @@ def _is_group_of_one(group: int) -> bool:
     import pwd
 
     try:
-        user = pwd.getpwuid(os.geteuid())
-        return group == user.pw_gid and set(grp.getgrgid(group).gr_mem) <= {user.pw_name}
+        user, own = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
     except KeyError:  # a container may know no names
         return False
+    if group != user.pw_gid or not set(own.gr_mem) <= {user.pw_name}:
+        return False
+    # A group that does not bear the user's name may be the first one of all users, who are no members by name then.
+    return own.gr_name == user.pw_name or [each.pw_name for each in pwd.getpwall() if each.pw_gid == group] == [
+        user.pw_name
+    ]
 
 
 def _is_trusted(owner: int) -> bool:

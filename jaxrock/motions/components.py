@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike
 from jaxrock._arguments import arguments, list_of, word_of
 from jaxrock._checks import direction, one_program, scalar, shown
 from jaxrock._described import described
+from jaxrock._precision import frames_of_the_package
 from jaxrock._settings import called_by_users
 from jaxrock.motions.files.parsing import PER_G
 from jaxrock.motions.files.reading import component_columns, read_record
@@ -158,7 +159,7 @@ def _together(name: str, records: list[Record]) -> Components:
         warnings.warn(
             f"The vertical component says {vertical.origin.component!r}, and is taken as it stands, positive upward: "
             "if its numbers are positive downward, take `Components(first, second, processing.scaled(vertical, -1))`.",
-            stacklevel=4,
+            stacklevel=frames_of_the_package() + 1,
         )
     first, second = records
     return Components(first, second, vertical)

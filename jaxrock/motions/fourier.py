@@ -37,6 +37,8 @@ def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[floa
     shocks = _shocks(lines)
     if not shocks:
         return 0.0, 0.0
+    from scipy.integrate import simpson
+
     longest = max(shock.length for shock in shocks)
     fine = _FINE if longest / min(map(_step, shocks)) < _MANY else 1
     apart = min(_APART, 1 / (2 * fine * longest))
@@ -45,7 +47,7 @@ def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[floa
     amplitudes = [_amplitudes(shock, grid) for shock in shocks]
     for number, (shock, one) in enumerate(zip(shocks, amplitudes)):
         power = np.abs(one) ** 2
-        found += [np.trapezoid(power, grid), np.trapezoid(power / grid, grid)]
+        found += [simpson(power, x=grid), simpson(power / grid, x=grid)]
         for earlier, other in zip(shocks[:number], amplitudes):
             both = 2 * one * other.conj()
             found += _between(np.stack([both, both / grid]), grid, shock.middle - earlier.middle)
@@ -72,7 +74,8 @@ def _step(shock: _Shock) -> float:
     joined = np.allclose(shock.lines.begin[1:], shock.lines.end[:-1], rtol=1e-9, atol=0)
     if length.size > 1 and joined and np.ptp(length) <= 1e-6 * length.max():
         return float(length.mean())
-    return max(min(_SHORT, shock.length / 1000, 8 * float(length.max())), shock.length / _MOST)
+    step = max(min(_SHORT, shock.length / 1000, 8 * float(length.max())), shock.length / _MOST)
+    return shock.length / np.ceil(shock.length / step)  # its end is one of the times
 
 
 def _amplitudes(shock: _Shock, grid: np.ndarray) -> np.ndarray:
@@ -87,7 +90,11 @@ def _amplitudes(shock: _Shock, grid: np.ndarray) -> np.ndarray:
 
     sums = zoom_fft(samples, [grid[0], grid[-1]], grid.size, fs=1 / step, endpoint=True)
     # Transform of straight lines between samples: that of the samples, periodic in their rate, times a squared sinc.
-    return step * sums * np.sinc(grid * step) ** 2 * np.exp(1j * np.pi * grid * shock.length)
+    whole = step * sums * np.sinc(grid * step) ** 2
+    # Half of the first and of the last sample lie in lines beyond the ends: they belong within.
+    moved = (1 - np.sinc(2 * grid * step)) / (2j * np.pi * grid)
+    ends = lines.begin[0] - lines.end[-1] * np.exp(-2j * np.pi * grid * time[-1])
+    return (whole + moved * ends) * np.exp(1j * np.pi * grid * shock.length)
 
 
 def _between(values: np.ndarray, grid: np.ndarray, later: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, below_one, check_known, checked, inner_share, is_traced, scalar
 from jaxrock._parameters import check_single
+from jaxrock._precision import frames_of_the_package
 from jaxrock.blocks.rigid import GRAVITY, Block
 from jaxrock.motions.fourier import squared_amplitudes
 from jaxrock.motions.motion import AbstractMotion
@@ -80,7 +81,10 @@ def _is_long(motion: AbstractMotion) -> bool:
 
 def _warn_of_drift(motion: AbstractMotion, how: str) -> None:
     name = motion.name if isinstance(motion, Record) and motion.name else "a record"
-    warnings.warn(f"The ground of {name} {how}: its baseline drifts. See `jaxrock.processing`.", stacklevel=4)
+    warnings.warn(
+        f"The ground of {name} {how}: its baseline drifts. See `jaxrock.processing`.",
+        stacklevel=frames_of_the_package() + 1,
+    )
 
 
 @arguments

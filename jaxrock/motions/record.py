@@ -15,6 +15,7 @@ from jaxrock._arguments import arguments
 from jaxrock._checks import Values, is_traced, not_negative, of_each, placed, size, strength, with_throw
 from jaxrock._label import Label
 from jaxrock._parameters import parameter
+from jaxrock._precision import frames_of_the_package
 from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
 from jaxrock.motions.pieces import Lasting
 from jaxrock.numerics.choice import where
@@ -166,7 +167,7 @@ def _warn_of_unit(samples: np.ndarray, name: str) -> None:
             f"{f'Record {name!r}' if name else 'A record'} peaks at {peak:.4g} g. If its samples are in {unit}, divide "
             f"them by {per_g}: it then peaks at {peak / per_g:.3g} g.",
             UserWarning,
-            stacklevel=7,
+            stacklevel=frames_of_the_package() + 1,
         )
 
 

@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike, Float, Int8
 from jaxrock._arguments import arguments
 from jaxrock._checks import Values, direction, placed, scalar, shown
 from jaxrock._parameters import check_single, shared
+from jaxrock._precision import frames_of_the_package
 from jaxrock._progress import Progress
 from jaxrock._tables import AbstractTable, Column
 from jaxrock.blocks.asymmetric import AsymmetricBlock
@@ -122,7 +123,7 @@ def _blocks(rock: Rock | Callable, angles: np.ndarray) -> Block | AsymmetricBloc
         warnings.warn(
             "The base is rounded: the rock is taken to rock about the outermost points of the ground it stands on, as "
             "`Rock.section` has it by default. A function of the azimuth can take another block.",
-            stacklevel=4,
+            stacklevel=frames_of_the_package() + 1,
         )
     found = [_in_plane(rock, float(angle)) for angle in angles]
     for block in found:

@@ -21,6 +21,7 @@ from jaxrock._arguments import arguments, at_least
 from jaxrock._aside import uninterrupted
 from jaxrock._checks import check_unmasked, is_traced, native, placed, shown
 from jaxrock._named import AbstractNamed
+from jaxrock._precision import frames_of_the_package
 from jaxrock._progress import Progress
 from jaxrock._tables import needed
 from jaxrock.sweeps.description import fingerprint
@@ -183,7 +184,8 @@ def _there(store: Store) -> np.ndarray:
         damaged += [file for number in others if own == 0 for file in store.look(int(number))[1]]
         if own == 0 and (files := store.mended + damaged):
             warnings.warn(
-                f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.", stacklevel=4
+                f"The store {store.path} is damaged: {listed(files)}. What these held is computed again.",
+                stacklevel=frames_of_the_package() + 1,
             )
     return found == 1
 

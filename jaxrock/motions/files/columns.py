@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxrock._precision import frames_of_the_package
 from jaxrock._text import check_end, file_error
 from jaxrock.motions.files.format import AbstractFormat, Accelerogram
 from jaxrock.motions.files.parsing import LIKE_DATA, NUMBER, agreed_step, agreed_unit, to_float
@@ -88,7 +89,10 @@ def _step_of(name: str, titles: Titles, times: np.ndarray, numbers, printed, dt:
     step = agreed_step(name, dt, float(f"{factor * _step(name, times, numbers, printed):.12g}"))
     if dt is None and not stated and step > _LONG_STEP:
         told = f"File `{name}` does not say in what its times are: taken for seconds, the time step is {step:g} s"
-        warnings.warn(f"{told}, long for accelerations. Are they in ms? A title `time [ms]` says so.", stacklevel=5)
+        warnings.warn(
+            f"{told}, long for accelerations. Are they in ms? A title `time [ms]` says so.",
+            stacklevel=frames_of_the_package() + 1,
+        )
     return step
 
 

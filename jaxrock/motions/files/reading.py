@@ -16,6 +16,7 @@ from jaxtyping import ArrayLike
 
 from jaxrock._arguments import arguments, at_least, path_of, word_of
 from jaxrock._checks import one_of, scalar, size
+from jaxrock._precision import frames_of_the_package
 from jaxrock._text import text_lines
 from jaxrock.motions.files.at2 import AT2
 from jaxrock.motions.files.columns import Columns
@@ -113,7 +114,10 @@ def _record(path: Path, kind: AbstractFormat, found: Accelerogram) -> Record:
     largest = np.abs(samples).max()
     if largest > STRONGEST:
         told = f"File `{path.name}` holds an acceleration of {largest:.4g} g, more than all but a few records"
-        warnings.warn(f"{told}: is its unit {found.unit}, and does no such number mark a gap?", stacklevel=4)
+        warnings.warn(
+            f"{told}: is its unit {found.unit}, and does no such number mark a gap?",
+            stacklevel=frames_of_the_package() + 1,
+        )
     origin = found.origin._replace(format=kind.name, unit=found.unit, file=path.name)
     return record_in_g(samples, found.dt, found.title or path.stem, origin)
 
