@@ -178,12 +178,14 @@ class Likelihood(eqx.Module):
         """Probability that each rock stands, (..., rocks), without derivatives."""
         return self._compiled(Likelihood._survival, values)
 
+    @called_by_users
     def survival_error(self, values: Mapping[str, ArrayLike]) -> Real:
         """Estimated standard error of `survival`, (..., rocks), which its quadrature leaves: from eight others with as
         many nodes at random places (Cranley & Patterson 1976). It costs as much as eight times `survival`."""
         found = [np.asarray(each.survival(values)) for each in self.drawn()]
         return placed(np.std(found, axis=0, ddof=1))
 
+    @called_by_users
     def drawn(self) -> list["Likelihood"]:
         """Likelihoods by other quadratures of as many nodes, at random places: they scatter by their errors."""
         draws = (self.quadrature.drawn(seed) for seed in range(_DRAWS))
