@@ -103,6 +103,10 @@ class SkippedTests:
             self.skipped.append(report.nodeid)
 
     def pytest_sessionfinish(self, session):
-        """Keep what was skipped; workers of xdist leave that to the process that started them."""
-        if not hasattr(session.config, "workerinput"):
-            session.config.cache.set(CACHED, sorted(set(self.skipped)))
+        """Keep what was skipped; workers of xdist leave that to the process that started them.
+
+        `-p no:cacheprovider` leaves pytest without a cache.
+        """
+        cache = getattr(session.config, "cache", None)
+        if cache is not None and not hasattr(session.config, "workerinput"):
+            cache.set(CACHED, sorted(set(self.skipped)))
