@@ -82,6 +82,16 @@ def test_a_skip_without_a_reason_is_a_failure(tmp_path, allowed):
     assert ("test_tests.py::test_away" in cached.read_text()) == allowed
 
 
+def test_pytest_without_a_cache(tmp_path):
+    (tmp_path / "conftest.py").write_text(CONFTEST.format(allowed=True))
+    (tmp_path / "pytest.ini").write_text("[pytest]")
+    (tmp_path / "test_tests.py").write_text("def test_nothing():\n    pass\n")
+    program = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
+    surroundings = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(program, cwd=tmp_path, env=surroundings, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stderr
+
+
 def packages_that_tests_need() -> dict[str, str]:
     """Return every optional package that a test is skipped for, with its file."""
     found = {}

@@ -195,6 +195,16 @@ def test_settings_are_those_of_the_caller_again():
         assert jax.config.jax_disable_jit
 
 
+def test_the_error_of_a_likelihood_is_estimated_where_every_transfer_is_forbidden():
+    rocks = rk.inverse.Observations([0.12], [2.0], ["toppled"], alpha_sd=[0.01])
+    likelihood = rk.inverse.Likelihood(rocks, rk.SinePulse)
+    values = {"amplitude": 0.3, "period": 0.8}
+    expected = np.asarray(likelihood.survival_error(values))
+    with jax.transfer_guard("disallow_explicit"):
+        found = likelihood.survival_error(values)
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_debug_nans_finds_the_users_own_and_passes_those_by_contract():
     with jax.debug_nans(True), jax.debug_infs(True):
         gone = rk.outcome(rk.Block(-1.0, 2.0, throw=False), PULSE, throw=False)

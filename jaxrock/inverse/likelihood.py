@@ -179,11 +179,9 @@ class Likelihood(eqx.Module):
 
     @called_by_users
     def survival_error(self, values: Mapping[str, ArrayLike]) -> Real:
-        """Estimate the standard error of `survival` by its quadrature, (..., rocks).
+        """Estimate the standard error of `survival` by its quadrature, (..., rocks), at eight times its cost.
 
-        Eight quadratures with as many nodes at random places give it (Cranley & Patterson 1976), at eight times the
-        cost of `survival`.
-        """
+        Eight quadratures with as many nodes at random places give it (Cranley & Patterson 1976)."""
         found = [np.asarray(each.survival(values)) for each in self.drawn()]
         return placed(np.std(found, axis=0, ddof=1))
 
