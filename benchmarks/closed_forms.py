@@ -22,7 +22,6 @@ import numpy as np  # noqa: E402
 from jaxrock.closed_form import sine_pulse, single_lobe  # noqa: E402
 
 POINTS, JUDGED = 1_000_000, 300
-BELOW = "\n## Before"
 
 
 def wall(duration, shape):
@@ -98,9 +97,7 @@ against the printed equation in 120 digits, or what the tests allow.
 """
     print("\n" + text)
     if "-" not in sys.argv[1:]:
-        page = Path(__file__).with_suffix(".md")
-        _, mark, below = page.read_text().partition(BELOW)
-        page.write_text(text + mark + below)
+        Path(__file__).with_suffix(".md").write_text(text)
 
 
 if __name__ == "__main__":

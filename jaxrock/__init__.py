@@ -19,7 +19,6 @@ from jaxrock import (
     responses as responses,
     studies as studies,
 )
-from jaxrock._moved import moved as _moved
 from jaxrock._parameters import parameter as parameter
 from jaxrock._surface import shown as _shown
 from jaxrock.blocks import restitution as restitution
@@ -86,7 +85,7 @@ if not _typing.TYPE_CHECKING:  # checkers know these names from above, and are t
             return _importlib.import_module(_LATER[name])
         if name == "Diffrax":
             return _importlib.import_module("jaxrock.engines.diffrax.arcs").Diffrax
-        return _moved(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 _NAMESPACES = """

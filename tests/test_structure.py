@@ -317,15 +317,9 @@ def test_a_namespace_offers_no_module_and_another_thing_by_one_name(space):
     assert own & modules <= {"restitution", "intensity"}
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["Observations", "HazardCurve", "Suite", "Outcome", "critical_durations", "peak_velocity", "Grid", "Equation"],
-)
-def test_old_names_say_where_they_are(name):
-    with pytest.warns(DeprecationWarning, match=rf"^`jaxrock.{name}` is `jaxrock.[a-z]+.{name}` now; ") as told:
-        old = getattr(jaxrock, name)
-    place = str(told[0].message).split("`")[3].removeprefix("jaxrock.")
-    assert old is operator.attrgetter(place)(jaxrock) and told[0].filename == __file__
+def test_an_unknown_name_raises():
+    with pytest.raises(AttributeError, match="^module 'jaxrock' has no attribute 'Observations'$"):
+        _ = jaxrock.Observations
 
 
 def test_importing_takes_little():
