@@ -1,7 +1,7 @@
-"""Ground motions: what each must tell the engines (`motion`), pulses, records, suites, files, measures of intensity.
+"""Ground motions: the interface to the engines (`motion`), pulses, records, suites, files and measures of intensity.
 
-Imports `numerics` and `blocks`. Start with `motion`; another pulse is a file in `pulses`, another format
-one in `files`.
+Imports `numerics` and `blocks`. Start with `motion`. A new pulse is a file in `pulses`, a new file format is one in
+`files`.
 """
 
 from jaxrock._surface import shown as _shown

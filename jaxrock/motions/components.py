@@ -1,4 +1,4 @@
-"""Components of one record: two horizontal ones, and the vertical one."""
+"""Components of one record: two horizontal ones, and perhaps a vertical one."""
 
 import os
 import re
@@ -23,11 +23,11 @@ from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.record import Record, record_in_g
 
 _DOWN = re.compile(r"\W*D((OW|W)?N)?\W*", re.IGNORECASE)
-# Of PEER also VRT, VT, V1, UPDN and 000V.
+# PEER also writes VRT, VT, V1, UPDN and 000V.
 _VERTICAL = re.compile(
     r"\W*(U(P|D|-D|P[-/ ]?(DN|DWN|DOWN))?\d?|D((OW|W)?N)?|\d*V(ER\w*|R?T)?\d?|..?Z|Z)\W*", re.IGNORECASE
 )
-# Azimuths, points of the compass, codes of SEED, words. Any other number of one or two digits is that of a channel.
+# Azimuths, points of the compass, SEED channel codes, words. Any other number of one or two digits is a channel number.
 _HORIZONTAL = re.compile(
     r"\W*(0|90|[0-2]\d\d|3[0-5]\d|360|\d{1,3} ?(°|DEG\w*)|[NS][-/ ]?(\d{1,2} ?(°|DEG)? ?)?[EW]|[NESW]"
     r"|N[-/ ]?S|S[-/ ]?N|E[-/ ]?W|W[-/ ]?E|(NORTH|EAST|SOUTH|WEST)\W*(NORTH|EAST|SOUTH|WEST)?|[A-Z][GHLN][NE]"
@@ -37,16 +37,16 @@ _HORIZONTAL = re.compile(
 
 
 class Components(eqx.Module):
-    """What one station recorded: two horizontal components at right angles, and perhaps the vertical one.
+    """Components recorded at one station: two horizontal ones at right angles, and perhaps the vertical one.
 
     **Arguments:**
 
     - `first`, `second`: `Record`s of one time step.
     - `vertical`: positive upward; None: there is none.
 
-    Of components that are not equally long the ends of the longer ones are cut off.
+    Components of different lengths are cut to the shortest one.
 
-    **Raises:** ValueError for components of different time steps, or that say that they began at different times.
+    **Raises:** ValueError for components of different time steps, or whose files state different start times.
     """
 
     __repr__ = described
@@ -74,7 +74,7 @@ class Components(eqx.Module):
 
     @arguments
     def along(self, angle: ArrayLike) -> Record:
-        """The horizontal component in one direction.
+        """Return the horizontal component in one direction.
 
         **Arguments:**
 
@@ -92,13 +92,13 @@ class Components(eqx.Module):
 
     @called_by_users
     def in_plane(self, angle: ArrayLike, vertical: bool) -> AbstractMotion:
-        """What shakes a block in one vertical plane: `along`, with the `vertical` component if that is wanted."""
+        """Return the motion of one vertical plane: `along` the angle, with the `vertical` component if it is wanted."""
         horizontal = self.along(angle)
         return horizontal.with_vertical(self.vertical) if vertical and self.vertical is not None else horizontal
 
 
 def is_vertical(record: Record) -> bool:
-    """Whether a record says that it is the vertical component."""
+    """Return whether the component code of a record names the vertical direction."""
     return bool(_VERTICAL.fullmatch(record.origin.component))
 
 
@@ -116,12 +116,12 @@ def read_components(
     **Arguments:**
 
     - `paths`: two or three files, one for each component; or one file that holds them all.
-    - `columns`: of one file, which of its columns or channels, two or three; None: the first three, or of text
-      all beside a first one of times.
+    - `columns`: the two or three columns or channels of a single file; None: the first three, or all columns of a text
+      file after a first column of times.
     - `given`: `format`, `dt` and `unit`, as in `read_record`.
 
-    Which component is vertical the files say (UP, UD, Z, ...); where they do not, it is the last of three, unless that
-    says it is horizontal (090, N-S, E, HNE, ...).
+    The files say which component is vertical (UP, UD, Z, ...). Where they do not, it is the last of three, unless that
+    one says that it is horizontal (090, N-S, E, HNE, ...).
 
     **Returns:** `Components`, the horizontal ones in the order of the files.
 
@@ -143,7 +143,7 @@ def read_components(
 
 
 def _together(name: str, records: list[Record]) -> Components:
-    """Two or three records as components: which is vertical they say, or else it is the last of three."""
+    """Combine two or three records into components; the vertical one names itself, or is the last of three."""
     upward = [k for k, record in enumerate(records) if is_vertical(record)]
     if len(upward) > 1 or len(records) == 2 and upward:
         said = [records[k].origin.component for k in upward]
@@ -167,21 +167,21 @@ def _together(name: str, records: list[Record]) -> Components:
 
 @arguments
 def components_of_stream(stream: Any, unit: Annotated[str, word_of(*PER_G)]) -> Components:
-    """The traces of one station in a stream of ObsPy, as components.
+    """Combine the traces of one station in an ObsPy stream into components.
 
     **Arguments:**
 
     - `stream`: an `obspy.Stream`, or a list, of two or three traces: one of each channel.
     - `unit`: as in `record_of_trace`.
 
-    **Returns:** `Components`, the horizontal ones in the order of the traces. Of a stream of many stations:
+    **Returns:** `Components`, the horizontal ones in the order of the traces. For a stream of many stations, write
     `[components_of_stream(stream.select(station=each), unit) for each in stations]`.
 
     **Raises:** as `record_of_trace` and `Components`; ValueError for another number of traces, for two stations, and
     for components as in `read_components`.
     """
     several = isinstance(stream, Iterable) and not isinstance(stream, (str, bytes))
-    several = several and getattr(stream, "shape", None) != ()  # as an array of one number has it
+    several = several and getattr(stream, "shape", None) != ()  # excludes a zero-dimensional array
     traces = list(stream) if several else []
     if len(traces) not in (2, 3):
         said = f"has {len(traces)}" if traces else f"is {shown(stream)}"

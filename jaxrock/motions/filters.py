@@ -1,6 +1,6 @@
-"""Butterworth filters of samples that continue beyond both ends: with rest, or mirrored for ever.
+"""Butterworth filters of samples that are extended beyond both ends: by zeros, or by periodic mirror images.
 
-NumPy and SciPy: `processing` uses them. No filter runs beyond the ends, however long it rings there.
+NumPy and SciPy only; `processing` uses them. No filter steps through an extension, however long its response rings.
 """
 
 from collections.abc import Callable
@@ -9,17 +9,17 @@ import numpy as np
 import scipy.fft
 import scipy.signal
 
-LOWEST = 1e-6  # corner over sampling rate: of lower ones coefficients of filters lose their digits, and at last all
+LOWEST = 1e-6  # corner over sampling rate: below it, rounding destroys the filter coefficients
 NARROWEST = 1e-6  # width of a band over its upper corner, for the same reason
 
 
 def smoothed(values: np.ndarray, dt: float, corner: float | None, order: int, beyond: Callable) -> np.ndarray:
-    """Pass values, which go on `beyond` both ends for ever, forwards and backwards through a low-pass (None: none)."""
+    """Apply a zero-phase low-pass (`corner` None: none) to values that `beyond` extends to a periodic signal."""
     return values if corner is None else beyond(values, lambda whole: _smoothed_period(whole, dt, corner, order))
 
 
 def _smoothed_period(whole: np.ndarray, dt: float, corner: float, order: int) -> np.ndarray:
-    """Pass a period of values, an even number of them, through the filter by its gain at each frequency."""
+    """Filter one period of values (an even number) by the squared Butterworth gain at each discrete frequency."""
     ratio = np.tan(np.pi * np.arange(whole.size // 2 + 1) / whole.size) / np.tan(np.pi * corner * dt)
     with np.errstate(over="ignore"):
         gain = 1 / (1 + ratio ** (2 * order))
@@ -27,22 +27,22 @@ def _smoothed_period(whole: np.ndarray, dt: float, corner: float, order: int) ->
 
 
 def evenly(values: np.ndarray, smooth: Callable) -> np.ndarray:
-    """Smooth values that are mirrored at both ends."""
+    """Smooth values that are extended evenly (mirrored) at both ends."""
     return smooth(np.concatenate([values, values[-2:0:-1]]))[: values.size]
 
 
-# What a ground at rest at first does, mirrored in time before it begins, and turned about its end after it. A mirror
-# image keeps the velocity at zero under a filter without delay; if the ground only rested before, it would jump.
+# The ground is at rest at first: its displacement is extended evenly before the beginning, and as an odd function about
+# the end. Even extension keeps the velocity at zero under a zero-phase filter; extension by rest would make it jump.
 
 
 def of_displacement(values: np.ndarray, smooth: Callable) -> np.ndarray:
-    """Smooth values that are mirrored at their beginning, and turned about their end."""
+    """Smooth values with an even extension at the beginning and an odd one about the end."""
     turned = 2 * values[-1] - values[-2::-1]
     return evenly(np.concatenate([values, turned]), smooth)[: values.size]
 
 
 def of_velocity(values: np.ndarray, smooth: Callable) -> np.ndarray:
-    """Smooth values that are turned about both ends: a straight line, which passes, plus an odd remainder."""
+    """Smooth values with odd extensions about both ends: a straight line, which passes, plus an odd remainder."""
     line = np.linspace(values[0], values[-1], values.size)
     beside = values - line
     return line + smooth(np.concatenate([beside, -beside[-2:0:-1]]))[: values.size]
@@ -51,10 +51,10 @@ def of_velocity(values: np.ndarray, smooth: Callable) -> np.ndarray:
 def butterworth(
     values: np.ndarray, dt: float, low: float | None, high: float | None, order: int, zero_phase: bool
 ) -> np.ndarray:
-    """Pass values, with rest before and after, through a Butterworth filter.
+    """Apply a Butterworth filter to values that are zero before and after.
 
-    Without delay the response has a causal part, and the mirror image of that before its cause. Either is a sum over
-    poles that begins at rest, so that no filter runs beyond an end.
+    A zero-phase response is a causal part plus its mirror image in time. Each part is a sum over poles that starts from
+    rest, so no filter has to step beyond an end.
     """
     if not zero_phase:
         edges = [edge for edge in (low, high) if edge is not None]
@@ -67,11 +67,11 @@ def butterworth(
 
 
 def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, order: int) -> np.ndarray:
-    """Return the causal part of a response without delay.
+    """Return the causal part of a zero-phase response.
 
-    With S = s/w of a low-pass and (s^2 + l h)/(s (h - l)) of a band, l, h and w are corners under the bilinear
-    transform. The squared gain 1/(1 + (S/i)^2N) has at each of its poles the residue -p/2N. The poles with a negative
-    real part are this half, the others its mirror image in time.
+    The normalised variable S is s/w for a low-pass and (s^2 + l h)/(s (h - l)) for a band-pass; l, h and w are corners
+    under the bilinear transform. The squared gain 1/(1 + (S/i)^2N) has the residue -p/2N at each pole p. Poles with a
+    negative real part form this half, the others its mirror image in time.
     """
     upper = np.tan(np.pi * high * dt)
     lower = 0.0 if low is None else np.tan(np.pi * low * dt)
@@ -84,7 +84,7 @@ def _causal_half(values: np.ndarray, dt: float, low: float | None, high: float, 
         else:
             middle = pole * (upper - lower) / 2
             root = np.sqrt(middle**2 - lower * upper)
-            far = max(middle + root, middle - root, key=abs)  # the near pole, a difference, would lose its digits
+            far = max(middle + root, middle - root, key=abs)  # the near pole, computed as a difference, would cancel
             part = _one_pole(_one_pole(values, 1, -1, lower * upper / far), size, 1, far)
         total += (1 if 2 * k + 1 == order else 2) * part.real
     return total

@@ -1,4 +1,4 @@
-"""Two motions at once: where the pieces of each lie among the finer ones that end wherever a piece of either ends."""
+"""Merged knots of two motions: the partition into pieces on which both motions are smooth."""
 
 import functools
 from collections.abc import Callable
@@ -16,22 +16,23 @@ from jaxrock.numerics.fixed import fixed
 from jaxrock.numerics.given import given, is_zero
 
 Scalar = Inexact[Array, ""]
-_FEW = 32  # pieces that are compared, one with all; more are sorted
+_FEW = 32  # up to so many pieces, all pairs are compared; more are sorted
 
 
 class Place(NamedTuple):
-    """The piece of a motion, and whether it moves: before and after its pieces it does not."""
+    """The piece of a motion, and whether the motion is under way; it is not before its first piece and after its
+    last.
+    """
 
     piece: Int[Array, "..."]
     moving: Bool[Array, "..."]
 
 
 class Finer(NamedTuple):
-    """The finer pieces, of the knots of two motions.
+    """Merged pieces, from the knots of two motions.
 
-    Of knots that come together those of the first motion come first, also where they are told apart by their
-    derivatives alone: between them lies a piece without a length, in which the first motion has moved on already, and
-    the second has not.
+    Where knots of both motions coincide, those of the first come first, also where only their derivatives differ.
+    Between them lies a piece of zero length, in which the first motion is already past its knot and the second is not.
     """
 
     first: Inexact[Array, " knots"]
@@ -39,15 +40,15 @@ class Finer(NamedTuple):
 
     @property
     def knots(self) -> Inexact[Array, " finer"]:
-        """Where they end, and the first begins [s]."""
+        """Times that bound the merged pieces [s]."""
         knots = jnp.concatenate([self.first, self.second])
         if knots.size > _FEW:
-            return jnp.sort(knots)  # which keeps the order of those that are alike
+            return jnp.sort(knots)  # stable: equal knots keep their order
         return given(_in_order, jnp.sort(fixed(knots)), (self.first, self.second))
 
     @property
     def _passed(self) -> Int[Array, " pieces"]:
-        """How many knots of the first motion come before each finer piece."""
+        """Number of knots of the first motion up to the beginning of each merged piece."""
         first, second, begins = jax.lax.stop_gradient((self.first, self.second, self.knots[:-1, None]))
         if begins.size > _FEW:
             knots, is_first = jnp.concatenate([first, second]), jnp.arange(begins.size + 1) < first.size
@@ -57,19 +58,24 @@ class Finer(NamedTuple):
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
-        """For each finer piece, and for what comes after them, the first from there on that lasts; None: they are few,
-        and one after the other is as quick."""
+        """For each merged piece, and for the end, the first piece from there on with a positive length.
+
+        None for few pieces: stepping over them one by one is as quick.
+        """
         knots = self.knots
         return _following(knots) if knots.size > _FEW else None
 
     def places(self, piece: Int[Array, "..."]) -> tuple[Place, Place]:
-        """Where the two motions are in finer pieces."""
+        """Return the places of both motions in merged pieces."""
         passed = self._passed[piece]
         return _place(self.first, passed - 1), _place(self.second, piece - passed)
 
     def spread(self, *values: Inexact[Array, " _"] | None, quiet: float) -> list[Any]:
-        """Values of the pieces of either motion (None: it has none) for the finer ones; `quiet` where it is still, and
-        in pieces without a length, where both never are at once."""
+        """Spread one value per piece of each motion (None: it has none) over the merged pieces.
+
+        A merged piece gets `quiet` where the motion is still, and where the piece has no length: the two motions are
+        never in such a piece at once.
+        """
         begins, lasting = self.knots[:-1], jnp.diff(self.knots) > 0
         places = self.places(jnp.arange(begins.size))
         return [
@@ -78,14 +84,16 @@ class Finer(NamedTuple):
         ]
 
     def spread_bounds(self, *bounds: Bounds) -> list[Bounds]:
-        """Bounds of the pieces of both motions for the finer ones."""
+        """Spread the bounds of both motions over the merged pieces."""
         found = self.spread(*(each.values for each in bounds), quiet=0.0)
         return [each._replace(values=values) for each, values in zip(bounds, found)]
 
     def series(
         self, *series: Callable | None, piece: Int[Array, ""], local: Scalar, unit: Scalar, order: int
     ) -> list[list[Scalar] | None]:
-        """What the `series` of either motion, horizontal or vertical (None: not asked for), gives in a finer piece."""
+        """Return the terms of each motion's `series`, horizontal or vertical (None: not asked for), in a merged
+        piece.
+        """
         begin, found = self.knots[piece], []
         for knots, each, place in zip((self.first, self.second), series, self.places(piece)):
             terms = None if each is None else each(place.piece, begin - knots[place.piece] + local, unit, order)
@@ -94,8 +102,10 @@ class Finer(NamedTuple):
 
 
 def _in_order(_, knots: tuple, changes: tuple) -> Inexact[Array, " finer"]:
-    """Changes of few knots that are sorted: JAX would sort their numbers, too, and look them up, which becomes no
-    machine code where it is done at every step."""
+    """Sort the tangents of few knots along with the knots.
+
+    JAX's own rule also sorts indices and gathers by them, which does not become machine code inside a step.
+    """
     first, second = fixed(knots)
     count = [jnp.arange(x.size, dtype=jnp.int32) for x in (first, second)]
     before_first = jnp.sum(second < first[:, None], axis=1, dtype=jnp.int32)
@@ -117,7 +127,7 @@ def _following(knots: Inexact[Array, " knots"]) -> Int[Array, " knots"]:
 
 @functools.partial(_following.defjvp, symbolic_zeros=True)
 def _(knots, changes):
-    # Of knots that come together one may go: a piece without a length has derivatives, and is not passed over.
+    # With tangents, a piece of zero length between coinciding knots has derivatives, so it is not skipped.
     still = isinstance(changes[0], SymbolicZero)
     found = _following(*knots) if still else jnp.arange(knots[0].size, dtype=jnp.int32)
     return found, np.zeros(found.shape, jax.dtypes.float0)

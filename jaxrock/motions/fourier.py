@@ -1,7 +1,7 @@
-"""Squared Fourier amplitudes of straight lines over a band of frequencies, in NumPy.
+"""Squared Fourier amplitudes of piecewise linear accelerations over a band of frequencies, in NumPy.
 
-Shocks far from one another are transformed separately, so that the quiet between them costs nothing. Their cross terms
-oscillate over frequency the faster, the farther apart they are: that factor is integrated in closed form.
+Shocks far apart in time are transformed separately, so that the quiet between them costs nothing. Their cross terms
+oscillate over frequency, faster for shocks farther apart: that factor is integrated in closed form.
 """
 
 from typing import NamedTuple
@@ -11,17 +11,17 @@ import numpy as np
 from jaxrock.motions.oscillator import integrals_of_exponential
 from jaxrock.motions.straight import Straight
 
-_QUIET = 20.0  # least pause between two shocks [s]
-_SHOCKS = 64  # largest number; with more, longer pauses part them
-_APART = 5e-3  # largest distance of amplitudes [Hz]
-_SHORT = 2.5e-4  # largest step of time [s], except for lines of one length
-_MOST = 1 << 24  # largest number of steps
-_FINE = 8  # amplitudes per independent amplitude of a shock's length
+_QUIET = 20.0  # shortest pause that separates two shocks [s]
+_SHOCKS = 64  # largest number of shocks; with more, only longer pauses separate them
+_APART = 5e-3  # largest spacing of frequencies [Hz]
+_SHORT = 2.5e-4  # largest time step [s], except for lines of equal length
+_MOST = 1 << 24  # largest number of time steps
+_FINE = 8  # frequencies per independent frequency of a shock's length
 _MANY = 1 << 20  # largest number of samples
 
 
 class _Shock(NamedTuple):
-    """Straight lines between pauses, their begin and length [s]."""
+    """Straight lines between two pauses, with their begin and length [s]."""
 
     lines: Straight
     begin: float
@@ -33,7 +33,7 @@ class _Shock(NamedTuple):
 
 
 def squared_amplitudes(lines: Straight, band: tuple[float, float]) -> tuple[float, float]:
-    """The integral of the squared Fourier amplitude over a band of frequencies [Hz], and that of it over frequency."""
+    """Integrate C^2 and C^2/f over a band of frequencies f [Hz], with C the Fourier amplitude."""
     shocks = _shocks(lines)
     if not shocks:
         return 0.0, 0.0
@@ -69,36 +69,36 @@ def _shocks(lines: Straight) -> list[_Shock]:
 
 
 def _step(shock: _Shock) -> float:
-    """Return the step of time [s]: that of the lines, if they are of one length and continuous."""
+    """Return the time step [s]: the length of the lines, if they are equally long and continuous."""
     length = shock.lines.length
     joined = np.allclose(shock.lines.begin[1:], shock.lines.end[:-1], rtol=1e-9, atol=0)
     if length.size > 1 and joined and np.ptp(length) <= 1e-6 * length.max():
         return float(length.mean())
     step = max(min(_SHORT, shock.length / 1000, 8 * float(length.max())), shock.length / _MOST)
-    return shock.length / np.ceil(shock.length / step)  # its end is one of the times
+    return shock.length / np.ceil(shock.length / step)  # the end is one of the times
 
 
 def _amplitudes(shock: _Shock, grid: np.ndarray) -> np.ndarray:
-    """Return the Fourier transform at some frequencies [Hz], with time from the middle of the shock."""
+    """Return the Fourier transform at the frequencies `grid` [Hz], with time from the middle of the shock."""
     lines, step, times = shock.lines, _step(shock), shock.lines.times
     time = step * np.arange(int(np.floor(times[-1] / step * (1 + 1e-9))) + 1)
     knots = np.stack([times[:-1], times[1:] - 1e-9 * step], axis=1).ravel()
     values = np.stack([lines.begin, lines.end], axis=1).ravel()
-    # At a jump the mean of both sides, so that the sample is centred in time.
+    # At a jump take the mean of both sides, which centres the sample in time.
     samples = sum(np.interp(time + k * 2e-9 * step, knots, values, left=0.0, right=0.0) / 2 for k in (-1, 1))
     from scipy.signal import zoom_fft
 
     sums = zoom_fft(samples, [grid[0], grid[-1]], grid.size, fs=1 / step, endpoint=True)
-    # Transform of straight lines between samples: that of the samples, periodic in their rate, times a squared sinc.
+    # Lines between samples transform to the samples' transform, periodic in the sampling rate, times a squared sinc.
     whole = step * sums * np.sinc(grid * step) ** 2
-    # Half of the first and of the last sample lie in lines beyond the ends: they belong within.
+    # Interpolation puts half of the first and last sample into lines beyond the ends: move it inside.
     moved = (1 - np.sinc(2 * grid * step)) / (2j * np.pi * grid)
     ends = lines.begin[0] - lines.end[-1] * np.exp(-2j * np.pi * grid * time[-1])
     return (whole + moved * ends) * np.exp(1j * np.pi * grid * shock.length)
 
 
 def _between(values: np.ndarray, grid: np.ndarray, later: float) -> np.ndarray:
-    """Return real parts of integrals of values, straight between frequencies, times e^(-2 pi i later frequency)."""
+    """Integrate values, linear between frequencies, times e^(-2 pi i later frequency); return the real parts."""
     apart = np.diff(grid)
     turn = -2j * np.pi * later
     whole, falling = integrals_of_exponential(turn * apart, apart)

@@ -1,9 +1,9 @@
 """Intensity measures of ground motions: peaks, integrals over time, response spectra, and measures of rocking.
 
-`peak_acceleration`, `peak_velocity` and their ratios to a block's are functions of JAX. The others are of known
-motions, in NumPy and SciPy: exact for records (straight lines between samples), to about 1e-7 for pulses. A pulse of
-thousands of cycles is sampled as finely as one cycle. A pulse of more than 5,000 cycles is refused, of more than 20 in
-functions of JAX under tracing. Quiet within a motion costs nothing. g is 9.81 m/s^2.
+`peak_acceleration`, `peak_velocity` and their ratios to a block's values are functions of JAX. The others take known
+motions and use NumPy and SciPy. They are exact for records (straight lines between samples), and within about 1e-7 for
+pulses. A pulse of thousands of cycles is sampled as finely as one cycle. Pulses of more than 5,000 cycles are refused,
+and under tracing those of more than 20. Quiet within a motion costs nothing. g is 9.81 m/s^2.
 """
 
 import warnings
@@ -36,7 +36,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-_LONG = 100  # samples of a record that is more than a pulse
+_LONG = 100  # samples; a longer record is checked for drift, a shorter one may be a pulse
 
 
 @arguments
@@ -57,14 +57,15 @@ def peak_acceleration(motion: AbstractMotion) -> Inexact[Array, ""]:
 
 @arguments
 def peak_velocity(motion: AbstractMotion) -> Inexact[Array, ""]:
-    """Peak ground velocity (PGV) [m/s], of a ground that is at rest at first, under 9.81 m/s^2.
+    """Peak ground velocity (PGV) [m/s] of a ground that starts from rest, with g = 9.81 m/s^2.
 
     **Arguments:**
 
     - `motion`: as in `peak_acceleration`; a record should have been corrected so that its velocity ends near zero.
 
-    **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses. It warns
-    of a record of 100 samples or more whose ground moves on at its end faster than a quarter of that: its baseline
+    **Returns:** the largest |velocity|: exact for records and straight lines, to about 1e-9 for smooth pulses.
+
+    A record of 100 samples or more whose last velocity exceeds a quarter of the peak raises a warning: its baseline
     drifts.
     """
     check_single(motion=motion)
@@ -89,21 +90,23 @@ def _warn_of_drift(motion: AbstractMotion, how: str) -> None:
 
 @arguments
 def peak_displacement(motion: AbstractMotion) -> float:
-    """Peak ground displacement (PGD) [m], of a ground that is at rest at first.
+    """Peak ground displacement (PGD) [m] of a ground that starts from rest.
 
     **Arguments:**
 
     - `motion`: one known motion; a record needs a correction of its baseline.
 
-    **Returns:** the largest |displacement|, also between samples. It warns of a record of 100 samples or more whose
-    ground ends farther away than half of that: its baseline drifts. (A fault may have moved the ground.)
+    **Returns:** the largest |displacement|, also between samples.
+
+    A record of 100 samples or more whose last displacement exceeds half of the peak raises a warning: its baseline
+    drifts. (A fault may have moved the ground.)
 
     **Raises:** ValueError for a motion of too many cycles within its pieces.
     """
     lines = straight(motion)
     velocity, places = lines.velocity[:-1], lines.displacement
     largest = np.abs(places).max(initial=0.0)
-    # Times at which the velocity v + a t + j t^2/2 passes zero within a line, also in one that begins at rest.
+    # Within a line, the velocity v + a t + j t^2/2 passes zero at these times, also from rest.
     slope = (lines.end - lines.begin) / lines.length
     root = np.sqrt(np.maximum(lines.begin**2 - 2 * slope * velocity, 0.0))
     lead = lines.begin + np.copysign(root, lines.begin)
@@ -121,7 +124,7 @@ def peak_displacement(motion: AbstractMotion) -> float:
 
 @arguments
 def velocity_to_acceleration(motion: AbstractMotion) -> float:
-    """PGV/PGA [s]: for how long the ground pushes.
+    """PGV/PGA [s]: how long the ground pushes.
 
     **Arguments:** as `peak_displacement`.
 
@@ -183,14 +186,13 @@ def significant_duration(motion: AbstractMotion, begin: ArrayLike = 0.05, end: A
 
 
 def _squares(lines: Straight) -> np.ndarray:
-    """Integral of the squared acceleration over each line."""
+    """Integrate the squared acceleration over each line."""
     a, b, length = lines
     return length * (a * a + a * b + b * b) / 3
 
 
 def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
-    """Return the time at which the integral of the squared acceleration first reaches a value, by bisection within a
-    line."""
+    """Return the time at which the integral of the squared acceleration reaches a value, by bisection within a line."""
     row = min(max(int(np.searchsorted(sums, wanted)) - 1, 0), lines.length.size - 1)
     a, b, length = (float(part[row]) for part in lines)
     low, high = 0.0, 1.0
@@ -206,7 +208,7 @@ def _time_of(lines: Straight, sums: np.ndarray, wanted: float) -> float:
 def mean_period(motion: AbstractMotion) -> float:
     """Mean period [s]: periods from 0.05 to 4 s, weighted with the squared Fourier amplitude.
 
-    **Arguments:** as `peak_displacement`; a record that is longer than its motion says no more.
+    **Arguments:** as `peak_displacement`; quiet around the motion does not change the result.
 
     **Returns:** the integral of C^2/f over that of C^2 from 0.25 to 20 Hz, C the Fourier amplitude of the motion (of a
     record: of the straight lines between samples).
@@ -294,7 +296,7 @@ def uplift_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array, "
     - `motion`: a motion of scalar parameters.
     - `block`: one `Block`.
 
-    **Returns:** the ratio; of what is traced, an array with derivatives.
+    **Returns:** the ratio; under tracing, an array with derivatives.
     """
     check_single(block=block)
     ratio = peak_acceleration(motion) / jnp.tan(block.alpha)
@@ -303,7 +305,7 @@ def uplift_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array, "
 
 @arguments
 def velocity_ratio(motion: AbstractMotion, block: Block) -> float | Float[Array, ""]:
-    """p PGV/(g tan alpha) [-]: the ground's velocity against the one that overturns the block in an instant.
+    """p PGV/(g tan alpha) [-]: the ground's velocity over the velocity that overturns the block in an instant.
 
     **Arguments:** as `uplift_ratio`.
 

@@ -1,6 +1,6 @@
-"""Records one after the other in one array: one of them is chosen by its number, and many scenes share the array.
+"""Records concatenated in one array: a traced number chooses one of them, and all lanes share the array.
 
-Engines follow a chosen record in place, from its first piece among those of all to its last.
+Engines follow a chosen record in place, from its first piece to its last among the pieces of all records.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from jaxrock.numerics.choice import where
 
 
 class JoinedRecords(Owner):
-    """Records one after the other, with room for more at the end: so that one program serves many suites.
+    """Records concatenated in one array, padded at the end so that one compiled program serves many suites.
 
     A record of n samples has n places: its n - 1 pieces, and one for the quiet after it.
     """
 
     samples: Inexact[Array, " places"] = parameter("g", strength, axes=1)
     dt: Inexact[Array, " records"] = parameter("s", size, axes=1)
-    first: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # place of each
-    count: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # samples of each
-    owner: Int[Array, " places"] = parameter("-", axes=1, is_whole=True)  # which record has a place
-    longest: int = eqx.field(static=True)  # room for the samples of any
+    first: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # first place of each record
+    count: Int[Array, " records"] = parameter("-", axes=1, is_whole=True)  # number of samples of each record
+    owner: Int[Array, " places"] = parameter("-", axes=1, is_whole=True)  # record to which each place belongs
+    longest: int = eqx.field(static=True)  # padded number of samples of the longest record
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> "JoinedRecords":
-        """Join records; what is known stays so within `jax.jit`."""
+        """Join records; known records give known arrays also within `jax.jit`."""
         sizes = np.array([record.samples.size for record in records])
         places, owners = roomy(int(sizes.sum())), roomy(len(records))
         owner = np.repeat(np.arange(len(records)), sizes)
@@ -52,14 +52,14 @@ class JoinedRecords(Owner):
 
     @property
     def place(self) -> Int[Array, " places"]:
-        """How many places of the same record come before each."""
+        """For each place, the number of places of its record before it."""
         return jnp.arange(self.samples.size, dtype=jnp.int32) - self.first[self.owner]
 
 
 class _InPlace(Straight):
-    """All records as one motion, of which a scene is followed from one piece to another. The time is its own record's.
+    """All records as one motion, of which one record's pieces are followed; time counts from that record's start.
 
-    No array depends on which of them that is.
+    No array depends on the chosen record.
     """
 
     joined: JoinedRecords
@@ -72,7 +72,7 @@ class _InPlace(Straight):
 
     @property  # type: ignore[misc]
     def dt(self) -> Scalar:  # type: ignore[override]
-        return self.sure * self.joined.dt[self.record]  # which makes slopes no numbers, at no cost in a step
+        return self.sure * self.joined.dt[self.record]  # an invalid number makes the slopes NaN, at no cost in a step
 
     @property
     def knots(self) -> Inexact[Array, " knots"]:
@@ -89,7 +89,7 @@ class _InPlace(Straight):
 
     @property
     def _left(self) -> Int[Array, " places"]:
-        """Pieces from each place on to the end of its record."""
+        """Number of pieces from each place to the end of its record."""
         many = self.joined
         return jnp.maximum(many.count[many.owner] - 1 - many.place, 0)
 
@@ -102,15 +102,15 @@ class _InPlace(Straight):
 
 
 class Chosen(AbstractChosen):
-    """One of many records, by its number, which may be traced: what `suite[number]` is."""
+    """One of many records, by its number, which may be traced: the result of `suite[number]`."""
 
     joined: JoinedRecords
     record: Int[Array, "..."] = parameter("-", is_free=False, is_whole=True)
-    sure: Inexact[Array, "..."] = parameter("-", is_free=False)  # 1; what is not a number where there is no such record
+    sure: Inexact[Array, "..."] = parameter("-", is_free=False)  # 1, or NaN where no record has this number
 
     @property
     def alone(self) -> Padded:
-        """The record with samples of its own."""
+        """The record with an array of its own samples."""
         many, places = self.joined, jnp.arange(self.joined.longest)
         first, count, dt = (x[self.record] for x in (many.first, many.count, many.dt))
         samples = many.samples[jnp.minimum(first + places, many.samples.size - 1)]
@@ -133,14 +133,14 @@ class Chosen(AbstractChosen):
 
 
 def is_in_place(motion: AbstractMotion) -> bool:
-    """Whether a motion is a chosen record, or that times a factor."""
+    """Return whether a motion is a chosen record, possibly times factors."""
     while isinstance(motion, Scaled):
         motion = motion.motion
     return isinstance(motion, Chosen)
 
 
 class Stretch(NamedTuple):
-    """A motion of which a scene is followed from one piece on, up to another; there is room for so many."""
+    """A motion of which the pieces `first` to `end` are followed; `room` is the static limit of their number."""
 
     motion: AbstractMotion
     first: Int[Array, ""]
@@ -149,7 +149,7 @@ class Stretch(NamedTuple):
 
 
 def in_place(motion: AbstractMotion) -> Stretch:
-    """Where a motion that `is_in_place` is found among all."""
+    """Return the stretch of a motion that `is_in_place` among the pieces of all records."""
 
     def is_chosen(part):
         return isinstance(part, Chosen)

@@ -1,4 +1,4 @@
-"""Measures of intensity by their names, and how they grow with the scale of a motion."""
+"""Measures of intensity by name, and their growth with the scale of a motion."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -13,7 +13,7 @@ from jaxrock.motions.files.parsing import NUMBER
 from jaxrock.motions.motion import AbstractMotion
 from jaxrock.motions.suite import Suite
 
-# By OpenQuake's names (SV is none of them): with our units, and the power of a motion's scale with which they grow.
+# By OpenQuake's names (SV is not one of them): function, unit, and the power of a motion's scale as which each grows.
 _NAMED: dict[str, tuple[Callable, str, float]] = {
     "PGA": (intensity.peak_acceleration, "g", 1.0),
     "PGV": (intensity.peak_velocity, "m/s", 1.0),
@@ -27,8 +27,10 @@ _SPECTRAL = re.compile(rf"({'|'.join(_AT_PERIOD)})\(({NUMBER})\)")
 
 
 class Measure(NamedTuple):
-    """A measure of intensity: its name, a function of a motion, and the power of a motion's scale with which it grows,
-    which is known of the package's own."""
+    """A measure of intensity: its name, and a function of a motion.
+
+    `power` is the power of a motion's scale as which the measure grows; None: it is not known.
+    """
 
     name: str
     function: Callable[[AbstractMotion], Any]
@@ -36,13 +38,13 @@ class Measure(NamedTuple):
 
 
 def unit_of(name: str) -> str:
-    """The unit of a measure of the package by its name; empty for another."""
+    """Return the unit of one of the package's measures by its name; empty for another name."""
     spectral = _SPECTRAL.fullmatch(name)
     return _AT_PERIOD[spectral[1]][1] if spectral else _NAMED[name][1] if name in _NAMED else ""
 
 
 def are_different(first: str, second: str) -> bool:
-    """Whether two names stand for different measures of the package; of another name nothing is known."""
+    """Return whether two names are known to stand for different measures of the package."""
 
     def parts(name):
         spectral = _SPECTRAL.fullmatch(name)
@@ -53,9 +55,9 @@ def are_different(first: str, second: str) -> bool:
 
 
 def measure_of(name: str, value: str | Callable) -> Measure:
-    """The measure that a word or a function stands for: an argument of this name.
+    """Return the measure that a word or a function stands for; `name` is the argument's name for messages.
 
-    **Raises:** ValueError for another word, or what is none.
+    **Raises:** ValueError for an unknown word, or another kind of value.
     """
     spectral = _SPECTRAL.fullmatch(value) if isinstance(value, str) else None
     if spectral:
@@ -72,9 +74,9 @@ def measure_of(name: str, value: str | Callable) -> Measure:
 
 
 def strengths(name: str, measure: Measure, suite: Suite) -> np.ndarray:
-    """(motions,) a measure of all motions of a suite as they are.
+    """(motions,) Return a measure of all unscaled motions of a suite.
 
-    **Raises:** ValueError for one that is not a positive number.
+    **Raises:** ValueError for a value that is not a positive number.
     """
     peaks = {"PGA": suite.peak_acceleration, "PGV": suite.peak_velocity}
     if measure.power is not None and measure.name in peaks:
@@ -87,7 +89,7 @@ def strengths(name: str, measure: Measure, suite: Suite) -> np.ndarray:
 
 
 def scaled_strengths(measure: Measure, suite: Suite, scale: np.ndarray) -> np.ndarray:
-    """(motions, scales) a measure of all motions of a suite at all scales: by its power, if it grows as one."""
+    """(motions, scales) Return a measure of all motions at all scales, by its power if it grows as one."""
     try:
         power = power_of("measures", measure, suite.motions())
     except ValueError:
@@ -96,9 +98,9 @@ def scaled_strengths(measure: Measure, suite: Suite, scale: np.ndarray) -> np.nd
 
 
 def power_of(name: str, measure: Measure, motions: Iterable[AbstractMotion]) -> float:
-    """The power of a motion's scale with which a measure grows: 1 for peaks and spectra, 2 for Arias intensity.
+    """Return the power of a motion's scale as which a measure grows: 1 for peaks and spectra, 2 for Arias intensity.
 
-    **Raises:** ValueError for one that grows otherwise, or not.
+    **Raises:** ValueError for a measure that grows otherwise, or not at all.
     """
     if measure.power is not None:
         return measure.power

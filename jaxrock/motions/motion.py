@@ -27,7 +27,7 @@ Piece = Int[Array, ""]  # number of a smooth piece
 
 
 class AbstractMotion(Owner):
-    """What every ground motion offers: `acceleration(t)`, `knots`, `end`, and series for the engines."""
+    """The interface of every ground motion: `acceleration(t)`, `knots`, `end`, and series for the engines."""
 
     __repr__ = described
 
@@ -42,35 +42,34 @@ class AbstractMotion(Owner):
 
     @property
     def lengths(self) -> Inexact[Array, " pieces"]:
-        """How long each piece lasts [s]. Blocks are followed by the time since the last knot: a motion that begins late
-        tells lengths that differences of rounded knots would not."""
+        """Durations of the pieces [s]; exact also for a motion that begins late, whose knots are rounded."""
         return jnp.diff(self.knots)
 
     def length(self, piece: Piece) -> Scalar:
-        """How long one piece lasts [s]."""
+        """Return the duration of one piece [s]."""
         return pick(self.lengths, piece)
 
     @property
     def lasting(self) -> Lasting:
-        """Up to which piece the motion lasts, and whether time runs forward in all."""
+        """The last piece with a positive length, and whether time runs forward in every piece."""
         return Lasting.of(self.lengths)
 
     @property
     def lateness(self) -> Scalar | None:
-        """By how much parts of the motion may come too early or too late, one beside another, because their times are
-        rounded [s]; None: by nothing that the length of a piece does not tell."""
+        """Bound of the relative timing error of parts through rounding of times [s]; None: `lengths` are exact."""
         return None
 
     @property
     def following(self) -> Int[Array, " knots"] | None:
-        """For each piece, and for what comes after the last, the first from there on that lasts; None: there is nothing
-        to pass over, or not much."""
+        """For each piece, and for the end, the first piece from there on that has a length; None: few or none to
+        skip.
+        """
         return None
 
     @property
     @abc.abstractmethod
     def scales(self) -> Inexact[Array, " pieces"] | None:
-        """Time in which the acceleration of each piece changes [s]; infinite for a straight line. None: all are."""
+        """Time scale of the acceleration in each piece [s]; infinite for a straight line. None: all are straight."""
 
     @property
     @abc.abstractmethod
@@ -91,12 +90,12 @@ class AbstractMotion(Owner):
         return None
 
     def vertical_series(self, piece: Piece, local: Scalar, unit: Scalar, order: int) -> list[Scalar] | None:
-        """As `series`, of the vertical acceleration, positive upward [g]."""
+        """Return the Taylor coefficients of the vertical acceleration, positive upward [g], as `series` does."""
         return None
 
     @property
     def envelope(self) -> Envelope:
-        """The bounds of both components."""
+        """Bounds of the horizontal and of the vertical acceleration."""
         vertical = self.vertical_bounds
         return Envelope(Bounds(self.bounds), None if vertical is None else Bounds(vertical))
 
@@ -118,12 +117,12 @@ class AbstractMotion(Owner):
         return acceleration_at(self, if_known(not_nan, "time", time))
 
     def with_vertical(self, vertical: "AbstractMotion") -> "WithVertical":
-        """This horizontal motion together with a vertical one, positive upward (its own vertical part is not used)."""
+        """Combine this horizontal motion with a vertical one, positive upward (whose own vertical part is not used)."""
         return WithVertical(self, vertical)
 
     @with_throw
     def shifted(self, delay: ArrayLike, *, throw: bool = True) -> "Shifted":
-        """The same motion after `delay` seconds of quiet (0 or more)."""
+        """Return this motion after `delay` seconds of quiet (0 or more)."""
         return Shifted(self, delay)
 
     def __mul__(self, factor: ArrayLike) -> "Scaled":
@@ -142,21 +141,21 @@ class AbstractMotion(Owner):
         return Summed(self, other) if isinstance(other, AbstractMotion) else NotImplemented
 
     def __radd__(self, other: object) -> "AbstractMotion":
-        return self if isinstance(other, int) and other == 0 else NotImplemented  # with which `sum` begins
+        return self if isinstance(other, int) and other == 0 else NotImplemented  # `sum` starts with 0
 
     def __sub__(self, other: "AbstractMotion") -> "Summed":
         return Summed(self, -other) if isinstance(other, AbstractMotion) else NotImplemented
 
-    __array_ufunc__ = None  # an array of NumPy times a motion is a motion, and not an array of motions
+    __array_ufunc__ = None  # a NumPy array times a motion is a motion, not an array of motions
 
 
 class _Changed(AbstractMotion):
-    """A motion made of others, which tells its `envelope`."""
+    """A motion made of others, which defines its `envelope`; the bounds follow from that."""
 
     @property
     @abc.abstractmethod
     def envelope(self) -> Envelope:
-        """The bounds of both components."""
+        """Bounds of the horizontal and of the vertical acceleration."""
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
@@ -170,7 +169,7 @@ class _Changed(AbstractMotion):
 
 
 class AtTheSameTimes(_Changed):
-    """A motion made of one other, piece by piece."""
+    """A motion made of one other, with the same pieces."""
 
     motion: AbstractMotion
 
@@ -205,7 +204,7 @@ class AtTheSameTimes(_Changed):
 class Scaled(AtTheSameTimes):
     """A motion times a factor (`factor * motion`)."""
 
-    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude says the same
+    factor: Inexact[Array, "..."] = parameter("-", factor, is_free=False)  # the motion's amplitude is the same
 
     @arguments
     def __init__(self, motion: AbstractMotion, factor: ArrayLike):
@@ -288,12 +287,12 @@ class Shifted(_Changed):
 
 
 class _Together(AbstractMotion):
-    """Two motions at once; its pieces end wherever a piece of either ends."""
+    """Two motions at once, on merged pieces."""
 
     @property
     @abc.abstractmethod
     def _both(self) -> tuple[AbstractMotion, AbstractMotion]:
-        """The two."""
+        """The two motions."""
 
     @property
     def _finer(self) -> Finer:
@@ -306,7 +305,7 @@ class _Together(AbstractMotion):
 
     @property
     def lateness(self) -> Scalar | None:
-        # A part that is shifted rounds its times as the whole sum does.
+        # The times of a shifted part are rounded like those of the whole sum.
         parts, knots = jax.tree.leaves(self._both, is_leaf=lambda node: isinstance(node, Shifted)), self.knots
         if not any(isinstance(part, Shifted) for part in parts):
             return None
@@ -340,7 +339,7 @@ class Summed(_Together):
 
     @property
     def bounds(self) -> Inexact[Array, " pieces"]:
-        # Looked up before they are scaled: what only scales a part leaves that to all scales alike.
+        # Values are spread before the gain applies, so that lanes with different gains share the spread array.
         both = self._finer.spread_bounds(*(motion.envelope.horizontal for motion in self._both))
         return functools.reduce(jnp.add, (bounds.times_gain(bounds.values) for bounds in both))
 
@@ -365,10 +364,10 @@ class WithVertical(_Changed, _Together):
     **Arguments:**
 
     - `horizontal`: as any motion, positive acceleration drives negative rotation.
-    - `vertical`: positive upward [g]; it makes the block heavier. Where it comes to -1 g the block leaves the ground,
+    - `vertical`: positive upward [g]; it makes the block heavier. Where it reaches -1 g the block leaves the ground,
       which is no longer rocking: see `contact_forces`.
 
-    Both begin at time 0. What scales or shifts the motion scales or shifts both.
+    Both begin at time 0. Scaling or shifting the motion scales or shifts both.
     """
 
     horizontal: AbstractMotion
@@ -395,6 +394,6 @@ class WithVertical(_Changed, _Together):
 
 
 def is_of_several(motion: AbstractMotion) -> bool:
-    """Whether it is made of two motions at once, or more."""
+    """Return whether a motion combines two motions or more."""
     parts = jax.tree.leaves(motion, is_leaf=lambda node: isinstance(node, _Together))
     return any(isinstance(part, _Together) for part in parts)

@@ -1,16 +1,16 @@
-"""The limit on the number of motions that make up one motion: each is a part of the program for the whole."""
+"""The limit on the number of parts of one motion: each part adds to the compiled program of the whole."""
 
 from typing import Any
 
 import equinox as eqx
 
-MOST = 100  # a sum of 33 delayed pulses has as many: its program compiles in 40 s, twice as many take minutes
+MOST = 100  # a sum of 33 delayed pulses: its program compiles in 40 s; twice as many parts take minutes
 
 
 def check_nesting(motion: eqx.Module) -> None:
     """Raise ValueError for a motion made of too many parts, whose program would take minutes to compile.
 
-    Every constructor of a motion calls it, so that the count never recurses deeper than the limit.
+    Every constructor of a motion calls this function, so that the count never recurses deeper than the limit.
     """
     count = _count(motion)
     if count > MOST:

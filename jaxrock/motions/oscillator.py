@@ -1,4 +1,4 @@
-"""Linear oscillators under straight lines of acceleration: exact from end to end of each, in NumPy.
+"""Linear oscillators under piecewise linear acceleration: exact at the ends of all lines, in NumPy.
 
 A line of many periods costs as much as one of two: see `_peaks_of_long_lines`.
 """
@@ -7,13 +7,13 @@ import numpy as np
 
 from jaxrock.motions.straight import Straight
 
-_PARTS = 80  # share of a period, for peaks
+_PARTS = 80  # parts of a period, for peaks
 _AT_A_TIME = 1 << 16  # lines, or parts of lines, whose states are in memory together
-_GONE = 40.0  # exponents after which an oscillation is below rounding
+_GONE = 40.0  # number of e-foldings after which an oscillation is below rounding
 
 
 def peaks_of_oscillator(lines: Straight, period: float, damping: float) -> tuple[float, float]:
-    """Peak displacement [m] and velocity [m/s] of an oscillator relative to the ground.
+    """Return the peak displacement [m] and velocity [m/s] of an oscillator relative to the ground.
 
     With s = omega (-damping + i sqrt(1 - damping^2)) and z' = s z + ground acceleration, the displacement is
     -Im z/Im s: a recursion of one complex number.
@@ -30,7 +30,7 @@ def peaks_of_oscillator(lines: Straight, period: float, damping: float) -> tuple
 
 
 def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: float) -> np.ndarray:
-    """Return peaks within some lines, and the states at their ends."""
+    """Return the peaks of displacement and velocity within some lines, from the states z at their ends."""
     window = 2 * np.pi / s.imag  # a period of the damped oscillation, or its decay if shorter
     window = min(window, max(_GONE / -s.real, period)) if s.real else window
     parts = np.maximum(1, np.ceil(_PARTS * lines.length / period)).astype(int)
@@ -49,9 +49,9 @@ def _peaks_of_lines(lines: Straight, states: np.ndarray, s: complex, period: flo
 def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window: float) -> np.ndarray:
     """Return peaks within lines of many periods: they lie in the first or in the last period.
 
-    The oscillator moves along a straight line, and rings about it. At one phase, from period to period, its distance is
-    a straight line and a decaying exponential. Where it is ahead of the line that is convex, and largest at an end.
-    Where it is behind, it is farther away half a period before or after.
+    The oscillator follows a straight line and rings about it. Sampled at one phase, from period to period, its distance
+    from zero is a straight line plus a decaying exponential. At phases where it is ahead of the line this sum is
+    convex, so its largest value lies at an end. At the others, it is farther from zero half a period before or after.
     """
     a, b, length = lines
     slope, first = (b - a) / length, np.full_like(length, window)
@@ -62,7 +62,7 @@ def _peaks_of_long_lines(lines: Straight, states: np.ndarray, s: complex, window
 
 
 def _peaks_of_parts(lines: Straight, states: np.ndarray, parts: np.ndarray, s: complex) -> np.ndarray:
-    """Return peaks within lines cut into equal parts, from the states at the beginnings of lines."""
+    """Return peaks within lines cut into equal parts, from the states at the beginnings of the lines."""
     peaks, total = np.zeros(2), np.cumsum(parts)
     for group in np.split(np.arange(parts.size), np.flatnonzero(np.diff(total // _AT_A_TIME)) + 1):
         row = np.repeat(group, parts[group])
@@ -96,20 +96,20 @@ def _rows(lines: Straight, rows: np.ndarray) -> Straight:
 
 
 def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
-    """Return z at the ends of all lines, from its first value."""
+    """Return z at the ends of all lines, from its initial value."""
     from scipy.signal import lfilter
 
     x = s * lines.length
     first, second = integrals_of_exponential(x, lines.length)
     gain, factor = lines.begin * (first - second) + lines.end * second, np.exp(x)
     edges = np.flatnonzero(np.concatenate([[True], np.abs(np.diff(lines.length)) > 0, [True]]))
-    if edges.size > x.size // 16:  # few lines of one length: a filter for each length would cost more than a loop
+    if edges.size > x.size // 16:  # many runs of equal length: one filter per run would cost more than a loop
         states = [state]
         for each, more in zip(factor.tolist(), gain.tolist()):
             states.append(each * states[-1] + more)
         return np.array(states)
     found = [np.array([state])]
-    for low, high in zip(edges[:-1], edges[1:]):  # of one length
+    for low, high in zip(edges[:-1], edges[1:]):  # a run of equally long lines
         part = lfilter([1.0], [1.0, -factor[low]], gain[low:high], zi=np.array([factor[low] * state]))[0]
         found.append(part)
         state = part[-1]
@@ -117,14 +117,14 @@ def _recursion(lines: Straight, s: complex, state: complex) -> np.ndarray:
 
 
 def _after(a: np.ndarray, slope: np.ndarray, state: np.ndarray, time: np.ndarray, s: complex) -> np.ndarray:
-    """Return z some time after the beginning of a line."""
+    """Return z at a time after the beginning of a line."""
     x = s * time
     first, second = integrals_of_exponential(x, time)
     return np.exp(x) * state + a * first + slope * time * second
 
 
 def integrals_of_exponential(x: np.ndarray, time: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Return integrals from 0 to some time of e^(x t/time), and of that times 1 - t/time."""
+    """Return the integrals over t from 0 to `time` of e^(x t/time), and of that times 1 - t/time."""
     small = np.abs(x) < 1e-2
     far = np.where(small, 1.0, x)
     first = np.expm1(far) / far
@@ -132,7 +132,7 @@ def integrals_of_exponential(x: np.ndarray, time: np.ndarray | float) -> tuple[n
 
 
 def _series(x: np.ndarray, first: int) -> np.ndarray:
-    """sum over k of x^k/(k + first)!"""
+    """Return the sum over k of x^k/(k + first)!"""
     x = np.where(np.abs(x) < 1e-2, x, 0.0)
     total, term = np.zeros_like(x), np.ones_like(x) / first
     for k in range(first, first + 8):
@@ -144,7 +144,7 @@ def _top(y0: np.ndarray, y1: np.ndarray, m0: np.ndarray, m1: np.ndarray, h: np.n
     """Return the largest magnitude of cubics with the given values and slopes at the ends of lines of lengths h."""
     sizes = np.maximum(np.abs(y0), np.abs(y1))
     largest = sizes.max(initial=0.0)
-    # No Hermite cubic lies farther beyond its ends.
+    # A cubic Hermite interpolant exceeds its end values at most by this much.
     rows = np.flatnonzero(sizes + 4 / 27 * h * (np.abs(m0) + np.abs(m1)) > largest)
     y0, y1, m0, m1 = (part[rows] for part in (y0, y1, h * m0, h * m1))
     # The slope over a share of the line is a t^2 + b t + m0.

@@ -16,24 +16,26 @@ from jaxrock.motions.record import with_room
 from jaxrock.numerics.gauss_legendre import gauss_legendre
 
 _NODES, _WEIGHTS = gauss_legendre(6)
-_FEW = 32  # pieces
-_PARTS = 256  # of every piece, where there are few
-_PER_SCALE = 8  # parts of the time in which an acceleration changes, where there are many
-_LEAST = 2  # parts of that time, still exact to 1e-9
+_FEW = 32  # pieces; more count as many
+_PARTS = 256  # parts of every piece, where there are few pieces
+_PER_SCALE = 8  # parts per time scale of the acceleration, where there are many pieces
+_LEAST = 2  # least number of parts per time scale: still exact to 1e-9
 _MOST = 1 << 20  # largest number of parts of a known motion
-_AT_A_TIME = 8192  # parts at a time
-_NEWTON = 3  # steps to a zero or a top: each doubles the digits of the one before
+_AT_A_TIME = 8192  # parts in one batch
+_NEWTON = 3  # Newton steps to a zero or an extremum: each doubles the number of correct digits
 
 
 def peaks_of_motion(motion: AbstractMotion) -> tuple[Scalar, Scalar]:
-    """`intensity.peak_acceleration` [g] and `peak_velocity` [m/s] at once, without a warning of a record's baseline."""
+    """Return `intensity.peak_acceleration` [g] and `peak_velocity` [m/s] together, without a warning of baseline
+    drift.
+    """
     return peaks_and_last_velocity(motion)[:2]
 
 
 def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Scalar]:
-    """Return peaks of acceleration [g] and velocity [m/s], and the last velocity [m/s].
+    """Return the peaks of acceleration [g] and velocity [m/s], and the last velocity [m/s].
 
-    A few programs serve records of any length.
+    Records are padded, so that a few compiled programs serve records of any length.
 
     **Raises:** ValueError for a motion of too many cycles within its pieces; the limit is lower under tracing.
     """
@@ -42,7 +44,7 @@ def peaks_and_last_velocity(motion: AbstractMotion) -> tuple[Scalar, Scalar, Sca
 
 
 def peaks_of_many(motions: AbstractMotion, choose: Callable, count: int) -> tuple[Array, Array]:
-    """Return `peaks_of_motion` of every `choose(motions, index)`, by one program."""
+    """Return `peaks_of_motion` of every `choose(motions, index)`, by one compiled program."""
 
     def peaks(motions, room):
         return jax.vmap(lambda index: _peaks_of(choose(motions, index), room))(jnp.arange(count))
@@ -51,7 +53,7 @@ def peaks_of_many(motions: AbstractMotion, choose: Callable, count: int) -> tupl
 
 
 def _fine_enough(motion: Any, peaks: Callable) -> tuple:
-    """Return the results of `peaks(motion, room)` with the usual parts of every piece, or with more where needed."""
+    """Return the results of `peaks(motion, room)` with the default number of parts, or with more where needed."""
     *found, wanted = peaks(motion, None)
     if wanted is None:
         return tuple(found)
@@ -59,7 +61,7 @@ def _fine_enough(motion: Any, peaks: Callable) -> tuple:
         message = "Argument `motion` must have at most 20 cycles within a piece where it is traced"
         return watched(tuple(found), message, jnp.any(wanted > 0))
     most = float(np.max(np.asarray(wanted)))
-    if not most > 0:  # NaN where the motion is
+    if not most > 0:  # also for NaN
         return tuple(found)
     if most > _MOST:
         raise too_long(_MOST // _LEAST, most / _LEAST)
@@ -76,11 +78,11 @@ def too_long(most: float, lasts: float) -> ValueError:
 
 @quickly(static_argnums=1)
 def _peaks_of(motion: AbstractMotion, room: int | None):
-    """Return peaks of acceleration [g] and velocity [m/s], the last velocity, and the number of parts wanted.
+    """Return the peaks of acceleration [g] and velocity [m/s], the last velocity, and the number of parts needed.
 
-    That number is 0 if there are enough parts, None if there always are. Every piece is cut into parts. Gauss-Legendre
-    quadrature integrates the acceleration over each part, and up to its zero in it. Newton's method finds the top of
-    the acceleration beside the larger end of each part.
+    That number is 0 if the parts suffice, None if they always do. Every piece is cut into parts. Gauss-Legendre
+    quadrature integrates the acceleration over each part, and up to its zero in the part. Newton's method finds the
+    extremum of the acceleration near the larger end of each part.
     """
     kind = motion.knots.dtype
     nodes, weights = (jnp.asarray(values, kind) / 2 for values in (_NODES, _WEIGHTS))
@@ -89,18 +91,18 @@ def _peaks_of(motion: AbstractMotion, room: int | None):
     def in_part(piece, begin, step):
         @jax.vmap
         def jets(local):
-            """Acceleration and its first two derivatives, at some times."""
+            """Return the acceleration and its first two derivatives at some times."""
             terms = motion.series(piece, jnp.clip(local, 0.0, lengths[piece]), jnp.ones_like(local), 2)
             terms = [*terms, *[jnp.zeros_like(terms[0])] * (3 - len(terms))]
             return terms[0], terms[1], 2 * terms[2]
 
         def gain_and(width, others):
-            """Velocity gained in as much of it as is asked for, and the acceleration at other times."""
+            """Return the velocity gained within `width` of the part, and the acceleration at other times."""
             values = jets(jnp.concatenate([begin + width * (0.5 + nodes), others]))[0]
             return values[: nodes.size] @ weights * width, values[nodes.size :]
 
         gain, (left, right) = gain_and(step, jnp.stack([begin, begin + step]))
-        turns = jnp.sign(left) * jnp.sign(right) < 0  # the product of small ones may be zero
+        turns = jnp.sign(left) * jnp.sign(right) < 0  # the product of two tiny values could underflow to zero
         zero = step * jnp.where(turns, left / jnp.where(turns, left - right, 1.0), 0.0)
 
         def nearer(_, found):
@@ -128,7 +130,7 @@ def _peaks_of(motion: AbstractMotion, room: int | None):
 
 
 def _wanted(motion: AbstractMotion) -> Array | None:
-    """Return the least number of parts of all pieces together, if `_parts` are too few; else 0."""
+    """Return the number of parts needed for all pieces together, if `_parts` gives too few; else 0."""
     lengths, scales = jax.lax.stop_gradient((motion.lengths, motion.scales))
     if scales is None:
         return None
@@ -139,9 +141,10 @@ def _wanted(motion: AbstractMotion) -> Array | None:
 
 
 def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
-    """The piece of every part, where in it the part begins, and how long it is [s].
+    """Return the piece of every part, the begin of the part within it, and the length of the part [s].
 
-    Of few pieces all have as many; of many those that are no straight line have as many as their curves ask for.
+    Few pieces get equally many parts each. Among many pieces, a straight line is one part, and others get parts by
+    their time scale.
     """
     lengths = motion.lengths
     if lengths.size > _FEW and motion.scales is not None:
@@ -153,11 +156,11 @@ def _parts(motion: AbstractMotion) -> tuple[Array, Array, Array]:
 
 
 def _parts_by_scale(motion: AbstractMotion, room: int) -> tuple[Array, Array, Array]:
-    """Return `_parts` by time scale: one for every piece, the others in proportion to its changes."""
+    """Return `_parts` by time scale: one for every piece, the others in proportion to length over time scale."""
     lengths, scales = motion.lengths, jnp.inf if motion.scales is None else motion.scales
     wanted = _PER_SCALE * lengths / scales
     counts = 1 + jnp.floor(wanted * jnp.minimum(1.0, room / jnp.maximum(wanted.sum(), 1.0))).astype(int)
-    total = lengths.size + room  # those that are left over lie at the end, without a length
+    total = lengths.size + room  # unused parts lie at the end and have no length
     piece = jnp.repeat(jnp.arange(lengths.size), counts, total_repeat_length=total)
     within = jnp.arange(total) - (jnp.cumsum(counts) - counts)[piece]
     step = lengths[piece] / counts[piece]

@@ -1,7 +1,7 @@
-"""What is done to records before they shake anything: from displacement and velocity, fused with a displacement,
-baseline, taper, filter, resample, cut, scale. Known records only: NumPy and SciPy do it, not JAX.
+"""Processing of records before an analysis, for known records only, in NumPy and SciPy rather than JAX.
 
-Every function gives a new `Record` that keeps the name and the origin.
+Records are made from displacement or velocity, fused with a displacement, corrected for their baseline, tapered,
+filtered, resampled, cut and scaled. Every function returns a new `Record` that keeps the name and the origin.
 """
 
 from fractions import Fraction
@@ -51,16 +51,16 @@ def _samples(record: Record) -> tuple[np.ndarray, float]:
 
 
 def _number(name: str, value: ArrayLike, allowed: Range) -> float:
-    """The one number that an argument is, after a check; in all digits that were given."""
+    """Return an argument as one checked number, in all digits that were given."""
     checked = allowed(name, value)
     check_known(**{name: checked})
     scalar(name, checked)
-    # In all digits that were given, of which JAX may keep half.
+    # `checked` may be a single-precision array of JAX: take the given value.
     return as_meant(checked if isinstance(value, jax.Array) else value)
 
 
 def _slack(record: Record) -> float:
-    """By how much a ratio of times may be off, through rounding of the time step."""
+    """Relative tolerance of a ratio of times, for rounding of the time step."""
     return max(1e-12, 4 * float(np.finfo(np.asarray(record.dt).dtype).eps))
 
 
@@ -87,7 +87,7 @@ Order = Annotated[int, at_least(1, 20)]
 def _series(name: str, values: Values, dt: ArrayLike, unit: str) -> tuple[np.ndarray, float]:
     checked = strength(name, values)
     check_known(**{name: checked})
-    # In all digits that were given: a second derivative of what is rounded to single precision is noise.
+    # Keep all digits that were given: the second derivative of values rounded to single precision is noise.
     array = np.asarray(checked if isinstance(values, jax.Array) else values, float)
     if array.ndim != 1 or array.size < 4:
         raise ValueError(f"Argument `{name}` must be a list of at least 4 samples, but has shape {array.shape}.")
@@ -104,21 +104,23 @@ def from_displacement(
     order: Order = 4,
     name: str = "",
 ) -> Record:
-    """A record from the ground's displacement, such as a shake table's.
+    """Make a record from the ground's displacement, such as a shake table's.
 
     **Arguments:**
 
     - `displacement`: (n,) samples, n at least 4; the ground is at rest at first.
     - `dt`: time between samples [s], positive.
     - `unit`: of the displacement: "m", "cm" or "mm".
-    - `corner`: of a Butterworth low-pass of this `order`, run forwards and backwards before it is differentiated [Hz];
-      None: no filter, and noise grows with the square of the frequency. Where the ground still moves at the end the
+    - `corner`: of a Butterworth low-pass of this `order`, run forwards and backwards before the differentiation [Hz];
+      None: no filter, and noise grows with the square of the frequency. Where the ground still moves at the end, the
       acceleration fades over the last 1/corner.
     - `name`: of the record.
 
-    **Returns:** a `Record`: the second derivative of the cubic spline through the samples, which is at rest at first
-    and straight between samples. So integrated twice it comes back to every sample. Over 9.81 m/s^2. All is done in
-    double precision; samples that are given in single precision (arrays of JAX, where that is its precision) are noisy.
+    **Returns:** a `Record`: the second derivative, over 9.81 m/s^2, of the cubic spline through the samples. The
+    spline is at rest at first, and its second derivative is straight between samples. Integrated twice, the record
+    therefore returns to every sample.
+
+    All is done in double precision. Samples given in single precision (JAX arrays where that is the default) are noisy.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
@@ -137,7 +139,7 @@ def from_velocity(
     order: Order = 4,
     name: str = "",
 ) -> Record:
-    """A record from the ground's velocity.
+    """Make a record from the ground's velocity.
 
     **Arguments:**
 
@@ -145,8 +147,8 @@ def from_velocity(
     - `dt`, `corner`, `order`, `name`: as in `from_displacement`.
     - `unit`: "m", "cm" or "mm", a second.
 
-    **Returns:** a `Record`: the first derivative of the cubic spline through the samples, at the samples. Over 9.81
-    m/s^2.
+    **Returns:** a `Record`: the first derivative, over 9.81 m/s^2, of the cubic spline through the samples, taken at
+    the samples.
 
     **Raises:** ValueError for arguments outside their ranges.
     """
@@ -166,21 +168,21 @@ def fused(
     corner: Annotated[float, known(positive)] = 0.5,
     order: Order = 4,
 ) -> Record:
-    """A record whose slow part comes from a displacement: what a displacement sensor and an accelerometer say together.
+    """Combine an accelerometer's record with a displacement sensor's, which gives its slow part.
 
     **Arguments:**
 
     - `record`: of the accelerometer, whose baseline may drift.
     - `displacement`: (n,) samples of the ground at the same place, n at least 4, the first at the record's first; at
-      rest at first. The shorter of the two ends both.
+      rest at first. The result ends with the shorter of the two.
     - `dt`: time between its samples [s], positive.
     - `unit`: of the displacement: "m", "cm" or "mm".
-    - `corner`: of the Butterworth filters of this `order`, run forwards and backwards [Hz]: below, the displacement is
-      believed, above, the accelerometer. Below half of both sampling rates.
+    - `corner`: of the Butterworth filters of this `order`, run forwards and backwards [Hz]: the displacement decides
+      below it, the accelerometer above. It lies below half of both sampling rates.
 
-    **Returns:** a `Record` of the accelerometer's time step: the record without a low-pass of what it differs by from
-    the second derivative of the displacement's spline. What both agree on stays as it is, a constant and a ramp of the
-    baseline go altogether, and other differences go on evenly beyond both ends.
+    **Returns:** a `Record` of the accelerometer's time step: the record less a low-pass of its difference from the
+    second derivative of the displacement's spline. Where both sensors agree, the record is unchanged. A constant and a
+    ramp of the baseline are removed exactly; other differences are extended evenly beyond both ends for the filter.
 
     **Raises:** ValueError for arguments outside their ranges.
 
@@ -199,12 +201,12 @@ def fused(
 
 @arguments
 def baseline_corrected(record: Record, degree: Annotated[int, at_least(1, 10)] = 2) -> Record:
-    """A record without the drift of its velocity: the derivative of a polynomial fitted to the velocity is taken off.
+    """Remove the drift of a record's velocity: subtract the derivative of a polynomial fitted to the velocity.
 
     **Arguments:**
 
     - `record`: a `Record` of two samples or more.
-    - `degree`: of the polynomial in velocity, which is zero at time 0; 1 takes a constant off the acceleration.
+    - `degree`: of the polynomial in velocity, which is zero at time 0; 1 subtracts a constant from the acceleration.
 
     **Returns:** a `Record`.
 
@@ -222,11 +224,11 @@ def baseline_corrected(record: Record, degree: Annotated[int, at_least(1, 10)] =
 
 @arguments
 def tapered(record: Record, seconds: ArrayLike) -> Record:
-    """A record that rises from zero and falls to zero as half a cosine.
+    """Taper a record: it rises from zero and falls to zero as half a cosine.
 
     **Arguments:**
 
-    - `seconds`: how long either end takes [s], 0 or more, at most half the record.
+    - `seconds`: duration of the taper at either end [s], 0 or more, at most half the record.
 
     **Returns:** a `Record`: times Tukey's window.
 
@@ -243,11 +245,11 @@ def tapered(record: Record, seconds: ArrayLike) -> Record:
 def filtered(
     record: Record, low: Corner = None, high: Corner = None, *, order: Order = 4, zero_phase: bool = True
 ) -> Record:
-    """A record after a Butterworth filter.
+    """Pass a record through a Butterworth filter.
 
     **Arguments:**
 
-    - `low`, `high`: frequencies that pass [Hz], above and below which; None: no such end. One of them at least.
+    - `low`, `high`: corners of the band that passes [Hz]; None: no corner at that end. At least one is needed.
     - `order`: of the filter.
     - `zero_phase`: whether it runs forwards and backwards (which doubles its order); the ground rests before and after.
 
@@ -269,16 +271,16 @@ def filtered(
 
 @arguments
 def resampled(record: Record, dt: ArrayLike) -> Record:
-    """A record with another time step.
+    """Resample a record with another time step.
 
     **Arguments:**
 
     - `dt`: the new time step [s], positive.
 
-    **Returns:** a `Record`. With a shorter step it lies on the old one's straight lines; with a step that is a whole
-    number of times shorter it is the same motion. With a longer step it has passed a linear-phase low-pass below half
-    the new sampling rate first (`scipy.signal.resample_poly`); the ground rests before and after, so that samples at
-    the ends of a record which does not begin or end at zero are smaller.
+    **Returns:** a `Record`. A shorter step samples the old one's straight lines; a step that is a whole number of times
+    shorter gives the same motion. A longer step follows a linear-phase low-pass below half the new sampling rate
+    (`scipy.signal.resample_poly`). That filter takes the ground as at rest before and after: samples at the ends of a
+    record that does not begin or end at zero become smaller.
 
     **Raises:** ValueError for arguments outside their ranges, or a longer step that is no ratio of small numbers.
     """
@@ -296,7 +298,7 @@ def resampled(record: Record, dt: ArrayLike) -> Record:
 
 @arguments
 def cut(record: Record, begin: ArrayLike = 0.0, end: ArrayLike | None = None) -> Record:
-    """The part of a record between two times, from the sample at or after the first to that at or before the second.
+    """Cut a record to the samples between two times, those at the times included.
 
     **Arguments:**
 
@@ -325,17 +327,17 @@ def scaled(
     acceleration: ArrayLike | None = None,
     velocity: ArrayLike | None = None,
 ) -> Record:
-    """A record times a factor, or to a peak.
+    """Scale a record by a factor, or to a peak.
 
     **Arguments:** one of
 
     - `factor`: any number.
-    - `acceleration`: peak acceleration that it gets [g], positive.
-    - `velocity`: peak velocity that it gets [m/s], positive.
+    - `acceleration`: peak acceleration of the result [g], positive.
+    - `velocity`: peak velocity of the result [m/s], positive.
 
     **Returns:** a `Record`.
 
-    **Raises:** ValueError where not just one is given, and for a peak that a record which does not move cannot get.
+    **Raises:** ValueError where not just one is given, and for a peak of a record that does not move.
     """
     samples, _ = _samples(record)
     given = {"factor": factor, "acceleration": acceleration, "velocity": velocity}

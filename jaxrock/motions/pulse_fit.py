@@ -1,7 +1,7 @@
-"""The pulse in a record: parameters of any class of pulses, by nonlinear least squares with exact derivatives.
+"""Fitting a pulse to a record: parameters of any class of pulses, by nonlinear least squares with exact derivatives.
 
-Where a pulse may begin is found by correlation for a grid of its other parameters; from the best of these SciPy's
-least squares descends.
+Correlation finds the best begin of the pulse for a grid of its other parameters. SciPy's least squares descends from
+the best points of the grid.
 """
 
 import functools
@@ -30,15 +30,15 @@ from jaxrock.status import Enumeration, item
 
 _ORDER = 6  # nodes of the quadrature over parts of pieces
 _PARTS = 64  # least number of parts of every smooth piece of a pulse
-_PER_SCALE = 0.5  # parts of the time in which its acceleration changes: exact to 1e-9
+_PER_SCALE = 0.5  # parts per time scale of the acceleration: exact to 1e-9
 _MOST = 1 << 14
-_LENGTHS = 14  # periods or durations that are tried
+_LENGTHS = 14  # grid points for a period or duration
 _USUAL = {"oscillations": (1.01, 8.0), "shape": (-30.0, 30.0), "phase": (-np.pi, np.pi)}
-_FIRST = {"oscillations": (1.2, 2.0, 3.0), "shape": (-4.0, 0.0, 4.0), "phase": (0.0, np.pi / 2)}  # where it is tried
+_FIRST = {"oscillations": (1.2, 2.0, 3.0), "shape": (-4.0, 0.0, 4.0), "phase": (0.0, np.pi / 2)}  # points of the grid
 
 
 class PulseStatus(Enumeration):
-    """What became of a fit of a pulse; `PulseStatus[fit.status]` is the message."""
+    """The outcome of a fit of a pulse; `PulseStatus[fit.status]` is the message."""
 
     successful = item("The sum of squares has a minimum there.")
     at_an_end = item("The least sum of squares lies at an end of a range: widen it, or take another pulse.")
@@ -46,7 +46,7 @@ class PulseStatus(Enumeration):
 
 
 class PulseFit(eqx.Module):
-    """What `fit_pulse` finds.
+    """The result of `fit_pulse`.
 
     - `motion`: the pulse after its `delay` [s] in the record; `pulse`: the same from time 0.
     - `values`: its parameters by name, the delay among them; `at_ends`: names of those at an end of their range.
@@ -66,12 +66,12 @@ class PulseFit(eqx.Module):
 
     @property
     def delay(self) -> float:
-        """When the pulse begins [s]."""
+        """Time at which the pulse begins [s]."""
         return self.values["delay"]
 
     @property
     def motion(self) -> AbstractMotion:
-        """The pulse as it stands in the record."""
+        """The pulse after its delay in the record."""
         return self.pulse.shifted(self.delay)
 
 
@@ -84,18 +84,18 @@ def fit_pulse(
     of: Annotated[str, word_of("velocity", "acceleration")] = "velocity",
     starts: Annotated[int, at_least(1, 100)] = 6,
 ) -> PulseFit:
-    """The pulse of a class that comes nearest to a record, by least squares.
+    """Fit a pulse of a class to a record, by least squares.
 
     **Arguments:**
 
     - `record`: a `Record`, its baseline corrected.
     - `pulse`: makes a motion of its parameters, proportional to `amplitude`: a class such as
-      `rk.MavroeidisPapageorgiouPulse`, or a function; what `functools.partial` gives by name is not looked for.
-    - `ranges`: (low, high) of parameters by name, of `delay` [s], too. What is left out has a usual one: times from
-      four samples to the whole record, `oscillations` 1.01 to 8, `shape` -30 to 30, phases half a turn either way;
-      parameters of other names must have one.
-    - `of`: what is compared at all samples: "velocity", as is usual for pulses near faults, or "acceleration".
-    - `starts`: from how many descents begin: the best of a grid, each where it correlates best with the record.
+      `rk.MavroeidisPapageorgiouPulse`, or a function. Parameters that `functools.partial` sets by name are not fitted.
+    - `ranges`: (low, high) of parameters by name, `delay` [s] among them. The default ranges are: times from four
+      samples to the whole record, `oscillations` 1.01 to 8, `shape` -30 to 30, phases half a turn either way.
+      Parameters of other names must have a range.
+    - `of`: compared at all samples: "velocity", as is usual for pulses near faults, or "acceleration".
+    - `starts`: number of descents, from the best points of a grid, each with the delay of its best correlation.
 
     **Returns:** a `PulseFit`. There may be lower minima that no start leads to.
 
@@ -123,7 +123,7 @@ def fit_pulse(
 
 
 class _Kind(NamedTuple):
-    """What is made of a place: parameters, times but the delay as their logarithms."""
+    """The map from a point of the search space to a pulse: parameters, of which durations enter as logarithms."""
 
     pulse: Callable[..., AbstractMotion]
     names: tuple[str, ...]
@@ -132,12 +132,12 @@ class _Kind(NamedTuple):
     parts: int = _PARTS
 
     def values(self, place) -> dict:
-        """Parameters by name."""
+        """Return the parameters by name."""
         return {name: jnp.exp(x) if log else x for name, x, log in zip(self.names, place, self.logarithmic)}
 
 
 class _Problem(NamedTuple):
-    """What a record's pulse is to come near to, at `times`, and the ends of places."""
+    """The least-squares problem: target values at `times`, and the bounds of the search space."""
 
     kind: _Kind
     target: Float[np.ndarray, " n"]
@@ -147,7 +147,7 @@ class _Problem(NamedTuple):
 
     @classmethod
     def of(cls, record: Record, pulse: Callable, ranges: Mapping, of: str) -> "_Problem":
-        """The problem, checked."""
+        """Check the arguments and make the problem."""
         samples, dt = np.asarray(record.samples, float), float(record.dt)
         if samples.size < 8 or not np.abs(samples).max() > 0:
             raise ValueError("Argument `record` must move, and have 8 samples at least.")
@@ -168,7 +168,7 @@ class _Problem(NamedTuple):
         return cls(kind, velocity if of == "velocity" else samples, times, *ends.T)
 
     def starts(self, count: int) -> list[np.ndarray]:
-        """The best places of a grid, each with the delay and the amplitude that fit best there."""
+        """Return the best points of a grid, each with its best delay and amplitude."""
         from scipy.signal import correlate
 
         names = self.kind.names
@@ -177,7 +177,7 @@ class _Problem(NamedTuple):
         allowed = (self.times >= self.lower[-1] - 1e-9) & (self.times <= self.upper[-1] + 1e-9)
         for place, one in zip(places, seen):
             products = correlate(self.target, one, method="fft")[size - 1 :]
-            squares = np.maximum(np.cumsum(one**2)[::-1], 1e-300)  # of what is within the record after each delay
+            squares = np.maximum(np.cumsum(one**2)[::-1], 1e-300)  # of the part within the record, for each delay
             gains = np.where(allowed & (squares > 1e-3 * squares[0]), products**2 / squares, -np.inf)
             at = int(np.argmax(gains))
             place[names.index("amplitude")], place[-1] = products[at] / squares[at], self.times[at]
@@ -186,7 +186,7 @@ class _Problem(NamedTuple):
         return [place for _, place in found[:count]]
 
     def _tried(self, index: int) -> np.ndarray:
-        """Where a parameter is tried; the amplitude and the delay follow."""
+        """Return the grid of one parameter; the best amplitude and delay follow from the others."""
         name, low, high = self.kind.names[index], self.lower[index], self.upper[index]
         if name in ("amplitude", "delay"):
             return np.array([1.0 if name == "amplitude" else 0.0])
@@ -197,13 +197,13 @@ class _Problem(NamedTuple):
         return first if first.size else low + (high - low) * np.array([0.25, 0.5, 0.75])
 
     def descend(self, place: np.ndarray):
-        """SciPy's least squares from a place."""
+        """Run SciPy's least squares from a point."""
         from scipy.optimize import least_squares
 
         room, known = 1e-9 * (self.upper - self.lower), {}
 
         def at(x):
-            """Values and slopes, which SciPy asks for one after the other."""
+            """Return values and Jacobian at a point, which SciPy asks for one after the other."""
             if x.tobytes() not in known:
                 known.clear()
                 known[x.tobytes()] = _with_slopes(self.kind, x, self.times)
@@ -223,7 +223,8 @@ class _Problem(NamedTuple):
 
 
 def _parts_of(kind: _Kind, ends: np.ndarray) -> int:
-    """Return the number of parts of each piece, so that pulses at all ends of the ranges change little within each.
+    """Return the number of parts of each piece, so that the acceleration of all pulses in the ranges changes little in
+    each.
 
     **Raises:** ValueError for ranges of pulses with too many cycles.
     """
@@ -238,7 +239,7 @@ def _parts_of(kind: _Kind, ends: np.ndarray) -> int:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _changes(kind: _Kind, places):
-    """Return the lengths of pieces of a pulse over the time in which its acceleration changes, at some places."""
+    """Return, at some points, the largest ratio of a piece's length to the time scale of its acceleration."""
 
     def at(place):
         values = kind.values(place)
@@ -250,7 +251,7 @@ def _changes(kind: _Kind, places):
 
 
 def _parameters(pulse: Callable) -> list[str]:
-    """Names of the numbers that a function makes a pulse of."""
+    """Return the names of the numeric parameters of a function that makes a pulse."""
     told = inspect.signature(pulse).parameters.values()
     names = [each.name for each in told
              if each.kind is each.POSITIONAL_OR_KEYWORD and not isinstance(each.default, str | None)]  # fmt: skip
@@ -260,7 +261,7 @@ def _parameters(pulse: Callable) -> list[str]:
 
 
 def _range(name: str, value) -> tuple[float, float]:
-    """Both ends of the range of a parameter."""
+    """Return the checked ends of the range of a parameter."""
     if value is None:
         raise ValueError(f"Argument `ranges` must hold a range of `{name}`, but does not.")
     low, high = (float(scalar(f"ranges[{name}]", finite(f"ranges[{name}]", end))) for end in pair("ranges", value))
@@ -270,7 +271,7 @@ def _range(name: str, value) -> tuple[float, float]:
 
 
 def _model(kind: _Kind, place, times):
-    """What is compared, at all times."""
+    """Return the compared quantity, velocity or acceleration, at all times."""
     values = kind.values(place)
     times = times - values.pop("delay")
     pulse = kind.pulse(**values)
@@ -293,15 +294,16 @@ def _with_slopes(kind: _Kind, place, times):
 
 
 def _velocity(pulse: AbstractMotion, times: Float[Array, " n"], count: int) -> Float[Array, " n"]:
-    """Integrate the acceleration, by Gauss-Legendre quadrature over parts of pieces [g s]; smooth where a pulse
-    jumps."""
+    """Integrate the acceleration by Gauss-Legendre quadrature over parts of pieces [g s]; exact also where a pulse
+    jumps.
+    """
     knots, lengths = pulse.knots, pulse.lengths
     nodes, weights = (jnp.asarray(values) for values in gauss_legendre(_ORDER))
     piece = jnp.clip(jax.vmap(lambda time: count_up_to(knots, time))(times) - 1, 0, lengths.size - 1)
     local = jnp.clip(times - knots[piece], 0.0, lengths[piece])
     width = jnp.where(lengths[piece] > 0, lengths[piece], 1.0) / count
     part = jnp.clip(jnp.floor(jax.lax.stop_gradient(local / width)).astype(int), 0, count - 1)
-    # All parts of all pieces, and what is left to each time of the part that it lies in: in one go, to compile less.
+    # One batch of quadratures, to compile less: all parts of all pieces, then the part before each time.
     every, parts = jnp.repeat(jnp.arange(lengths.size), count), jnp.tile(jnp.arange(count), lengths.size)
     pieces = jnp.concatenate([every, piece])
     begins = jnp.concatenate([parts * lengths[every] / count, part * width])

@@ -20,7 +20,7 @@ from jaxrock.motions.motion import AbstractMotion, Piece, Scalar
 from jaxrock.motions.pieces import Lasting
 from jaxrock.numerics.choice import where
 
-_SHORT = 64  # samples of a record that is a program of its own
+_SHORT = 64  # samples; shorter records are not padded but compiled for their own length
 STRONGEST = 3.0  # [g]; few records exceed it
 _is_in_g = contextvars.ContextVar("is_in_g", default=False)  # whether samples are known to be in g
 
@@ -33,7 +33,7 @@ class Straight(AbstractMotion):
 
     @property
     def _ends(self) -> tuple[Inexact[Array, " pieces"], Inexact[Array, " pieces"]]:
-        """Acceleration at both ends of each piece [g]."""
+        """Accelerations at both ends of each piece [g]."""
         if self.samples.shape[-1] == 1:
             return self.samples, self.samples
         return self.samples[:-1], self.samples[1:]
@@ -55,11 +55,11 @@ class Straight(AbstractMotion):
 
 
 class Origin(NamedTuple):
-    """What a file says of a record, in its words; empty where it says nothing.
+    """Metadata of a record as its file states them; empty where the file says nothing.
 
     - `event`, `station`, `component`: the earthquake, the station's name, the direction of the sensor.
-    - `start`: when the first sample was taken; `code`: of the station.
-    - `format`, `unit`: of the file, before the samples were brought to g; `file`: its name.
+    - `start`: time of the first sample; `code`: of the station.
+    - `format`, `unit`: of the file, before the samples were converted to g; `file`: its name.
     """
 
     event: str = ""
@@ -80,15 +80,15 @@ class Record(Straight):
     - `acceleration`: (n,) samples [g], the first at time 0, finite; n at least 1 (a single sample lasts no time and
       moves nothing). Or (..., n) of many records of one length, for use under `jax.vmap`.
     - `dt`: time between samples [s], positive.
-    - `name`: where it comes from; shown in tables and figures. Compiled functions do not see it: one serves all names,
-      and a record that it returns has the name that the first one had.
-    - `origin`: an `Origin`, what a file says of it; None: nothing.
+    - `name`: where it comes from; shown in tables and figures. Compiled functions ignore it: one serves all names, and
+      a record that it returns has the name of the record for which it was compiled.
+    - `origin`: an `Origin`, the metadata of its file; None: nothing.
 
     **Raises:** ValueError for samples that are not finite numbers, a column (n, 1) in place of them, or dt <= 0.
 
-    It warns of known samples beyond 3 g, which are likely in another unit. `factor * record` never warns.
+    Known samples beyond 3 g raise a warning, as they are likely in another unit. `factor * record` never warns.
 
-    Stepping from knot to knot, an engine meets the record exactly: there is no interpolation error.
+    An engine steps from knot to knot, so it meets the record exactly: there is no interpolation error.
     """
 
     samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
@@ -133,7 +133,7 @@ class Record(Straight):
         if self.samples.shape[-1] == 1:
             return jnp.zeros(2, self.samples.dtype)
         count = self.samples.shape[-1]
-        if is_traced(self.dt):  # a list of numbers would stand in the program
+        if is_traced(self.dt):  # a NumPy array would become a constant of the program
             return self.dt * jnp.arange(count)
         return placed(np.asarray(self.dt) * np.arange(count, dtype=self.dt.dtype))
 
@@ -151,7 +151,7 @@ class Record(Straight):
 
 
 def record_in_g(acceleration: Values, dt: ArrayLike, name: str = "", origin: Origin | None = None) -> Record:
-    """Make a `Record` of samples computed from accelerations in g, without a warning about their unit."""
+    """Make a `Record` from accelerations known to be in g, without a warning about their unit."""
     before = _is_in_g.set(True)
     try:
         return Record(acceleration, dt, name, origin)
@@ -172,16 +172,16 @@ def _warn_of_unit(samples: np.ndarray, name: str) -> None:
 
 
 class AbstractChosen(AbstractMotion):
-    """A record whose samples lie among those of others."""
+    """A record stored in an array together with others."""
 
     @property
     @abc.abstractmethod
     def alone(self) -> "Padded":
-        """The record with samples of its own."""
+        """The record with an array of its own samples."""
 
 
 class Padded(Straight):
-    """A record with room for more samples, which are zero and at its end."""
+    """A record padded with zero samples at its end."""
 
     samples: Inexact[Array, "*batch n"] = parameter("g", strength, axes=1)
     dt: Inexact[Array, "..."] = parameter("s", size)
@@ -204,21 +204,20 @@ class Padded(Straight):
 
 
 def padded(motion: AbstractMotion) -> AbstractMotion:
-    """The same motion, with room in its records: so that those of many lengths are one program.
+    """Pad the records of a motion, so that one compiled program serves many lengths.
 
-    There is room for a quarter more samples at most. Its pieces beyond the end have no length.
+    Padding adds at most a quarter of the samples. Pieces beyond the end have no length.
     """
     return jax.tree.map(_padded, motion, is_leaf=_is_record)
 
 
 def with_room(motion: AbstractMotion) -> AbstractMotion:
-    """The same motion, with room in its records for as many samples as the next power of two, 1024 at least: so that a
-    few programs serve a suite of any lengths."""
+    """Pad the records of a motion to the next power of two, 1024 at least, so that a few programs serve all lengths."""
     return jax.tree.map(_doubled, motion, is_leaf=_is_record)
 
 
 def roomy(count: int) -> int:
-    """Room for so many, and for a quarter more at most: a few numbers serve all."""
+    """Return a padded size, at most a quarter larger than `count`; few sizes occur."""
     return count + -count % (1 << max((count - 1).bit_length() - 3, 0))
 
 
@@ -245,11 +244,11 @@ def _padded(part):
 
 
 def _with_room(samples, dt, more: int):
-    # Known samples go through NumPy: of JAX's padding there would be a program for every number of samples.
+    # NumPy pads known samples: `jnp.pad` would compile a program for every number of samples.
     room = [(0, 0)] * (samples.ndim - 1) + [(0, more)]
     if is_traced(samples):
         roomier = jnp.pad(samples, room)
     else:
-        with jax.ensure_compile_time_eval():  # known to what is traced, too
+        with jax.ensure_compile_time_eval():  # known also under tracing
             roomier = placed(np.pad(np.asarray(samples), room))
     return roomier, dt, of_each(lambda dt: dt * (samples.shape[-1] - 1), dt)

@@ -1,4 +1,4 @@
-"""What motions tell of the ground: its acceleration as a series, and bounds of it."""
+"""The ground's acceleration as a Taylor series, and bounds of it."""
 
 from collections.abc import Callable
 from typing import NamedTuple, overload
@@ -18,28 +18,28 @@ class Shaking(NamedTuple):
     vertical: list[Scalar] | None = None
 
     def each(self, function: Callable) -> "Shaking":
-        """The same with the coefficients that a function makes of those of each component."""
+        """Apply a function to the coefficients of each component."""
         return Shaking(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
     def at(self, x: Scalar) -> tuple[Scalar, Scalar | None]:
-        """Horizontal acceleration [g], and the weight of a mass over that at rest (None: 1), at x units of time."""
+        """Return the horizontal acceleration [g] and the weight over that at rest (None: 1), at x units of time."""
         return horner(self.horizontal, x), None if self.vertical is None else 1 + horner(self.vertical, x)
 
     @property
     def now(self) -> tuple[Scalar, Scalar | None]:
-        """As `at` no time at all."""
+        """The values of `at` for x = 0."""
         return self.horizontal[0], None if self.vertical is None else 1 + self.vertical[0]
 
     def rescaled(self, length: Scalar) -> "Shaking":
-        """Coefficients in time/length."""
+        """Return the coefficients in time/length."""
         return self.each(lambda terms: rescaled(terms, length))
 
     def shifted(self, by: Scalar) -> "Shaking":
-        """Coefficients about a time `by` later."""
+        """Return the coefficients about a time `by` later."""
         return self.each(lambda terms: shifted(terms, by))
 
     def steepest(self, within: Scalar | float = 1.0) -> tuple[Scalar, Scalar | None]:
-        """Bounds of how fast the components change in so many units of time, per unit."""
+        """Bound the rates of change of the components within this many units of time, per unit."""
 
         def bound(terms):
             slopes = [k * jnp.abs(c) for k, c in enumerate(terms)][1:]
@@ -49,11 +49,12 @@ class Shaking(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Upper bounds of a component's absolute acceleration within each piece [g], times `gain` where there is one: what
-    only scales a motion leaves the array to all scales alike.
+    """Upper bounds of a component's absolute acceleration within each piece [g], times `gain` where there is one.
 
-    Of a motion in which many follow one another: `left`, how many pieces there are from each on to the end of its own,
-    and `peak`, the largest value among those of one; None: all pieces belong together.
+    The gain stands apart so that lanes that only scale a motion share the array.
+
+    Where many records follow one another, `left` is the number of pieces from each to the end of its record, and `peak`
+    the largest value of the chosen record. None: all pieces belong to one motion.
     """
 
     values: Inexact[Array, " pieces"]
@@ -62,12 +63,12 @@ class Bounds(NamedTuple):
     peak: Scalar | None = None
 
     def scaled(self, factor: Scalar) -> "Bounds":
-        """Those of a motion that is so many times as strong."""
+        """Return the bounds of the motion times a factor."""
         factor = jnp.abs(factor)
         return self._replace(gain=factor if self.gain is None else factor * self.gain)
 
     def times_gain(self, values: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-        """Some of the values, or what was made of them, as bounds."""
+        """Multiply some of the values, or numbers derived from them, by the gain."""
         return values if self.gain is None else self.gain * values
 
     @property
@@ -83,7 +84,7 @@ class Envelope(NamedTuple):
     vertical: Bounds | None
 
     def each(self, function: Callable) -> "Envelope":
-        """The same with the bounds that a function makes of those of each component."""
+        """Apply a function to the bounds of each component."""
         return Envelope(function(self.horizontal), None if self.vertical is None else function(self.vertical))
 
 
@@ -92,7 +93,7 @@ def sum_of_series(first: list[Scalar], second: list[Scalar] | None) -> list[Scal
 @overload
 def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None: ...
 def sum_of_series(first: list[Scalar] | None, second: list[Scalar] | None) -> list[Scalar] | None:
-    """Coefficients of a sum; None is zero."""
+    """Add two lists of coefficients; None is zero."""
     if first is None or second is None:
         return first if second is None else second
     longer, shorter = (first, second) if len(first) > len(second) else (second, first)

@@ -1,4 +1,4 @@
-"""A known motion as straight lines, in NumPy: what measures of intensity are sums over."""
+"""A known motion as straight lines, in NumPy: the measures of intensity are sums over these lines."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,9 @@ from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.peaks import too_long
 from jaxrock.motions.record import Record
 
-_LINES = 16384  # of smooth pieces, at least
-_PER_SCALE = 256  # of the time in which an acceleration changes
-_FEWEST = 32  # lines of that time, with an error of 1e-7
+_LINES = 16384  # least number of lines of all smooth pieces together
+_PER_SCALE = 256  # lines per time scale of the acceleration
+_FEWEST = 32  # least number of lines per time scale, with an error of 1e-7
 _MOST = 1 << 20
 
 
@@ -31,23 +31,23 @@ class Straight(NamedTuple):
 
     @property
     def times(self) -> np.ndarray:
-        """Their ends, from 0 on [s]."""
+        """Times of the ends of lines, from 0 on [s]."""
         return np.concatenate([[0.0], np.cumsum(self.length)])
 
     @property
     def velocity(self) -> np.ndarray:
-        """At their ends [m/s], of a ground at rest at first."""
+        """Velocity at the ends of lines [m/s], of a ground that starts from rest."""
         return np.concatenate([[0.0], np.cumsum(self.length * (self.begin + self.end) / 2)])
 
     @property
     def displacement(self) -> np.ndarray:
-        """At their ends [m]."""
+        """Displacement at the ends of lines [m]."""
         gain = self.length * self.velocity[:-1] + self.length**2 * (2 * self.begin + self.end) / 6
         return np.concatenate([[0.0], np.cumsum(gain)])
 
 
 def straight(motion: AbstractMotion) -> Straight:
-    """The horizontal acceleration of one known motion: of a record just that, of others close to it.
+    """Return the horizontal acceleration of one known motion: a record exactly, other motions approximately.
 
     **Raises:** ValueError for many motions in one, or one that is traced.
     """
@@ -72,7 +72,7 @@ def straight(motion: AbstractMotion) -> Straight:
     step = (lengths / np.maximum(counts, 1))[piece]
     places = (number * step, (number + 0.5) * step, np.minimum((number + 1) * step, lengths[piece]))
     begin, middle, end = (GRAVITY * _values(motion, piece, local) for local in places)
-    # Chords of a curve lie on its inner side: these lines have its integral, by Simpson's rule.
+    # Chords lie on the inner side of a curve: shift them to have the curve's integral by Simpson's rule.
     bend = 2 / 3 * (middle - (begin + end) / 2)
     return Straight(begin + bend, end + bend, step)
 
@@ -80,7 +80,7 @@ def straight(motion: AbstractMotion) -> Straight:
 def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
     """Return the number of lines of each piece: one for a straight piece, none without a length, else by its curvature.
 
-    Pieces without a length make room for longer records.
+    Padding of records gives pieces without a length.
 
     **Raises:** ValueError for curves of too many lines.
     """
@@ -96,8 +96,8 @@ def _counts(lengths: np.ndarray, scales: np.ndarray | None) -> np.ndarray:
 
 
 def _values(motion: AbstractMotion, piece: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """Acceleration [g] at times from the beginnings of pieces, from within them."""
-    room = (0, (1 << (piece.size - 1).bit_length()) - piece.size)  # few lengths: each is a program
+    """Return the acceleration [g] at times from the beginnings of pieces, each from within its piece."""
+    room = (0, (1 << (piece.size - 1).bit_length()) - piece.size)  # few sizes, as each is compiled
     return np.asarray(_series(motion, np.pad(piece, room, "edge"), np.pad(local, room, "edge")), float)[: piece.size]
 
 

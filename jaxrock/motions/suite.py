@@ -25,12 +25,13 @@ from jaxrock.motions.motion import AbstractMotion, Scaled, Shifted, WithVertical
 from jaxrock.motions.peaks import peaks_of_many, peaks_of_motion
 from jaxrock.motions.record import Record, record_in_g, with_room
 
-_LEAST = 1e-12  # [g]; what is scaled to a level is divided by its peak
+_LEAST = 1e-12  # [g]; peaks are divisors in scaling to a level
 
 
 def _known_stays_so(tree) -> contextlib.AbstractContextManager:
-    """Within it what follows from a tree without traced arrays is computed at once, within `jax.jit` too."""
-    # Where nothing is traced that is so anyway; to ask for it would compile one by one what `jax.jit` compiles whole.
+    """Return a context in which values computed from an untraced tree stay concrete, also within `jax.jit`."""
+    # Outside tracing values are concrete anyway; the context would compile operation by operation instead of whole
+    # programs.
     if is_traced(tree) or not is_traced(jnp.zeros(())):
         return contextlib.nullcontext()
     return jax.ensure_compile_time_eval()
@@ -48,17 +49,17 @@ class Suite(AbstractNamed):
     - `motions`: a list of motions; one whose parameters are arrays of shape (n,) is an ensemble of n. Or a list of
       `Components`, each of which is one motion for every azimuth.
     - `names`: of the motions (or of the components); None: those of records, or the kind, with numbers.
-    - `azimuth`: (azimuths,) of components [rad], within 2 pi, from the first one towards the second: in which vertical
-      planes a block rocks. Motions then are those of the first record at all azimuths, of the second, and so on.
+    - `azimuth`: (azimuths,) of components [rad], within 2 pi, from the first one towards the second: the vertical
+      planes in which a block rocks. The motions are the first record at all azimuths, then the second, and so on.
     - `vertical`: whether the vertical component of components shakes a block, too, if there is one.
 
-    `suite[number]` is one of them; where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`)
+    `suite[number]` is one of them. Where the number is traced (`jax.vmap` over numbers, a suite as an axis of `sweep`),
     all scenes share the samples of all records.
 
-    `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,); `sources` the names of records before they were
-    turned, and `azimuth` (motions,) by how much, or None; so many `turns` are of one record.
+    `peak_acceleration` [g] and `peak_velocity` [m/s] are (motions,). `sources` are the names of records before turning.
+    `azimuth` is the angle of each motion, (motions,), or None. `turns` is the number of motions from each record.
 
-    Within `jax.jit`, `jax.vmap` and derivatives motions may depend on what is traced.
+    Within `jax.jit`, `jax.vmap` and derivatives, motions may depend on traced values.
 
     **Raises:** ValueError if there are no motions, or names in another number, or one twice; for a motion that does not
     move; for components without azimuths, and azimuths without components.
@@ -66,7 +67,7 @@ class Suite(AbstractNamed):
 
     __repr__ = described
 
-    groups: tuple[AbstractMotion, ...]  # each of many motions; of samples that all of it share, there is one set
+    groups: tuple[AbstractMotion, ...]  # ensembles; samples that all of an ensemble share are stored once
     names: tuple[str, ...] = eqx.field(static=True)
     peak_acceleration: Float[Array, " motions"]
     peak_velocity: Float[Array, " motions"]
@@ -114,7 +115,7 @@ class Suite(AbstractNamed):
                 peaks, "Argument `motions` must move the ground", failed
             )
             return
-        # What lasts for no time, as a record of one sample, moves nothing.
+        # A motion without duration, such as a record of one sample, moves nothing.
         for name, peak, speed in zip(self.names, np.asarray(self.peak_acceleration), np.asarray(self.peak_velocity)):
             if not (peak > _LEAST and speed > 0):
                 raise ValueError(f"Argument `motions` must move the ground, but {name!r} does not.")
@@ -124,10 +125,10 @@ class Suite(AbstractNamed):
 
     @called_by_users
     def __getitem__(self, number) -> AbstractMotion:
-        """One of its motions. Where its number is traced, scenes of all records share their samples.
+        """Return one of its motions. Where the number is traced, scenes of all records share their samples.
 
-        **Raises:** IndexError for a number without a motion, ValueError for one that is traced, or is no whole number;
-        ValueError for a traced number where motions are of several kinds, or made of records but by a factor.
+        **Raises:** IndexError for a number out of range; ValueError for one that is not whole. Of a traced number:
+        ValueError out of range, and for motions of several kinds, or derived from records other than by a factor.
         """
         if not is_traced(number):
             place = _place(number, len(self))
@@ -137,12 +138,12 @@ class Suite(AbstractNamed):
         if jnp.ndim(number) or not jnp.issubdtype(number.dtype, jnp.integer):
             raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.")
         motion, failed = self._chosen(number.astype(jnp.int32)), (number < 0) | (number >= len(self))
-        whole, own = eqx.partition(motion, shared(motion))  # what all share is not copied for each
+        whole, own = eqx.partition(motion, shared(motion))  # exclude shared arrays, which would be copied per lane
         message = f"The number of a motion must be in [0, {len(self) - 1}]"
         return eqx.combine(watched(own, message, failed), whole)
 
     def _chosen(self, number) -> AbstractMotion:
-        """The motion of a traced number."""
+        """Return the motion of a traced number."""
         if all(_is_record(group.motion if type(group) is Scaled else group) for group in self.groups):
             with _known_stays_so(self.groups):
                 joined = JoinedRecords.of([_multiplied(motion) for motion in self.motions()])
@@ -160,16 +161,16 @@ class Suite(AbstractNamed):
         return self.motions()
 
     def motions(self) -> Iterator[AbstractMotion]:
-        """Its motions, one by one."""
+        """Yield its motions one by one."""
         for group in self.groups:
             for index in range(size_of(group)):
                 yield one_of_many(group, index)
 
 
 def _place(number: Any, count: int) -> int:
-    """The place of a motion, from 0, by its number, which may be counted from the end."""
+    """Return the index of a motion, from 0, by its number, which may be counted from the end."""
     try:
-        place = operator.index(number)  # of arrays of one whole number, too
+        place = operator.index(number)  # also for an array of one whole number
     except TypeError:
         raise ValueError(f"A motion of a suite has a whole number, but this is {shown(number)}.") from None
     if not -count <= place < count:
@@ -182,7 +183,7 @@ def _is_record(motion: AbstractMotion) -> bool:
 
 
 def _multiplied(motion: Any) -> Record:
-    """A record, or one times a factor, as a record with samples of its own."""
+    """Return a record, possibly times a factor, as a record with its own samples."""
     if isinstance(motion, Record):
         return motion
     record = motion.motion
@@ -190,7 +191,9 @@ def _multiplied(motion: Any) -> Record:
 
 
 def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | None, vertical: bool):
-    """Components at all azimuths: motions, their names, the names of their records, and the azimuth of each."""
+    """Turn components to all azimuths: return motions, their names, the names of their records, and the azimuth of
+    each.
+    """
     if azimuth is None or not all(isinstance(each, Components) for each in motions):
         raise ValueError("Arguments `motions` and `azimuth` must be given for components alone, all of them.")
     angles = np.asarray(direction("azimuth", azimuth), float)
@@ -207,7 +210,7 @@ def _turned(motions: Sequence, names: Sequence[str] | None, azimuth: Values | No
 
 
 def _ensemble(motion: AbstractMotion) -> AbstractMotion:
-    """A motion whose numbers all have the shape (n,); samples stay as they are."""
+    """Broadcast all numbers of a motion to the shape (n,); samples stay as they are."""
     leaves = list(leaves_of(motion))
     for leaf in leaves:
         if jnp.ndim(leaf.value) > 1 and leaf.declared.axes is not None:
@@ -219,7 +222,7 @@ def _ensemble(motion: AbstractMotion) -> AbstractMotion:
 
 
 def size_of(group: AbstractMotion) -> int:
-    """Number of motions in a group."""
+    """Return the number of motions in a group."""
     return next(leaf.value.shape[0] for leaf in leaves_of(group) if not leaf.is_shared)
 
 
@@ -232,7 +235,7 @@ def _names(motion: AbstractMotion, size: int) -> list[str]:
 
 
 def repeated(suite: Suite) -> tuple[str, str] | None:
-    """Names of two motions that are the same to the last sample; None where there are none, or some are traced."""
+    """Return the names of two identical motions; None where there are none, or the suite is traced."""
     if is_traced(suite):
         return None
     seen: dict[Any, str] = {}
@@ -244,7 +247,7 @@ def repeated(suite: Suite) -> tuple[str, str] | None:
 
 
 def _content(value: Any) -> Hashable:
-    """What a motion is made of, but for its name and where it comes from (all labels are equal)."""
+    """Return the content of a motion as a key, without its name and origin (all labels are equal)."""
     if isinstance(value, (np.ndarray, jax.Array)):
         array = np.asarray(value)
         return array.shape, array.dtype.str, array.tobytes()
@@ -256,7 +259,7 @@ def _content(value: Any) -> Hashable:
 
 
 def _numbered(names: list[str]) -> list[str]:
-    """The same, with a number where several are alike: names tell which outcomes go together."""
+    """Number the names that occur more than once: names tell which outcomes go together."""
     alike, seen, found = Counter(names), Counter[str](), []
     for name in names:
         seen[name] += 1
@@ -265,8 +268,8 @@ def _numbered(names: list[str]) -> list[str]:
 
 
 def _peaks(group: AbstractMotion):
-    """Peak accelerations and velocities of its motions."""
+    """Return the peak accelerations and velocities of a group's motions."""
     group = with_room(group)
-    if size_of(group) == 1:  # of what is traced for one motion, there are programs already
+    if size_of(group) == 1:  # a single motion uses the programs that are compiled already
         return [jnp.reshape(peak, (1,)) for peak in peaks_of_motion(one_of_many(group, 0))]
     return peaks_of_many(group, one_of_many, size_of(group))

@@ -1,4 +1,6 @@
-"""Motions as a block feels them that may be turned round: mirrored, but for what the ground does vertically."""
+"""Motions as a block turned by half a circle feels them: the horizontal acceleration is mirrored, the vertical is
+not.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +13,14 @@ from jaxrock.motions.shaking import Envelope
 
 
 def has_vertical(motion: AbstractMotion) -> bool:
-    """Whether the ground moves vertically; how much is not computed."""
+    """Return whether the ground moves vertically; the acceleration itself is not computed."""
     return jax.eval_shape(lambda motion: motion.vertical_bounds, motion) is not None
 
 
 def felt(motion: AbstractMotion, times: Scalar) -> AbstractMotion:
-    """A motion `times` as strong; if that is negative, as a block feels it that is turned round."""
+    """Scale a motion by `times`; a negative factor mirrors its horizontal acceleration only, as if the block were
+    turned.
+    """
     if not has_vertical(motion):
         return Scaled(motion, times)
     return Scaled(Turned(motion, jnp.where(times < 0, -1.0, 1.0)), jnp.abs(times))

@@ -1,4 +1,4 @@
-"""Pulses: one family a file. What a file here defines is a pulse of the package: public, and known to the command line.
+"""Pulses, one family a file. A pulse class defined in a file here is public and known to the command line.
 
 Imports `motions.motion` and `numerics`. Start with `pulse`, then `sinusoidal`.
 """
@@ -12,7 +12,7 @@ from jaxrock.motions.pulses.pulse import AbstractPulse
 
 
 def _defined() -> dict[str, type[AbstractPulse]]:
-    """Every pulse that a module of this folder defines, by the name of its class."""
+    """Return every pulse class that a module of this folder defines, by name."""
     names = sorted(f"{__name__}.{found.name}" for found in pkgutil.iter_modules(__path__))
     kinds = [kind for name in names for kind in vars(importlib.import_module(name)).values()]
     return {
@@ -24,7 +24,7 @@ def _defined() -> dict[str, type[AbstractPulse]]:
 
 _KINDS = _defined()
 PULSES = {kind.word(): kind for kind in _KINDS.values()}  # by the word of the command line
-# Of the parameters that have one.
+# Units of the parameters that are not dimensionless.
 UNITS = {name: known.unit for kind in _KINDS.values() for name, known in declared(kind).items() if known.unit != "-"}
 globals().update(_KINDS)
 __all__ = list(_KINDS)

@@ -21,7 +21,7 @@ class RectangularPulse(AbstractPulse):
 
     @classmethod
     def word(cls) -> str:
-        """What the command line calls it."""
+        """Return the command line's word for it."""
         return "rectangle"
 
     @with_throw
@@ -52,7 +52,7 @@ class TriangularPulse(AbstractPulse):
 
     @classmethod
     def word(cls) -> str:
-        """What the command line calls it."""
+        """Return the command line's word for it."""
         return "triangle"
 
     @with_throw
@@ -79,7 +79,7 @@ class TriangularPulse(AbstractPulse):
 
 
 def _growth_ratio(x: Real) -> Real:
-    """(e^x - 1)/x for x <= 0, smooth through 0."""
+    """Return (e^x - 1)/x for x <= 0, smooth through 0."""
     small = jnp.abs(x) < 1e-2
     far = where(small, -1.0, x)
     near = horner([jnp.full_like(x, 1 / math.factorial(k + 1)) for k in range(7)], x)
@@ -115,8 +115,8 @@ class ExponentialPulse(AbstractPulse):
     def _layer(self) -> Real:
         """Part of the duration in which the exponential is not yet negligible (e^-40), at most one half.
 
-        Outside the layers the pulse is constant to rounding. They get pieces of their own, so that a
-        pulse of any shape costs a bounded number of steps.
+        Outside the layers the pulse is constant to rounding. The layers are separate pieces, so that a pulse of any
+        shape costs a bounded number of steps.
         """
         return 20.0 / jnp.maximum(jnp.abs(self.shape), 40.0)
 
@@ -128,7 +128,7 @@ class ExponentialPulse(AbstractPulse):
         return self.duration * jnp.stack([zero, inner, zero + 0.5, 1 - inner, zero + 1])
 
     def _curved(self, piece: Int[Array, "..."]) -> Bool[Array, "..."]:
-        """Whether a piece is a layer; one thinner than rounding is left out."""
+        """Return whether a piece is a layer; a layer thinner than rounding counts as none."""
         middle = (piece == 1) | (piece == 2)
         in_layer = where(self.shape > 0, middle, ~middle)
         return in_layer & (jnp.abs(self.shape) < 1e24)
@@ -146,7 +146,7 @@ class ExponentialPulse(AbstractPulse):
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         shape = jnp.clip(self.shape, -1e25, 1e25)
-        rate = 1 / self.duration  # the same at every step: computed once
+        rate = 1 / self.duration  # loop-invariant: computed once
         layer, y = self._layer, local * rate
         spiked = shape > 0
         down, up = where(spiked, 0.0, shape), where(spiked, shape, 0.0)

@@ -65,7 +65,7 @@ class MavroeidisPapageorgiouPulse(AbstractPulse):
         return jnp.abs(self.amplitude)[None] * (1 + 0.5 / self.oscillations)
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
-        # The product of cosines is a sum of three: at the period, and at the two side frequencies.
+        # The product of cosines is a sum of three: one at the period, two at the side frequencies.
         time = local - self.oscillations * self.period / 2
         total: list[Any] = [0.0] * (order + 1)
         for weight, ratio in ((0.5, 1.0), (0.25, 1 + 1 / self.oscillations), (0.25, 1 - 1 / self.oscillations)):

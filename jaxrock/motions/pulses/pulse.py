@@ -1,4 +1,4 @@
-"""What pulses have in common: an amplitude [g], and a start at time 0."""
+"""The base class of pulses: an amplitude [g], and a start at time 0."""
 
 import re
 
@@ -14,7 +14,7 @@ Real = Inexact[Array, "..."]
 
 
 def one_piece(end: Real) -> Real:
-    """Knots of a motion that is smooth from 0 to `end`."""
+    """Return the knots of a motion that is smooth from 0 to `end`."""
     if is_at_hand(end):
         return placed(np.stack([np.zeros_like(end), end]))
     return jnp.stack([jnp.zeros_like(end), end])
@@ -27,5 +27,5 @@ class AbstractPulse(AbstractMotion):
 
     @classmethod
     def word(cls) -> str:
-        """What the command line calls it: `half-sine` for `HalfSinePulse`."""
+        """Return the command line's word for it: `half-sine` for `HalfSinePulse`."""
         return re.sub("(?<=[a-z])(?=[A-Z])", "-", cls.__name__.removesuffix("Pulse")).lower()

@@ -13,13 +13,13 @@ from jaxrock.numerics.xla_cpu import keep
 
 
 def sinusoid(amplitude: Real, rate: Real, angle: Real, unit: Real, order: int, local: Real) -> list[Real]:
-    """Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
+    """Return Taylor coefficients of amplitude sin(angle + rate (time - local)) in time/unit, from u'' = -rate^2 u."""
     sine, cosine = sine_cosine_of_any(angle)
     return harmonic(keep(amplitude * sine, local), keep(amplitude * cosine, local) * rate * unit, rate * unit, order)
 
 
 def harmonic(value: Real, slope: Real, rate: Real, order: int) -> list[Real]:
-    """Taylor coefficients of the solution of u'' = -rate^2 u with the given value and slope."""
+    """Return Taylor coefficients of the solution of u'' = -rate^2 u with the given value and slope."""
     terms, square = [value, slope], rate**2
     for k in range(order - 1):
         terms.append(square * terms[k] * (-1 / ((k + 1) * (k + 2))))
@@ -79,7 +79,7 @@ class _OneCycle(AbstractPulse):
 class SinePulse(_OneCycle):
     """One full cycle of amplitude sin(2 pi t/period) [g], `period` in s, positive (D&D 2012, 3.2)."""
 
-    __init__ = _OneCycle.__init__  # said again for type checkers, which would make one of the fields
+    __init__ = _OneCycle.__init__  # repeated for type checkers, which would derive one from the fields
 
     def series(self, piece: Piece, local: Real, unit: Real, order: int) -> list[Real]:
         rate = 2 * math.pi / self.period
