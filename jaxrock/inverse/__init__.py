@@ -1,6 +1,7 @@
-"""From rocks, or a measured history, back to motions and blocks: likelihood, estimates, samples, allowed motions.
+"""Infer motions and blocks from observed rocks, or from a measured history of rotation.
 
-Imports `studies` and `responses`. Start with `likelihood`, then `estimate`.
+Holds likelihoods, estimates, posterior samples and regions of allowed motions. The package imports `studies` and
+`responses`. Start reading with `likelihood`, then `estimate`.
 """
 
 from jaxrock._surface import shown as _shown

@@ -1,4 +1,4 @@
-"""Any number of points for a program that is compiled for so many."""
+"""Run a program compiled for a fixed number of points at any number of points."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,8 +12,10 @@ def in_batches(
     lanes: int,
     progress: Callable[[int], None] = lambda more: None,
 ) -> list[np.ndarray]:
-    """Results of `function(points, wanted)`, each (points, ...): it is called with so many points (`lanes`) at a time,
-    of which those that are not `wanted` fill up the last ones, and need not be computed."""
+    """Return the results of `function(points, wanted)`, each (points, ...), computed in batches of `lanes` points.
+
+    The last batch is padded. Padding points are not `wanted`, and `function` need not compute them.
+    """
     results = []
     for begin in range(0, len(points), lanes):
         part = points[begin : begin + lanes]

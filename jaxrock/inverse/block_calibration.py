@@ -1,8 +1,8 @@
-"""Blocks from verdicts under known motions: slenderness, size, restitution and their scatter.
+"""Calibrate blocks from verdicts under known motions: slenderness, size, restitution and their scatter.
 
-The verdict of a single scene jumps, and its margin has slopes up to 1e15 after a long record. What is fitted is the
-share of a parameter's distribution that topples: scenes are followed once, on a grid over the parameters, and every
-cell of it weighs as much as the distribution has in it. That is smooth in the distribution's median and scatter.
+The verdict of a single scene jumps, and its margin has slopes up to 1e15 after a long record. The fit therefore uses
+the share of a parameter's distribution that topples. Scenes are computed once, on a grid over the parameters. Each
+cell has the weight of its probability, which makes the sum smooth in the distribution's median and scatter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,13 +29,13 @@ from jaxrock.motions.suite import Suite
 from jaxrock.status import Enumeration, item
 from jaxrock.studies.suite_scenes import scenes
 
-_LEAST_BEND = 1e-8  # of the likelihood over a range, squared: what is less is rounding
+_LEAST_BEND = 1e-8  # least curvature of the likelihood, in squared ranges; anything smaller is rounding
 _deviation = Range("be in (0, 1]", 0.0, 1.0, lambda x: (x > 0) & (x <= 1))
-_STARTS = 6  # points of a net from which the likelihood is climbed
+_STARTS = 6  # grid points from which the likelihood is maximised
 
 
 class CalibrationStatus(Enumeration):
-    """What became of a calibration; `CalibrationStatus[found.status]` is the message."""
+    """Result code of a calibration; `CalibrationStatus[found.status]` is the message."""
 
     successful = item(
         "A maximum of the likelihood lies within the ranges: the highest that was found from the best points of a net."
@@ -51,15 +51,16 @@ class CalibrationStatus(Enumeration):
 
 
 class BlockCalibration(AbstractTable):
-    """What `calibrate_block` finds.
+    """The result of `calibrate_block`.
 
-    - `values`: the most probable ones by name; of a parameter with scatter its median, and `name_sd`.
-    - `covariance`: of the places of all in this order: logarithms where an `Unknown` is one, else themselves; the
-      inverse of the observed information. `standard_errors` by name, of the same: infinite where one would be larger
-      than the range, and NaN where there is no maximum.
-    - `log_likelihood`: at the maximum; with priors, without their constants.
-    - `probability`: (tests,) to topple, of every test. `bounds`: (2, tests) if all undecided scenes stood, or toppled.
-    - `held_out`: (tests,) the same of fits to the tests of other motions; NaN where `folds` was 0.
+    - `values`: the most probable values by name. A parameter with scatter has its median, and the scatter as `name_sd`.
+    - `covariance`: of the parameters in this order (of the logarithms where the `Unknown` is `log`). It is the inverse
+      of the observed information. `standard_errors`, by name, are infinite where one would be larger than the range,
+      and NaN where there is no maximum.
+    - `log_likelihood`: at the maximum, with the priors except for their constants.
+    - `probability`: (tests,) probability of toppling in each test. `bounds`: (2, tests) this probability if all
+      undecided scenes stood, and if all toppled.
+    - `held_out`: (tests,) probability of toppling from fits to the tests of other motions; NaN where `folds` was 0.
     - `status`: a `CalibrationStatus`.
     """
 
@@ -85,12 +86,12 @@ class BlockCalibration(AbstractTable):
 
     @property
     def standard_errors(self) -> dict[str, Float[Array, ""]]:
-        """Of the places, by name."""
+        """Standard errors by name: of logarithms where the `Unknown` is `log`, of the parameters elsewhere."""
         return dict(zip(self.values, jnp.sqrt(jnp.diag(self.covariance))))
 
     @called_by_users
     def log_density(self, values: Mapping[str, ArrayLike]) -> Float[Array, ""]:
-        """Log-likelihood and log-prior at values by name: a smooth function for optimisers and samplers of JAX.
+        """Return the log-likelihood plus log-prior at values by name: smooth, for JAX optimisers and samplers.
 
         **Raises:** ValueError for other names.
         """
@@ -99,7 +100,7 @@ class BlockCalibration(AbstractTable):
         return _density(self.problem, {name: as_real(name, values[name]) for name in self.problem.unknowns})
 
     def auc(self, held_out: bool = False) -> float:
-        """Share of pairs of a test that toppled and one that stood in which the first is more probable, NaN of none."""
+        """Share of pairs of a toppled and a standing test in which the first is more probable; NaN without pairs."""
         chosen, toppled = np.asarray(self.held_out if held_out else self.probability), np.asarray(self.toppled)
         fell, stood = (chosen[(toppled == way) & np.isfinite(chosen)] for way in (1, 0))
         if not fell.size or not stood.size:
@@ -109,13 +110,13 @@ class BlockCalibration(AbstractTable):
 
     @arguments
     def curve(self, bins: Annotated[int, at_least(2, 1000)] = 10, held_out: bool = False) -> dict[str, np.ndarray]:
-        """The calibration curve: tests in bins of about as many each, in the order of their probability.
+        """Return the calibration curve: tests ordered by probability, in bins of about equal counts.
 
         **Arguments:**
 
-        - `bins`: how many; `held_out`: whether by fits to other motions.
+        - `bins`: number of bins; `held_out`: whether to use the fits to other motions.
 
-        **Returns:** columns tests, probability (their mean), toppled (their share).
+        **Returns:** columns tests (their number), probability (its mean), toppled (share that toppled).
         """
         chosen = np.asarray(self.held_out if held_out else self.probability)
         known = np.flatnonzero(np.isfinite(chosen) & (np.asarray(self.toppled) >= 0))
@@ -129,7 +130,7 @@ class BlockCalibration(AbstractTable):
 
     @arguments
     def disagreeing(self, probability: ArrayLike = 0.05, held_out: bool = False) -> np.ndarray:
-        """Indices of tests that ended in a way which had less than this probability, the least probable first.
+        """Return the indices of tests whose outcome had less than this probability, the least probable first.
 
         **Raises:** ValueError for a probability outside [0, 1].
         """
@@ -141,7 +142,7 @@ class BlockCalibration(AbstractTable):
 
 
 class _Problem(eqx.Module):
-    """The likelihood over places: what is unknown, and what the scenes of the grid tell."""
+    """The likelihood over coordinates: the unknowns, and the table of scenes computed on the grid."""
 
     unknowns: dict[str, Unknown]
     axes: dict[str, Axis]
@@ -160,13 +161,13 @@ class _Problem(eqx.Module):
         return {name: jnp.exp(x) if unknown.log else x for (name, unknown), x in named}
 
     def probabilities(self, places, shares):
-        """Of toppling, of every test; `shares` (tests, cells...) that topple."""
+        """Return the probability of toppling in each test; `shares`, (tests, cells...), are those that topple."""
         values = self.values(places)
         found = weighed(shares, [axis.weights(values, name) for name, axis in self.axes.items()])
         return self.lapse / 2 + (1 - self.lapse) * found
 
     def terms(self, places):
-        """Log-likelihood of every test."""
+        """Return the log-likelihood of each test."""
         table = self.table
         p = jnp.clip(self.probabilities(places, table.toppled), 1e-12, 1 - 1e-12)
         verdicts = jnp.where(table.seen == 1, jnp.log(p), jnp.where(table.seen == 0, jnp.log1p(-p), 0.0))
@@ -201,30 +202,30 @@ def calibrate_block(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> BlockCalibration:
-    """Find slenderness, size or restitution of a block, and their scatter, from what it did under known motions.
+    """Find slenderness, size or restitution of a block, and their scatter, from outcomes under known motions.
 
     **Arguments:**
 
-    - `block`: makes a `Block` or `AsymmetricBlock` of the unknown parameters by name, such as
+    - `block`: function that makes a `Block` or `AsymmetricBlock` from the unknown parameters by name, such as
       `lambda alpha: rk.Block(alpha, 3.0)`, or `rk.Block`.
-    - `motions`: (tests,) as they were, scaled: a `Suite`, or what makes one.
+    - `motions`: (tests,) motions as scaled in each test: a `Suite`, or a list from which one can be made.
     - `toppled`: (tests,) 1 toppled, 0 stood, -1 not known.
     - `unknowns`: an `Unknown` for each parameter that `block` takes: its value, or its median over tests.
-    - `scatter`: for parameters that differ from test to test (how a rock was set up, what it stands on): the standard
-      deviation of the logarithm (of the parameter itself where its `Unknown` is not `log`), a number or an `Unknown`.
-      At least one parameter must have it.
+    - `scatter`: for parameters that differ from test to test (set-up of a rock, its base): the standard deviation of
+      the logarithm (of the parameter itself where its `Unknown` is not `log`), a number or an `Unknown`. At least one
+      parameter must have scatter.
     - `model`, `engine`, `progress`: as in `rocking_spectrum`.
     - `rotation`: (tests,) peak rotation over slenderness of a block that stood, 0 if it was not seen to move (below
       0.01), NaN where only the verdict is known.
-    - `rotation_sd`: standard deviation of its logarithm, in (0, 1], by what was measured and what the model leaves out.
+    - `rotation_sd`: standard deviation of the logarithm of `rotation`, in (0, 1], from measurement and model error.
     - `facing`: 1 if motion and block have the same positive direction in a test, -1 if not, 0 not known: one number or
-      (tests,). Of a symmetric block it changes nothing.
-    - `cells`: of the grid over every parameter, or by its name; the scenes are their product. The grid goes 2.5 of the
-      largest deviation beyond the ranges, and without scatter to their ends; `alpha`, `alpha1` and `alpha2` to 0.9 rad,
-      `restitution` to 0 and 1.
-    - `lapse`: share of tests that end either way, whatever the block is: so that one odd test cannot decide all.
+      (tests,). It has no effect on a symmetric block.
+    - `cells`: number of grid cells over each parameter, one number or by name; the scenes are their product. With
+      scatter the grid extends 2.5 of the largest deviation beyond the range, without it to the ends of the range. It is
+      limited to 0.9 rad for `alpha`, `alpha1` and `alpha2`, and to 0 and 1 for `restitution`.
+    - `lapse`: share of tests that end either way whatever the block is, so that one odd test cannot decide the fit.
     - `groups`: (tests,) labels of motions for cross-validation, such as the record that was scaled; None: each test.
-    - `folds`: into how many parts the groups are dealt for it; 0: no cross-validation.
+    - `folds`: number of parts into which the groups are divided for cross-validation; 0: no cross-validation.
 
     **Returns:** a `BlockCalibration`.
 
@@ -266,7 +267,7 @@ def _axes(unknowns, scatter, cells) -> dict[str, Axis]:
 
 
 def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """What was seen of every test, how it faced, and rotations, if any was."""
+    """Return the checked outcomes, orientations and rotations of the tests; the last is None if not given."""
 
     def of_tests(name, value, allowed):
         array = np.asarray(as_real(name, np.asarray(value, float) if np.asarray(value).dtype == bool else value), float)
@@ -287,12 +288,12 @@ def _tests(count: int, toppled, facing, rotation) -> tuple[np.ndarray, np.ndarra
 
 
 def _numbered(labels) -> np.ndarray:
-    """A number for each label: those of one label have the same."""
+    """Return an integer for each label, the same for equal labels."""
     return np.unique([str(label) for label in np.atleast_1d(np.asarray(labels, object))], return_inverse=True)[1]
 
 
 def _dealt(groups, count: int, folds: int) -> np.ndarray | None:
-    """In which part every test is left out."""
+    """Return the number of the fold in which each test is held out; None without folds."""
     labels = np.arange(count) if groups is None else _numbered(groups)
     if labels.shape != (count,):
         raise ValueError(f"Argument `groups` must hold a label for each of {count} tests, but has {labels.shape}.")
@@ -303,7 +304,7 @@ def _dealt(groups, count: int, folds: int) -> np.ndarray | None:
 
 
 def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
-    """The most probable places, their errors, and what fits to other motions say."""
+    """Fit the most probable coordinates with their errors, and the held-out probabilities by cross-validation."""
     place, converged = climbed(problem, _starts(problem))
     ends = np.asarray(problem.ends)
     covariance, good = _errors(np.asarray(_hessian(problem, jnp.asarray(place))), np.ptp(ends, axis=1))
@@ -329,10 +330,10 @@ def _fitted(problem: _Problem, part: np.ndarray | None) -> BlockCalibration:
 
 
 def _errors(hessian: np.ndarray, extents: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Covariance of the places, and whether they are at a maximum.
+    """Return the covariance of the coordinates, and whether they are at a maximum.
 
-    Counted in ranges, a direction in which the likelihood bends by less than 1 either way is flat. A parameter whose
-    standard error is more than its range is not told: its variance is infinite, its covariances are not numbers.
+    A direction whose curvature is within 1 of zero, in squared ranges, is flat. A parameter whose standard error
+    exceeds its range is not identified: its variance is infinite, and its covariances are NaN.
     """
     bends, directions = np.linalg.eigh(-hessian * np.outer(extents, extents))
     if not np.all(bends > -1):
@@ -345,7 +346,7 @@ def _errors(hessian: np.ndarray, extents: np.ndarray) -> tuple[np.ndarray, bool]
 
 
 def _starts(problem: _Problem) -> list[np.ndarray]:
-    """The best points of a net over the ranges."""
+    """Return the best points of a regular grid over the ranges."""
     ends = np.asarray(problem.ends)
     side = max(2, int(600 ** (1 / len(ends))))
     shares = [(np.arange(min(side, 24)) + 0.5) / min(side, 24)] * len(ends)
@@ -356,11 +357,12 @@ def _starts(problem: _Problem) -> list[np.ndarray]:
 
 
 def climbed(problem: _Problem, starts: list[np.ndarray], weights=None) -> tuple[np.ndarray, bool]:
-    """The highest place that is reached from some, within the ranges."""
+    """Maximise within the ranges from each start; return the best coordinates, and whether the search converged."""
     from scipy.optimize import minimize
 
     ends = np.asarray(problem.ends)
-    weights = np.ones(len(problem.table.seen)) if weights is None else weights  # one program for both
+    # Weights of 1 in place of None, so that one compiled program serves both.
+    weights = np.ones(len(problem.table.seen)) if weights is None else weights
 
     def down(place):
         value, slope = _value(problem, place, weights)

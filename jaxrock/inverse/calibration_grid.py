@@ -1,4 +1,4 @@
-"""The grid of a calibration: cells over each parameter, what a distribution has in each, and what became of scenes."""
+"""The grid of a calibration: cells over each parameter, their probability weights, and outcomes of the scenes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,17 +15,17 @@ from jaxrock.inverse.unknowns import Unknown
 from jaxrock.studies.suite_scenes import TOPPLED, UNDECIDED, Scenes
 from jaxrock.transforms.fingerprint import with_checks
 
-# What the usual parameters can be (wider blocks than that have no restitution of Housner's).
+# Limits of the usual parameters (Housner's restitution does not exist for wider blocks).
 _LIMITS = dict.fromkeys(("alpha", "alpha1", "alpha2"), (1e-3, 0.9)) | {"restitution": (0.0, 1.0)}
-STILL = 0.01  # peak rotation over slenderness that is not seen
-_BEYOND = 2.5  # standard deviations for which the grid goes beyond the range of a median
+STILL = 0.01  # peak rotation over slenderness below which an observer sees no motion
+_BEYOND = 2.5  # standard deviations by which the grid extends beyond the range of a median
 
 
 class Axis(eqx.Module):
     """Cells over one parameter, or over its logarithm.
 
-    - `middles`: (cells,) places; `width` of a cell; `deviation`: of the scatter, None where there is none or it is
-      unknown.
+    - `middles`: (cells,) coordinates of the middles; `width`: of a cell.
+    - `deviation`: standard deviation of the scatter; None without scatter, or where it is unknown.
     """
 
     middles: Float[np.ndarray, " cells"]
@@ -36,14 +36,14 @@ class Axis(eqx.Module):
 
     @classmethod
     def of(cls, name: str, unknown: Unknown, scatter, count: int) -> "Axis":
-        """The cells over a range, and what scatter adds to it."""
+        """Return the cells over a range, extended by the scatter."""
         low, high = (float(x) for x in unknown.ends)
-        if scatter is None:  # the outermost middles are the ends themselves: beyond them a likelihood would be flat
+        if scatter is None:  # the outermost middles are the ends of the range: beyond them a likelihood would be flat
             middles = np.linspace(low, high, count)
             return cls(middles, (high - low) / (count - 1), None, False, unknown.log)
         widest = float(scatter.high) if isinstance(scatter, Unknown) else float(scatter)
         low, high = low - _BEYOND * widest, high + _BEYOND * widest
-        # Scatter takes no parameter beyond what it can be, nor a median's range there.
+        # Scatter does not extend the grid beyond a parameter's limits, unless the range of the median does.
         ends = [
             np.log(max(end, 1e-300)) if unknown.log else end
             for end in _LIMITS.get(name, (0.0, np.inf) if unknown.log else (-np.inf, np.inf))
@@ -64,13 +64,13 @@ class Axis(eqx.Module):
         return np.exp(self.middles) if self.log else self.middles
 
     def weights(self, values: dict, name: str) -> Float[Array, " cells"]:
-        """How much of the distribution lies in each cell; what lies beyond the grid is in the cells at its ends.
+        """Return the probability of the distribution in each cell; the end cells include the tails beyond the grid.
 
-        Without scatter: of the cells around the value, by the cubic of Catmull and Rom, which has a slope everywhere.
+        Without scatter, return Catmull-Rom weights of the cells around the value; they are differentiable everywhere.
         """
         place = jnp.log(values[name]) if self.log else values[name]
         if not self.is_scattered:
-            # At an end, where rounding may put it on either side, it has the slope of the inside.
+            # At an end rounding may put the value on either side: use the slope of the inside there.
             known = jax.lax.stop_gradient(place)
             place = place + (jnp.clip(known, self.middles[0], self.middles[-1]) - known)
             return self._by_cubics((place - self.middles[0]) / self.width)
@@ -80,17 +80,17 @@ class Axis(eqx.Module):
         return jnp.diff(jnp.concatenate([jnp.zeros(1), below, jnp.ones(1)]))
 
     def _by_cubics(self, place: Array) -> Float[Array, " cells"]:
-        """Weights of the cells around a place, in cells from the first."""
+        """Return cubic weights of the cells around a place, which is counted in cells from the first."""
         x = jnp.abs(place - np.arange(-1.0, self.count + 1))
         near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
         found = jnp.where(x < 1, near, jnp.where(x < 2, far, 0.0))
-        # The cells before the first and after the last go on straight: 2 f[0] - f[1].
+        # Values before the first and after the last cell are extrapolated linearly: 2 f[0] - f[1].
         outer = jnp.stack([2 * found[0], -found[0], -found[-1], 2 * found[-1]])
         return found[1:-1].at[np.array([0, 1, -2, -1])].add(outer)
 
 
 def blocks_of_cells(block: Callable, axes: dict[str, Axis]) -> Any:
-    """The blocks of all cells, the last parameter changing fastest; what all blocks share is there once."""
+    """Return the blocks of all cells, the last parameter changing fastest; shared leaves are stored once."""
     grid = np.meshgrid(*(axis.values for axis in axes.values()), indexing="ij")
     made = with_checks(lambda *each: block(**dict(zip(axes, each))))
     try:
@@ -129,10 +129,12 @@ def _is_one(values: np.ndarray) -> bool:
 
 
 class Table(eqx.Module):
-    """What the scenes of every test tell, over the cells.
+    """Outcomes of the scenes of each test, over the cells.
 
-    - `seen`: (tests,) 1, 0 or -1. `toppled`: (tests, cells, ...) share that topples, half of what is undecided; `lower`
-      and `upper`: none, or all of it. `density`: of the logarithm of a rotation that was seen, of what stood.
+    - `seen`: (tests,) 1, 0 or -1.
+    - `toppled`: (tests, cells, ...) share that topples, counting half of the undecided scenes; `lower` and `upper`
+      count none, and all, of these.
+    - `density`: (tests, cells, ...) density of the logarithm of the observed rotation, in scenes that stood.
     """
 
     seen: Float[Array, " tests"]
@@ -144,7 +146,7 @@ class Table(eqx.Module):
 
     @classmethod
     def of(cls, found: Scenes, seen, ways, told, deviation: float, shape: tuple[int, ...]) -> "Table":
-        """From scenes (tests, ways round, cells), and how every test faced."""
+        """Build the table from scenes (tests, orientations, cells), and from the orientation of each test."""
         count = found.verdict.shape[1]
         turned = np.clip(np.where(ways == 0, 0.5, ways < 0), 0, 1) if count > 1 else np.zeros_like(ways)
         mix = np.stack([1 - turned, turned][:count], axis=1)
@@ -166,7 +168,7 @@ class Table(eqx.Module):
 
 
 def weighed(shares: Float[Array, "tests *cells"], weights: list) -> Float[Array, " tests"]:
-    """Means over all axes of cells."""
+    """Return the weighted means over all axes of cells."""
     for each in reversed(weights):
         shares = shares @ each
     return shares

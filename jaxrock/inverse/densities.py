@@ -1,4 +1,4 @@
-"""What rocks say about a motion, as a function for optimisers and samplers of any library."""
+"""The log-density of a motion given rocks, as a function for optimisers and samplers of any library."""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated
@@ -26,38 +26,43 @@ Real = Inexact[Array, "..."]
 class LogDensity(eqx.Module):
     """Log-density of a motion's unknown parameters, given rocks, over points of the whole real line.
 
-    Coordinate i of a point leads into the range of parameter i: its share of the range (of the range of logarithms, if
-    it is searched in them) is 1/(1 + exp(-x)). Made by `log_density`; a pytree, for `jit`, `vmap` and derivatives of
-    every order. Nothing is raised for any point: a motion that there is not, and what is no number, has minus infinity.
+    A logistic function maps coordinate i of a point into the range of parameter i. The share of the range (of the
+    range of logarithms, if it is searched in them) is 1/(1 + exp(-x)). `log_density` makes it. It is a pytree, for
+    `jit`, `vmap` and derivatives of every order. No point raises an error: impossible motions and NaN have minus
+    infinity.
     """
 
     problem: Problem
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters, in the order of coordinates."""
+        """Names of the parameters, in the order of coordinates."""
         return self.problem.names
 
     @called_by_users
     def __call__(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
-        """Log-density of points, (..., parameters), with respect to the points themselves, but for a constant: what a
-        sampler takes. Many points at once take less time than `jax.vmap` of one."""
+        """Return the log-density at points, (..., parameters), with respect to the points, up to a constant.
+
+        Samplers take this function. One call with many points takes less time than `jax.vmap` of calls with one.
+        """
         return _at_points(self, self._checked(point), np.array(True))
 
     @called_by_users
     def objective(self, point: Inexact[ArrayLike, "*batch parameters"]) -> Float[Array, "*batch"]:
-        """Log-likelihood and log-prior: what `estimate_motion` makes as large as it can. It does not depend on the
-        coordinates."""
+        """Return the log-likelihood plus log-prior, which `estimate_motion` maximises.
+
+        It does not depend on the choice of coordinates.
+        """
         return _at_points(self, self._checked(point), np.array(False))
 
     @called_by_users
     def values(self, point: Inexact[ArrayLike, "*batch parameters"]) -> dict[str, Float[Array, "*batch"]]:
-        """Parameters by name, in their units, at points."""
+        """Return the parameters by name, in their units, at points."""
         return self.problem.values(self.place(self._checked(point)))
 
     @arguments
     def point(self, values: Mapping[str, ArrayLike]) -> Float[Array, "*batch parameters"]:
-        """The point of parameters by name; infinite at the ends of their ranges, not a number outside."""
+        """Return the point of parameters given by name; infinite at the ends of their ranges, NaN outside."""
         if set(values) != set(self.names):
             raise ValueError(f"Argument `values` must hold {', '.join(self.names)}, but holds {', '.join(values)}.")
         low, high = self.problem.ends.T
@@ -71,8 +76,8 @@ class LogDensity(eqx.Module):
     def starts(
         self, count: Annotated[int, at_least(1, 10**6)], seed: Annotated[int, at_least(0)] = 0
     ) -> Float[Array, "count parameters"]:
-        """So many points, spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
-        from scipy.stats import qmc  # it takes a third of a second
+        """Return `count` points spread evenly over the ranges (Halton's sequence): the likelihood has many maxima."""
+        from scipy.stats import qmc  # imported here because it takes a third of a second
 
         share = jnp.asarray(qmc.Halton(len(self.names), seed=seed).random(count), self.problem.ends.dtype)
         return jnp.log(share) - jnp.log1p(-share)
@@ -84,18 +89,18 @@ class LogDensity(eqx.Module):
         return point
 
     def place(self, point: Real) -> Real:
-        """Parameters, or their logarithms where they are searched in these, at points."""
+        """Return the parameters, or their logarithms where these are searched, at points."""
         low, high = self.problem.ends.T
         return low + (high - low) * jax.nn.sigmoid(point)
 
     def log_volume(self, point: Real) -> Real:
-        """What the log-density has more than the objective: of the coordinates, (...)."""
+        """Return the log-Jacobian of the coordinates, (...): the log-density less the objective."""
         return jnp.sum(jax.nn.log_sigmoid(point) + jax.nn.log_sigmoid(-point), axis=-1)
 
 
 @quickly(eqx.filter_jit, follows_scenes=True)
 def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) -> Real:
-    """The log-density or, not `by_point`, the objective: one program for both."""
+    """Return the log-density or, if not `by_point`, the objective; one compiled program serves both."""
     problem = density.problem
     if point.shape[-1:] != (len(problem.names),):
         raise ValueError(
@@ -103,7 +108,7 @@ def _at_points(density: LogDensity, point: Real, by_point: Bool[ArrayLike, ""]) 
         )
     if point.size == 0:
         return jnp.zeros(point.shape[:-1], point.dtype)
-    nowhere = jnp.isnan(point).any(axis=-1)  # after a step of an optimiser that has gone astray
+    nowhere = jnp.isnan(point).any(axis=-1)  # a diverged optimiser may step to NaN
     point = jnp.where(nowhere[..., None], 0.0, point)
     value = problem.log_density(density.place(point)) + jnp.where(by_point, density.log_volume(point), 0.0)
     return jnp.where(nowhere, -jnp.inf, value)
@@ -121,9 +126,9 @@ def log_density(
     model: AbstractEquation = Housner(),
     engine: AbstractEngine | None = None,
 ) -> LogDensity:
-    """The log-density of a motion's parameters, for any optimiser or sampler: recipes in `docs/inverse.md`.
+    """Return the log-density of a motion's parameters, for any optimiser or sampler: recipes in `docs/inverse.md`.
 
-    **Arguments:** as in `estimate_motion`. `motion` and `model` are taken as they are now.
+    **Arguments:** as in `estimate_motion`. The state of `motion` and `model` is read at this call.
 
     **Returns:** a `LogDensity`.
 

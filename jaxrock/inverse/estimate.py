@@ -1,12 +1,12 @@
-"""The motion that rocks allow: parameters of a pulse, with intervals, from rocks that stand, fell, or rocked so far.
+"""Estimate the parameters of a motion, with intervals, from rocks that stand, fell, or rocked by a measured angle.
 
-The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals. A scan of it comes
-first, and climbers start from the best places of the scan. No search can prove that there is no higher maximum between
-its places.
+The likelihood (see `likelihood`) has many maxima, because overturning sets are unions of intervals. The search scans
+it first, and starts climbers from the best places of the scan. No search can prove that there is no higher maximum
+between its places.
 
-Intervals are those of the profile likelihood: all values of a parameter with which some values of the others explain
-the observations nearly as well as the best. Where the observations leave a side open, the interval ends at the range
-that was searched, and is marked open.
+Intervals are those of the profile likelihood. They hold all values of a parameter with which some values of the others
+explain the observations nearly as well as the best. Where the observations leave a side open, the interval ends at the
+range that was searched, and is marked open.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,19 +35,19 @@ from jaxrock.status import Enumeration, item
 Real = Inexact[Array, "..."]
 _SCANNED, _LEAST_SCANNED = 16, 256  # places of the scan for each start; least number of places
 _ROUNDS_BESIDE, _SCANNED_BESIDE, _BESIDE = 3, 128, 0.08  # rounds, points in each, and their extent in ranges
-_CLIMBING_BESIDE = 8  # points of these
+_CLIMBING_BESIDE = 8  # climbers started from these points
 _UNSURE = 0.5  # standard error of a log-likelihood above which a remark reports it
-_GAIN = 1e-6  # of a round that calls for another
-_RETRIES = 7  # starts with another scatter
+_GAIN = 1e-6  # least gain of log-likelihood in a round after which another round follows
+_RETRIES = 7  # starts of a fit with another scatter
 _RATIO = 1.9207  # log-likelihood ratio of 95 %, half of 1.96^2
 _SURPRISED = 3.0  # standard deviations of the observations' log-probability
-_ODD, _NAMED = 2.0, 3  # the same of one rock, from which it is named; at most so many
-_COMPUTED = 0.5  # of the possible scenes at the maximum
-_FLAT = 0.5  # of a range: a standard deviation beyond which a direction is not determined
+_ODD, _NAMED = 2.0, 3  # surprise of one rock, in standard deviations, above which it is named; most rocks named
+_COMPUTED = 0.5  # least share of the possible scenes that must be computed at the maximum
+_FLAT = 0.5  # standard deviation, in ranges, above which a direction is not determined
 
 
 class EstimateStatus(Enumeration):
-    """What became of an estimate; `EstimateStatus[estimate.status]` is the message."""
+    """Result code of an estimate; `EstimateStatus[estimate.status]` is the message."""
 
     successful = item(
         "One of the maxima that were found stands out, and every interval lies within the range that was searched."
@@ -80,14 +80,16 @@ class EstimateStatus(Enumeration):
 class Estimate(AbstractTable):
     """The motion that observations allow; arrays have the order of `names`.
 
-    - `names`, `values`: the parameters and where their likelihood (with priors: posterior density) is largest.
-    - `interval`: (parameters, 2) 95 % intervals of the profile likelihood, in the parameters' units; other starts'
-      maxima that are as good lie within.
+    - `names`, `values`: the parameters, and their values where the likelihood (with priors: posterior density) is
+      largest.
+    - `interval`: (parameters, 2) 95 % intervals of the profile likelihood, in the parameters' units. They cover maxima
+      of other starts that are as good.
     - `open`: (parameters, 2) whether an end is only the end of the range.
     - `covariance`: (parameters, parameters) of logarithms of the parameters (of the parameter itself where the search
       is not in its logarithm). It is the inverse Hessian of a parabola through log-likelihoods about 1/2 below the
-      maximum, because steps make slopes unusable. Infinite along a flat direction, with a fall below 0.02 within half a
-      range. It describes the highest maximum alone; intervals cover all.
+      maximum, because steps of the likelihood make its slopes unusable. It is infinite along a flat direction, where
+      the likelihood falls by less than 0.02 within half a range. It describes the highest maximum alone; intervals
+      cover all.
     - `directions`, `deviations`: (parameters, parameters) rows of unit vectors in ranges of the parameters, and
       (parameters,) the standard deviation along each, in ranges. Directions of half a range or more are not determined.
     - `log_likelihood`: at the maximum, with the priors.
@@ -132,7 +134,7 @@ class Estimate(AbstractTable):
     status: EstimateStatus
 
     def __getitem__(self, name: str) -> Real:
-        """The value of a parameter."""
+        """Return the value of a parameter."""
         return self.values[self.names.index(name)]
 
     @property
@@ -162,7 +164,7 @@ def estimate_motion(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Estimate:
-    """Estimate the parameters of a motion from rocks that stand, fell, or rocked so far.
+    """Estimate the parameters of a motion from rocks that stand, fell, or rocked by a measured angle.
 
     **Arguments:**
 
@@ -208,7 +210,7 @@ def estimate_motion(
         profiled = profile(evaluate, summits, shape)
         if profiled.better is None:
             break
-        # A profile went over a pass to a higher summit.
+        # Climbing along a profile has crossed to a higher summit.
         summits = _joined(climb(evaluate, profiled.better[None]), summits)
     result = _conclude(evaluate, summits, shape, profiled, trace)
     bar.add(bar.total - bar.done)
@@ -216,8 +218,10 @@ def estimate_motion(
 
 
 def _beside(evaluate: Evaluator, summits: Summits) -> np.ndarray:
-    """The best of some points around the highest summit: gaps that are narrower than the scatter make small summits
-    beside it."""
+    """Return the best of some points around the highest summit.
+
+    Gaps in the overturning set that are narrower than the scatter make small summits beside the highest one.
+    """
     low, high = evaluate.ends
     best = evaluate.places(summits.points[np.argmax(summits.values)])
     places = best + _BESIDE * (spread(_SCANNED_BESIDE, evaluate) - (low + high) / 2)
@@ -282,12 +286,12 @@ def _conclude(evaluate: Evaluator, summits: Summits, shape: Shape, profiled: Pro
 
 def _surprise(facts: Sequence[np.ndarray]) -> float:
     badness, mean, variance = (float(np.sum(x)) for x in facts)
-    # A quarter keeps near certainties, whose variance is nothing, from being surprised by rounding.
+    # The added 0.25 keeps rounding from counting as surprise where outcomes are nearly certain and the variance is 0.
     return (badness - mean) / np.sqrt(variance + 0.25)
 
 
 def _worst(likelihood: Likelihood, probability: np.ndarray, stands: np.ndarray, facts: Sequence[np.ndarray]) -> str:
-    """Rocks that surprise most, the worst first: how probable what they did is, or by how much a rotation is off."""
+    """Name the most surprising rocks, the worst first, with the probability of the outcome or the error of rotation."""
     badness, mean, variance = facts
     surprise = (badness - mean) / np.sqrt(variance + 0.25)
     order = np.argsort(-surprise)[:_NAMED]
@@ -304,7 +308,7 @@ def _worst(likelihood: Likelihood, probability: np.ndarray, stands: np.ndarray, 
 
 
 def _consistent(evaluate: Evaluator, point: np.ndarray) -> float:
-    """About the least scatter under which observations do not contradict each other."""
+    """Return roughly the least scatter under which the observations do not contradict each other; else infinity."""
     for factor in (1.5, 2.0, 3.0, 4.5, 7.0, 10.0):
         scatter = evaluate.problem.likelihood.scatter * factor
         problem = eqx.tree_at(lambda p: p.likelihood.scatter, evaluate.problem, scatter)

@@ -1,4 +1,4 @@
-"""Which motions rocks allow, over two parameters: regions of likelihood, and the largest motion nobody has exceeded."""
+"""Motions that rocks allow: likelihood regions over two parameters, and the largest motion that was not exceeded."""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated
@@ -31,12 +31,12 @@ _LANES = 64  # motions in one call of the compiled program
 
 
 class FeasibleRegion(AbstractTable):
-    """How well motions explain observations, over two parameters.
+    """The log-likelihood of observations over two parameters of a motion.
 
-    - `names`: of the two; `values`: (rows,) of the first and (columns,) of the second.
+    - `names`: of the two parameters; `values`: (rows,) of the first and (columns,) of the second.
     - `log_likelihood`: (rows, columns).
-    - `allowed`: (rows, columns), whether a motion is within the 95 % region of two parameters, that is less than 3.00
-      below the best of the map.
+    - `allowed`: (rows, columns), whether a motion is within the 95 % region of two parameters: its log-likelihood is
+      less than 3.00 below the best of the map.
     """
 
     names: tuple[str, str] = eqx.field(static=True)
@@ -67,7 +67,7 @@ def feasible_region(
 
     - `likelihood`: a `Likelihood`.
     - `over`: two parameters by name, with lists of values.
-    - `fixed`: the motion's other parameters, if it has more; at those of an `Estimate`, say.
+    - `fixed`: values of the motion's other parameters, if it has more, for example those of an `Estimate`.
     - `progress`: whether to draw a progress bar; None: on a terminal, if it takes long.
 
     **Returns:** a `FeasibleRegion`.
@@ -94,13 +94,14 @@ def feasible_region(
 
 
 class Unexceeded(AbstractTable):
-    """The largest motions that all rocks survive, and all weaker ones too.
+    """The largest motions that all rocks survive, together with all weaker ones.
 
-    - `durations`: (n,) [s]; `amplitude`: (n,) largest amplitude [g], as it is given to the motion, up to which every
-      rock stands; infinite where no amplitude that was looked at topples any, not a number where the least topples one.
-    - `by_rock`: (rocks, n) the same for each rock alone that stands.
-    - `weakest`: (n,) the number, from 0, among all rocks of the one that sets it; -1 where none does.
-    - `complete`: (n,) whether every amplitude that was looked at could be decided, and the least topples none.
+    - `durations`: (n,) [s].
+    - `amplitude`: (n,) largest amplitude [g], as passed to the motion, up to which every rock stands. It is infinite
+      where no amplitude tried topples a rock, and NaN where the least one topples a rock.
+    - `by_rock`: (rocks, n) this amplitude for each standing rock alone.
+    - `weakest`: (n,) index, from 0 among all rocks, of the rock that limits the amplitude; -1 where none does.
+    - `complete`: (n,) whether every amplitude tried was decided, and the least topples no rock.
     """
 
     durations: Float[Array, " n"]
@@ -131,11 +132,11 @@ def unexceeded_motion(
     engine: AbstractEngine | None = None,
     progress: bool | None = None,
 ) -> Unexceeded:
-    """Find the largest motion up to which all rocks that stand would have stood, for every duration.
+    """Find the largest motion up to which all standing rocks would have stood, for each duration.
 
-    Rocks are taken as they are stated, and the motion as the same at all of them: no scatter. Overturning intervals
-    above the first one do not count as safe between them: the motion was not exceeded. A rock of which it is not known
-    which way round it stood counts with the way in which it stands more.
+    Rocks have their stated values, and the motion is the same at all of them: no scatter. Amplitudes between two
+    overturning intervals do not count as safe. A rock of unknown orientation counts with the orientation in which it
+    survives the larger motion.
 
     **Arguments:**
 
@@ -167,7 +168,7 @@ def unexceeded_motion(
         engine=engine,
         progress=progress,
     )
-    # Of the two ways round that of a larger motion; NaN, where a rock topples either way from the least on.
+    # Of the two orientations take the larger amplitude; NaN where the least amplitude topples the rock in both.
     by_rock = np.fmax.reduce((np.asarray(critical.lowest) / np.asarray(own)).reshape(*ways.shape, count), axis=0)
     amplitude = by_rock.min(axis=0)
     weakest = np.where(np.isposinf(amplitude), -1, standing[np.argmin(by_rock, axis=0)])
@@ -176,8 +177,10 @@ def unexceeded_motion(
 
 
 def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMotion, Array]:
-    """Those of amplitude 1, one way or (-1) the other, and of all durations in one, which share samples of a record;
-    and what each calls its amplitude."""
+    """Return all motions of unit amplitude in one batched motion, and the amplitude that each declares.
+
+    `ways` is 1 or -1, the sign of each motion. Motions of all durations share the samples of a record.
+    """
     first = [jax.ShapeDtypeStruct((), x.dtype) for x in (ways, duration)]
     one = eqx.filter_eval_shape(motion, *first)
     if not isinstance(one, AbstractMotion):
@@ -196,5 +199,5 @@ def _motions(motion: Callable, ways: Array, duration: Array) -> tuple[AbstractMo
             raise
         said = "whose samples do not depend on amplitude and duration: scale it outside, `amplitude * rk.Record(...)`"
         raise ValueError(f"Argument `motion` must make a motion {said}.") from None
-    # One program of what would be dozens.
+    # Without `jit` each operation would compile a program of its own, dozens in all.
     return made, jax.jit(jax.vmap(lambda each: jnp.abs(amplitude_of(each)), in_axes=(axes,)))(made)
