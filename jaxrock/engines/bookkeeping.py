@@ -83,8 +83,8 @@ def rounded(stepper: AbstractStepper, state: State, push: Scalar, time: Scalar) 
 def note(stepper: AbstractStepper, state: State, outward, turning, crossing, opening, speed, acceleration) -> State:
     """Update peaks, clearances and the closeness to standing still in balance (see `Outcome.margin`)."""
     moments = stepper.scene.moments
-    # The larger of the accelerations with and without the shaking: a block that the ground holds for an instant, far
-    # from its saddle, is not in balance.
+    # Take the larger acceleration, with or without the shaking: a block that the ground holds for an instant, far from
+    # its saddle, is not in balance.
     pull = jnp.maximum(jnp.abs(acceleration), jnp.abs(moments.restoring(Angle.of(opening))))
     per_rest = 1 / moments.restoring_at_rest**2  # `keep` below has XLA compute the product once
     stillness = keep((moments.stiffness * speed**2 + pull**2) * per_rest, state.local)

@@ -158,8 +158,8 @@ def initial_state(scene: Scene, rotation: Scalar, velocity: Scalar) -> State:
 def all_moving(state: State, scene: Scene) -> State:
     """Return the state; if any parameter of the scene has a tangent, so have all fields that will depend on it.
 
-    Otherwise JAX traces the loop over all steps twice when it differentiates it: with the tangents at entry, then with
-    those that the first step adds.
+    Otherwise JAX traces the loop over all steps twice to differentiate it: with the tangents at entry, then with those
+    that the first step adds.
     """
     path = [getattr(state, name) for name in _MOVES]
     numbers = [x for x in jax.tree.leaves(scene) if not jnp.shape(x)]
