@@ -270,9 +270,8 @@ class ArcStepper(AbstractStepper):
         return replace(after, done=after.done | turned | (after.status != Status.successful))
 
     def _outdone(self, state: State) -> Flag:
-        """Return whether a turn of an asymmetric block in the free stage decides its outcome: it will neither fall on
-        the other side, nor come higher or closer to balance there. The energy left is too small to reach some angle
-        below all that."""
+        """Return whether an asymmetric block that has turned back can neither fall on the other side, nor come higher
+        or closer to balance there. Its energy is too small to reach some angle below all that."""
         scene = self.scene.on(state.side)
         far, whole = scene.both_moments[1], scene.moments.work(state.opening)
         left = scene.reset.most(jnp.sqrt(2 * whole)) ** 2 * whole
